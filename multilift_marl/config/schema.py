@@ -1,0 +1,182 @@
+"""Every parameter, once: type, default, unit and meaning. YAML files and overrides only change these values."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+if TYPE_CHECKING:
+    from multilift_marl.config.system import System
+
+
+def _integer(value: Any) -> Any:
+    """Accept 2e6, which PyYAML reads as a string, where a whole number is meant; refuse true and false."""
+    if isinstance(value, bool):
+        raise ValueError("must be a whole number")
+    if isinstance(value, str | float):
+        try:
+            number = float(value)
+        except ValueError:
+            raise ValueError("must be a whole number") from None
+        if not number.is_integer():
+            raise ValueError("must be a whole number")
+        return int(number)
+    return value
+
+
+def _real(value: Any) -> Any:
+    """Accept 1e-3, which PyYAML reads as a string; refuse true and false."""
+    if isinstance(value, bool):
+        raise ValueError("must be a number")
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            raise ValueError("must be a number") from None
+    return value
+
+
+Int = Annotated[int, BeforeValidator(_integer)]
+Float = Annotated[float, BeforeValidator(_real)]
+Vector = tuple[Float, Float, Float]
+Positive = Annotated[Float, Field(gt=0)]
+PerDrone = Positive | tuple[Positive, ...]
+
+
+class Section(BaseModel):
+    """A frozen group of parameters that rejects unknown keys and values of the wrong type."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class EnvConfig(Section):
+    """Size and timing of the environment."""
+
+    num_drones: Int = Field(4, ge=1, le=64, description="drones in a team")
+    num_envs: Int = Field(256, ge=1, description="environments stepped together")
+    num_threads: Int = Field(0, ge=0, description="threads that step them; 0: one for each CPU")
+    episode_seconds: Float = Field(8.0, gt=0, description="[s] time limit of an episode")
+    policy_hz: Float = Field(50.0, gt=0, description="[Hz] rate of actions and observations")
+
+
+class SimConfig(Section):
+    """Time steps of physics and control."""
+
+    timestep: Float = Field(0.004, gt=0, le=0.02, description="[s] physics step")
+    control_hz: Float = Field(250.0, gt=0, description="[Hz] rate of the drones' controllers")
+
+
+class VehicleConfig(Section):
+    """The quadrotor."""
+
+    preset: str = Field("falcon", description="vehicle of config/vehicles.py")
+
+
+class PayloadConfig(Section):
+    """The load. None stands for the standard rig: 0.35 kg a drone, a box that carries the ring of anchors."""
+
+    shape: Literal["box", "point"] = Field("box", description="box, or point: a mass without extent")
+    mass: Float | None = Field(None, gt=0, description="[kg] None: 0.35 kg for each drone")
+    size: tuple[Positive, Positive, Positive] | None = Field(None, description="[m] edges of the box; None: fits")
+    inertia: tuple[Positive, Positive, Positive] | None = Field(
+        None, description="[kg m²] principal moments; None: of a uniform box"
+    )
+    anchors: tuple[Vector, ...] | None = Field(
+        None, description="[m] attachment of each cable from the centre of mass; None: the standard rig's"
+    )
+    drag_area: Float = Field(0.09, ge=0, description="[m²] C_d A of the payload (cube C_d 1.05 on its smaller faces)")
+
+
+class CableConfig(Section):
+    """The cables; lists hold one value for each drone."""
+
+    model: Literal["massless"] = Field("massless", description="massless: pull-only Kelvin-Voigt element")
+    length: PerDrone | None = Field(None, description="[m] natural length; None: 1 m, more if a point load needs it")
+    stiffness: PerDrone = Field(1e5, description="[N/m] of the whole cable")
+    damping: PerDrone = Field(1e3, description="[N s/m] of the whole cable")
+    angle: Float = Field(30.0, ge=0, lt=80, description="[deg] cables from the vertical in the resting formation")
+
+
+class ControlConfig(Section):
+    """The drones' geometric controller and its action interface."""
+
+    action: Literal["reference"] = Field("reference", description="what an action means (control/actions.py)")
+    max_offset: Float = Field(0.5, gt=0, description="[m] slot offset of a full action, along each axis")
+    max_yaw: Float = Field(0.5, gt=0, description="[rad] yaw offset of a full action")
+    reference_frequency: Float = Field(6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference")
+    reference_speed: Float = Field(1.0, gt=0, description="[m/s] speed limit of the smoothed reference")
+    position_frequency: Float = Field(4.0, gt=0, description="[rad/s] natural frequency of the position loop")
+    position_damping: Float = Field(1.0, gt=0, description="[-] its damping ratio")
+    attitude_frequency: Float = Field(20.0, gt=0, description="[rad/s] of roll and pitch; at most 0.7/motor lag")
+    attitude_damping: Float = Field(0.8, gt=0, description="[-] its damping ratio")
+    yaw_frequency: Float = Field(8.0, gt=0, description="[rad/s] natural frequency of yaw")
+
+
+class RandomizationConfig(Section):
+    """What each episode draws anew, always from the nominal values; hidden from the drones."""
+
+    payload_mass: Float = Field(0.0, ge=0, lt=1, description="[-] mass and inertia scaled by 1 ± this, uniform")
+    payload_force: Float = Field(0.0, ge=0, description="[N] constant horizontal force, magnitude uniform up to this")
+
+
+class WindConfig(Section):
+    """The air."""
+
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s] mean wind in the world frame")
+
+
+class TrainConfig(Section):
+    """PPO for a team with shared parameters."""
+
+    algorithm: Literal["mappo", "ippo"] = Field("mappo", description="mappo: central critic; ippo: local critic")
+    frames: Int = Field(6_000_000, ge=1, description="environment steps in all")
+    horizon: Int = Field(32, ge=1, description="steps of each environment between updates")
+    epochs: Int = Field(4, ge=1, description="passes over each batch")
+    minibatches: Int = Field(8, ge=1, description="minibatches of each pass")
+    learning_rate: Float = Field(5e-4, gt=0, description="[-] of Adam, at the start")
+    final_learning_rate: Float = Field(0.1, ge=0, le=1, description="[-] fraction of it left at the end (linear)")
+    gamma: Float = Field(0.99, ge=0, le=1, description="[-] discount of one policy step")
+    gae_lambda: Float = Field(0.95, ge=0, le=1, description="[-] of generalised advantage estimation")
+    clip: Float = Field(0.2, gt=0, description="[-] PPO's clipping range")
+    entropy: Float = Field(0.0, ge=0, description="[-] weight of the entropy bonus")
+    value_weight: Float = Field(1.0, ge=0, description="[-] weight of the critic's loss")
+    max_grad_norm: Float = Field(1.0, gt=0, description="[-] gradient clipping")
+    target_kl: Float = Field(0.03, gt=0, description="[-] approximate KL that ends an update early")
+    hidden: tuple[Int, ...] = Field((128, 128), description="[-] widths of the hidden layers")
+    initial_std: Float = Field(0.3, gt=0, description="[-] of the action distribution at the start")
+    checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
+
+
+class EvalConfig(Section):
+    """Evaluation during training, on seeds of its own."""
+
+    every: Int = Field(25, ge=1, description="iterations between evaluations")
+    episodes: Int = Field(128, ge=1, description="episodes of each")
+
+
+class Config(Section):
+    """The whole configuration."""
+
+    task: str = Field("hover", description="name of the task")
+    seed: Int = Field(0, ge=0, description="seed of everything random")
+    env: EnvConfig = EnvConfig()
+    sim: SimConfig = SimConfig()
+    vehicle: VehicleConfig = VehicleConfig()
+    payload: PayloadConfig = PayloadConfig()
+    cable: CableConfig = CableConfig()
+    control: ControlConfig = ControlConfig()
+    randomization: RandomizationConfig = RandomizationConfig()
+    wind: WindConfig = WindConfig()
+    reward: dict[str, Float] = Field({}, description="weights of the task's reward terms")
+    task_options: dict[str, Any] = Field({}, description="options of the task")
+    train: TrainConfig = TrainConfig()
+    eval: EvalConfig = EvalConfig()
+
+    @cached_property
+    def system(self) -> System:
+        """The physical system that this configuration describes, checked for possibility."""
+        from multilift_marl.config.system import resolve_system
+
+        return resolve_system(self)

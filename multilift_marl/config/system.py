@@ -1,0 +1,248 @@
+"""From a configuration to the physical system it describes, in numbers, refused in one sentence if impossible."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from multilift_marl.config.vehicles import PRESETS, Vehicle
+from multilift_marl.errors import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from multilift_marl.config.schema import Config
+
+GRAVITY = 9.81  # [m/s²]
+MIN_THRUST_TO_WEIGHT = 1.18
+MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the vehicle's span
+REST_SEPARATION = 0.6  # [m] between falcons at rest, by which the standard rig is sized
+_FALCON_SPAN = PRESETS["falcon"].span
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Drones, cables and payload in numbers (SI units; N drones).
+
+    Attributes:
+        vehicle: the quadrotor, the same for all drones.
+        payload_shape: "box" or "point".
+        payload_size: edges of the box (3,) [m].
+        payload_mass: nominal mass [kg].
+        payload_inertia: nominal principal moments (3,) [kg m²].
+        payload_drag_area: C_d A [m²].
+        anchors: attachment of each cable in the payload frame (N, 3) [m].
+        cable_length, cable_stiffness, cable_damping: (N,) [m], [N/m], [N s/m].
+        formation_force: pull of each cable on the resting payload, in the payload frame (N, 3) [N].
+        slots: resting drones in the payload frame, cables stretched by their tension (N, 3) [m].
+        slot_azimuth: direction of each slot from the payload, in its horizontal plane (N,) [rad].
+        min_separation: distance between drones that counts as a collision [m].
+        wind: mean wind (3,) [m/s].
+        timestep: physics step [s].
+        control_interval: physics steps for each control step.
+    """
+
+    vehicle: Vehicle
+    payload_shape: str
+    payload_size: np.ndarray
+    payload_mass: float
+    payload_inertia: np.ndarray
+    payload_drag_area: float
+    anchors: np.ndarray
+    cable_length: np.ndarray
+    cable_stiffness: np.ndarray
+    cable_damping: np.ndarray
+    formation_force: np.ndarray
+    slots: np.ndarray
+    slot_azimuth: np.ndarray
+    min_separation: float
+    wind: np.ndarray
+    timestep: float
+    control_interval: int
+
+    @property
+    def num_drones(self) -> int:
+        """Drones in the team, N."""
+        return len(self.anchors)
+
+    @property
+    def weight(self) -> float:
+        """Weight of payload and drones [N]."""
+        return GRAVITY * (self.payload_mass + self.num_drones * self.vehicle.mass)
+
+
+def resolve_system(config: Config) -> System:
+    """Return the system of `config`.
+
+    Raises:
+        ConfigError: it cannot exist or cannot fly; the message says why and what to change.
+    """
+    n, payload, cable = config.env.num_drones, config.payload, config.cable
+    if config.vehicle.preset not in PRESETS:
+        raise ConfigError(f"unknown vehicle.preset '{config.vehicle.preset}'{nearest(config.vehicle.preset, PRESETS)}")
+    vehicle = PRESETS[config.vehicle.preset]
+    scale = vehicle.span / _FALCON_SPAN
+    length = _per_drone(_standard_length(config, scale) if cable.length is None else cable.length, n, "cable.length")
+    anchors, size = _rig(config, n, length, scale)
+    mass = payload.mass if payload.mass is not None else 0.35 * n
+    inertia = payload.inertia or mass / 12 * np.array(
+        [size[1] ** 2 + size[2] ** 2, size[0] ** 2 + size[2] ** 2, size[0] ** 2 + size[1] ** 2]
+    )
+    inertia = np.asarray(inertia, float)
+    if 2 * inertia.max() > inertia.sum() * (1 + 1e-9):
+        raise ConfigError(
+            f"payload.inertia {inertia.tolist()} is impossible: no moment may exceed the sum of the other two"
+        )
+    stiffness = _per_drone(cable.stiffness, n, "cable.stiffness")
+    force = formation_forces(anchors, mass * GRAVITY, np.deg2rad(cable.angle), payload.shape == "point")
+    tension = np.linalg.norm(force, axis=1)
+    slots = anchors + force / tension[:, None] * (length + tension / stiffness)[:, None]
+    centred = np.hypot(slots[:, 0], slots[:, 1]) < 1e-9
+    system = System(
+        vehicle=vehicle,
+        payload_shape=payload.shape,
+        payload_size=size,
+        payload_mass=mass,
+        payload_inertia=inertia,
+        payload_drag_area=payload.drag_area,
+        anchors=anchors,
+        cable_length=length,
+        cable_stiffness=stiffness,
+        cable_damping=_per_drone(cable.damping, n, "cable.damping"),
+        formation_force=force,
+        slots=slots,
+        slot_azimuth=np.where(centred, 0.0, np.arctan2(slots[:, 1], slots[:, 0])),
+        min_separation=MIN_SEPARATION * scale,
+        wind=np.asarray(config.wind.velocity, float),
+        timestep=config.sim.timestep,
+        control_interval=whole_ratio(1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"),
+    )
+    _check_possible(system, length)
+    return system
+
+
+def _standard_length(config: Config, scale: float) -> float:
+    """Return 1 m for a falcon's span, or more where a ring of drones about one point would be too narrow."""
+    n, spread = config.env.num_drones, np.sin(np.deg2rad(config.cable.angle))
+    if config.payload.shape == "box" or n == 1 or spread == 0:
+        return scale
+    return scale * max(1.0, REST_SEPARATION / (2 * np.sin(np.pi / n) * spread))
+
+
+def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return anchors (n, 3) and the box's edges (3,): the configured or the standard ones of n drones."""
+    payload = config.payload
+    reach = length.min() * np.sin(np.deg2rad(config.cable.angle))
+    ring = max(0.27 * scale, REST_SEPARATION * scale / (2 * np.sin(np.pi / n)) - reach) if n > 1 else 0.0
+    if payload.size is not None:
+        size = np.asarray(payload.size, float)
+    elif n == 4:
+        size = np.array([0.55, 0.45, 0.15]) * scale
+    else:
+        edge = 2 * max(ring, 0.15 * scale)
+        size = np.array([edge, edge, 0.15 * scale])
+    if payload.anchors is not None:
+        anchors = np.asarray(payload.anchors, float)
+        if len(anchors) != n:
+            raise ConfigError(f"payload.anchors lists {len(anchors)} anchors for env.num_drones={n}: give one for each")
+    elif payload.shape == "point":
+        anchors = np.zeros((n, 3))
+    elif n == 4:
+        anchors = np.array([[0.27, 0.22, 0.08], [-0.27, 0.22, 0.08], [-0.27, -0.22, 0.08], [0.27, -0.22, 0.08]]) * scale
+    else:
+        azimuth = 2 * np.pi * np.arange(n) / n
+        anchors = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(n, 0.08 * scale)], axis=1)
+    if payload.shape == "point":
+        size = np.full(3, 0.1 * scale)
+        if np.any(anchors != 0):
+            raise ConfigError("payload.anchors of a point payload must all be [0, 0, 0]; use payload.shape=box for others")
+    return anchors, size
+
+
+def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bool) -> np.ndarray:
+    """Return the cables' pulls (N, 3) [N] that hold a payload level, as near as possible to `angle` from the vertical.
+
+    The pulls nearest to equal, symmetric ones in the least-squares sense among all that balance the weight and
+    its moments about the centre of mass.
+
+    Args:
+        anchors: (N, 3) [m] from the centre of mass.
+        weight: of the payload [N].
+        angle: of the cables from the vertical [rad].
+        point: True where the payload has no attitude to hold.
+
+    Raises:
+        ConfigError: no pulls balance the payload, or some cable would have to push.
+    """
+    n = len(anchors)
+    centre = anchors[:, :2].mean(axis=0)
+    radial = anchors[:, :2] - centre
+    distance = np.linalg.norm(radial, axis=1, keepdims=True)
+    even = 2 * np.pi * np.arange(n) / n
+    radial = np.where(distance > 1e-6, radial / np.maximum(distance, 1e-6), np.stack([np.cos(even), np.sin(even)], axis=1))
+    if n == 1:
+        radial = np.zeros((1, 2))
+    nominal = weight / n * np.concatenate([np.tan(angle) * radial, np.ones((n, 1))], axis=1)
+    balance = np.concatenate([np.eye(3)] * n, axis=1)
+    load = np.array([0, 0, weight, 0, 0, 0])
+    if point:
+        load = load[:3]
+    else:
+        moments = [[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in anchors]
+        balance = np.concatenate([balance, np.concatenate(np.array(moments, float), axis=1)], axis=0)
+    flat = nominal.ravel()
+    force = (flat + np.linalg.pinv(balance) @ (load - balance @ flat)).reshape(n, 3)
+    residual = np.abs(balance @ force.ravel() - load).max()
+    if residual > 1e-6 * weight:
+        raise ConfigError(
+            f"payload.anchors {np.round(anchors, 3).tolist()} cannot hold the payload level: place them around its centre of mass"
+        )
+    if np.any(force[:, 2] < 0.02 * weight / n):
+        raise ConfigError(
+            f"payload.anchors: cable {int(force[:, 2].argmin())} would have to push; move the anchors around the centre of mass"
+        )
+    return force
+
+
+def _check_possible(system: System, length: np.ndarray) -> None:
+    n, vehicle = system.num_drones, system.vehicle
+    outside = np.linalg.norm(np.maximum(np.abs(system.anchors) - system.payload_size / 2, 0), axis=1)
+    if np.any(outside > length):
+        i = int(np.argmax(outside - length))
+        raise ConfigError(
+            f"payload.anchors: anchor {i} is out of reach, {outside[i]:.2f} m outside the payload; move it onto the payload"
+        )
+    thrust = 4 * vehicle.rotor_thrust_max
+    if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
+        raise ConfigError(
+            f"{n} × {vehicle.name} lift {n * thrust:.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of payload and "
+            f"drones, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
+        )
+    hover = np.linalg.norm(system.formation_force + [0, 0, vehicle.mass * GRAVITY], axis=1)
+    if np.any(hover > thrust / 1.05):
+        i = int(hover.argmax())
+        raise ConfigError(
+            f"drone {i} would need {hover[i]:.1f} N of its {thrust:.1f} N to hover; lower payload.mass, cable.angle "
+            "or move payload.anchors so that the load is shared"
+        )
+    if n > 1:
+        apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)
+        if apart.min() < system.min_separation:
+            raise ConfigError(
+                f"neighbouring drones would rest {apart.min():.2f} m apart, closer than the separation limit of "
+                f"{system.min_separation:.2f} m; spread payload.anchors or raise cable.length or cable.angle"
+            )
+
+
+def _per_drone(value: float | tuple[float, ...], n: int, key: str) -> np.ndarray:
+    values = np.atleast_1d(np.asarray(value, float))
+    if len(values) not in (1, n) or (isinstance(value, tuple) and len(values) != n):
+        raise ConfigError(f"{key} lists {len(values)} values for env.num_drones={n}: give one value or one for each drone")
+    return np.broadcast_to(values, (n,)).copy()
+
+
+def whole_ratio(fast: float, slow: float, slow_key: str, fast_key: str) -> int:
+    ratio = round(fast / slow)
+    if ratio < 1 or abs(fast / slow - ratio) > 1e-6:
+        raise ConfigError(f"{slow_key}={slow:g} must divide {fast_key}={fast:g} into whole steps")
+    return ratio

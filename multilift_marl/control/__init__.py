@@ -1,0 +1,1 @@
+"""Control: thrust allocation, the geometric controller, the formation and the action interfaces."""

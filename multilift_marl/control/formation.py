@@ -1,0 +1,146 @@
+"""Where the drones belong: the formation about the payload's target pose, and the smooth way there."""
+
+from __future__ import annotations
+
+from math import cos, pi, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.math3d import add, clip, heading, limit, matrow, mul, put, row, scale, sub, turn, vec
+
+
+class Goal(NamedTuple):
+    """The payload's target and the formation about it."""
+
+    position: np.ndarray
+    """(E, 3) target of the payload's centre of mass [m]."""
+    rotation: np.ndarray
+    """(E, 3, 3) target attitude."""
+    yaw: np.ndarray
+    """(E,) heading of the target [rad]."""
+    slots: np.ndarray
+    """(E, N, 3) place of each drone with the payload at rest at the target, world frame [m]."""
+    slot_frame: np.ndarray
+    """(E, N, 2) cosine and sine of the slot frame's heading: x points outward from the payload, z up."""
+    pull: np.ndarray
+    """(E, N, 3) nominal force of each drone on its cable there [N]."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, num_drones: int) -> Goal:
+        """Return empty goals."""
+        e, n = num_envs, num_drones
+        return cls(*(np.zeros(shape) for shape in ((e, 3), (e, 3, 3), (e,), (e, n, 3), (e, n, 2), (e, n, 3))))
+
+
+class Rig(NamedTuple):
+    """The nominal formation in the payload frame, as System describes it."""
+
+    anchors: np.ndarray
+    """(N, 3) [m]."""
+    slots: np.ndarray
+    """(N, 3) [m]."""
+    azimuth: np.ndarray
+    """(N,) [rad]."""
+    force: np.ndarray
+    """(N, 3) [N]."""
+
+
+class Reference(NamedTuple):
+    """What the drones are told to follow: a command, smoothed."""
+
+    command: np.ndarray
+    """(E, N, 3) commanded position [m]."""
+    command_yaw: np.ndarray
+    """(E, N) [rad]."""
+    position: np.ndarray
+    """(E, N, 3) [m]."""
+    velocity: np.ndarray
+    """(E, N, 3) [m/s]."""
+    acceleration: np.ndarray
+    """(E, N, 3) [m/s²]."""
+    jerk: np.ndarray
+    """(E, N, 3) [m/s³]."""
+    yaw: np.ndarray
+    """(E, N) [rad]."""
+    yaw_rate: np.ndarray
+    """(E, N) [rad/s]."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, num_drones: int) -> Reference:
+        """Return references at the origin."""
+        e, n = num_envs, num_drones
+        shapes = ((e, n, 3), (e, n), (e, n, 3), (e, n, 3), (e, n, 3), (e, n, 3), (e, n), (e, n))
+        return cls(*(np.zeros(shape) for shape in shapes))
+
+
+@kernel
+def place_formation(e, goal, rig):
+    """Write slots, slot frames and pulls of environment e for its target pose."""
+    target, position = matrow(goal.rotation, e), row(goal.position, e)
+    yaw = heading(target)
+    goal.yaw[e] = yaw
+    c, s = cos(yaw), sin(yaw)
+    for n in range(rig.slots.shape[0]):
+        anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
+        cable = sub((rig.slots[n, 0], rig.slots[n, 1], rig.slots[n, 2]), anchor)
+        put(goal.slots[e, n], add(add(position, mul(target, anchor)), turn(c, s, cable)))
+        put(goal.pull[e, n], turn(c, s, (rig.force[n, 0], rig.force[n, 1], rig.force[n, 2])))
+        goal.slot_frame[e, n, 0] = cos(yaw + rig.azimuth[n])
+        goal.slot_frame[e, n, 1] = sin(yaw + rig.azimuth[n])
+
+
+@kernel
+def start_reference(e, state, reference):
+    """Let the references of environment e start where its drones are, at their velocities and headings."""
+    for n in range(reference.yaw.shape[1]):
+        put(reference.position[e, n], vec(state.drone_position, e, n))
+        put(reference.velocity[e, n], vec(state.drone_velocity, e, n))
+        reference.acceleration[e, n] = 0.0
+        reference.jerk[e, n] = 0.0
+        reference.yaw[e, n] = heading(matrow(state.drone_rotation[e], n))
+        reference.yaw_rate[e, n] = 0.0
+
+
+@kernel
+def smooth(lo, hi, reference, frequency, speed, dt):
+    """Move the references of environments lo to hi one control step towards their commands.
+
+    Position: a critically damped third-order filter, (s/ω + 1)³, whose input is limited so that far commands are
+    approached at `speed`; yaw: a second-order one.
+
+    Args:
+        lo, hi: the environments.
+        reference: Reference.
+        frequency: ω [rad/s].
+        speed: largest steady speed [m/s].
+        dt: control step [s].
+    """
+    w = frequency
+    for e in range(lo, hi):
+        for n in range(reference.yaw.shape[1]):
+            p, v, a = vec(reference.position, e, n), vec(reference.velocity, e, n), vec(reference.acceleration, e, n)
+            gap = limit(sub(vec(reference.command, e, n), p), 3.0 * speed / w)
+            jerk = sub(scale(w * w * w, gap), add(scale(3.0 * w * w, v), scale(3.0 * w, a)))
+            a = add(a, scale(dt, jerk))
+            v = add(v, scale(dt, a))
+            put(reference.position[e, n], add(p, scale(dt, v)))
+            put(reference.velocity[e, n], v)
+            put(reference.acceleration[e, n], a)
+            put(reference.jerk[e, n], jerk)
+            turn_gap = wrap(reference.command_yaw[e, n] - reference.yaw[e, n])
+            rate = reference.yaw_rate[e, n]
+            rate += dt * (w * w * clip(turn_gap, -1.0, 1.0) - 2.0 * w * rate)
+            reference.yaw_rate[e, n] = rate
+            reference.yaw[e, n] += dt * rate
+
+
+@kernel
+def wrap(angle):
+    """Return the angle in (-π, π]."""
+    while angle > pi:
+        angle -= 2.0 * pi
+    while angle <= -pi:
+        angle += 2.0 * pi
+    return angle

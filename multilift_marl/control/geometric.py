@@ -1,0 +1,150 @@
+"""The geometric controller on SO(3) that flies each drone (report eqs 25-32; Lee, Leok and McClamroch, CDC 2010)."""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.schema import ControlConfig
+from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.control.allocation import allocate, allocation_matrix
+from multilift_marl.math3d import (
+    add,
+    column,
+    cross,
+    dot,
+    mat,
+    matmul,
+    mul,
+    norm,
+    scale,
+    sub,
+    thrust_frame,
+    transpose,
+    unit,
+    vec,
+)
+
+
+class Gains(NamedTuple):
+    """Nominal parameters and gains; the plant may differ."""
+
+    mass: float
+    inertia: tuple[float, float, float]
+    k_p: float
+    """Position gain [1/s²]."""
+    k_v: float
+    """Velocity gain [1/s]."""
+    k_R: tuple[float, float, float]
+    """Attitude gains for unit inertia [1/s²]."""
+    k_w: tuple[float, float, float]
+    """Rate gains for unit inertia [1/s]."""
+    allocation: np.ndarray
+    """Inverse allocation matrix (4, 4)."""
+    thrust_min: float
+    """Of one rotor [N]."""
+    thrust_max: float
+    load_share: np.ndarray
+    """(N,) payload mass that each drone carries [kg]."""
+
+
+def make_gains(control: ControlConfig, system: System) -> Gains:
+    """Return gains for natural frequencies and damping ratios, attitude as fast as the motors allow (0.7/τ)."""
+    vehicle = system.vehicle
+    tilt = min(control.attitude_frequency, 0.7 / vehicle.rotor_time_constant)
+    frequency = np.array([tilt, tilt, min(control.yaw_frequency, tilt)])
+    return Gains(
+        mass=vehicle.mass,
+        inertia=tuple(float(moment) for moment in vehicle.inertia),
+        k_p=control.position_frequency**2,
+        k_v=2 * control.position_damping * control.position_frequency,
+        k_R=tuple(frequency**2),
+        k_w=tuple(2 * control.attitude_damping * frequency),
+        allocation=np.ascontiguousarray(np.linalg.inv(allocation_matrix(vehicle))),
+        thrust_min=vehicle.thrust_coefficient * vehicle.rotor_speed_min**2,
+        thrust_max=vehicle.rotor_thrust_max,
+        load_share=system.formation_force[:, 2] / GRAVITY,
+    )
+
+
+@kernel
+def desired_rates(attitude, force, force_rate, yaw, yaw_rate):
+    """Return Ω_d, the body rates of the frame that `thrust_frame` turns with force and yaw [rad/s].
+
+    With b3 = F/|F| and b2 = c/|c|, c = b3 × (cos ψ, sin ψ, 0), the derivatives of the unit vectors are those parts of
+    Ḟ/|F| and ċ/|c| that are perpendicular to b3 and b2; Ω_d = (-b2·ḃ3, b1·ḃ3, -b1·ḃ2).
+
+    Args:
+        attitude: R_d = thrust_frame(force, yaw), 9 numbers.
+        force, force_rate: F [N], Ḟ [N/s].
+        yaw, yaw_rate: ψ [rad], ψ̇ [rad/s].
+    """
+    b1, b2, b3 = column(attitude, 0), column(attitude, 1), column(attitude, 2)
+    b3_rate = scale(1.0 / max(norm(force), 1e-6), sub(force_rate, scale(dot(force_rate, b3), b3)))
+    heading = (cos(yaw), sin(yaw), 0.0)
+    heading_rate = (-yaw_rate * sin(yaw), yaw_rate * cos(yaw), 0.0)
+    side_rate = add(cross(b3_rate, heading), cross(b3, heading_rate))
+    turning = dot(b1, side_rate) / max(norm(cross(b3, heading)), 1e-3)
+    return (-dot(b2, b3_rate), dot(b1, b3_rate), -turning)
+
+
+@kernel
+def attitude_torque(attitude, rates, desired, desired_rate, g):
+    """Return the torque M of eqs 31-32 with Ω̇_d = 0 [N m].
+
+    Args:
+        attitude, desired: R and R_d, 9 numbers each.
+        rates, desired_rate: Ω and Ω_d in their own frames [rad/s].
+        g: Gains.
+    """
+    error = matmul(transpose(desired), attitude)
+    e_r = (0.5 * (error[7] - error[5]), 0.5 * (error[2] - error[6]), 0.5 * (error[3] - error[1]))
+    rotated = mul(transpose(error), desired_rate)
+    e_w = sub(rates, rotated)
+    momentum = (g.inertia[0] * rates[0], g.inertia[1] * rates[1], g.inertia[2] * rates[2])
+    gyroscopic = cross(rates, momentum)
+    transport = cross(rates, rotated)
+    return (
+        gyroscopic[0] - g.inertia[0] * (g.k_R[0] * e_r[0] + g.k_w[0] * e_w[0] + transport[0]),
+        gyroscopic[1] - g.inertia[1] * (g.k_R[1] * e_r[1] + g.k_w[1] * e_w[1] + transport[1]),
+        gyroscopic[2] - g.inertia[2] * (g.k_R[2] * e_r[2] + g.k_w[2] * e_w[2] + transport[2]),
+    )
+
+
+@kernel
+def fly(lo, hi, state, reference, pull, thrust, g):
+    """Compute the rotor thrusts that make the drones of environments lo to hi follow their references.
+
+    Thrust is the desired force along the actual body z axis, F_d · R e3 (Lee 2010), in place of eq 27's |a_d|.
+    The nominal pull of the cable, and the inertia of the load that hangs on it, are fed forward.
+
+    Args:
+        lo, hi: the environments.
+        state: SystemState.
+        reference: Reference to follow.
+        pull: nominal force that each drone exerts on its cable (E, N, 3) [N].
+        thrust: written, (E, N, 4) [N].
+        g: Gains.
+    """
+    for e in range(lo, hi):
+        for n in range(thrust.shape[1]):
+            position_error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
+            velocity_error = sub(vec(state.drone_velocity, e, n), vec(reference.velocity, e, n))
+            feedback = add(scale(g.k_p, position_error), scale(g.k_v, velocity_error))
+            moved = g.mass + g.load_share[n]
+            force = sub(scale(moved, vec(reference.acceleration, e, n)), scale(g.mass, feedback))
+            force = add(force, vec(pull, e, n))
+            force = (force[0], force[1], max(force[2] + g.mass * GRAVITY, 0.1 * g.mass * GRAVITY))
+            yaw, yaw_rate = reference.yaw[e, n], reference.yaw_rate[e, n]
+            desired = thrust_frame(force, yaw)
+            force_rate = scale(moved, vec(reference.jerk, e, n))
+            desired_rate = desired_rates(desired, force, force_rate, yaw, yaw_rate)
+            attitude = mat(state.drone_rotation, e, n)
+            torque = attitude_torque(attitude, vec(state.drone_body_rates, e, n), desired, desired_rate, g)
+            total = max(dot(force, unit(column(attitude, 2))), 0.0)
+            rotors = allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]

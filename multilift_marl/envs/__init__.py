@@ -1,0 +1,1 @@
+"""Doors to the environment: the batched core, PettingZoo, TorchRL."""

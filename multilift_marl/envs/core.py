@@ -1,0 +1,261 @@
+"""The batched environment that every door leads to: E environments of N drones, stepped together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.schema import Config
+from multilift_marl.config.system import whole_ratio
+from multilift_marl.control.actions import ACTIONS
+from multilift_marl.control.formation import Reference, smooth, start_reference
+from multilift_marl.control.geometric import fly, make_gains
+from multilift_marl.errors import ConfigError
+from multilift_marl.sim.randomization import randomize
+from multilift_marl.sim.world import Shard, World
+from multilift_marl.tasks import find_task
+from multilift_marl.tasks.failures import CAUSES, DIVERGED
+from multilift_marl.tasks.observations import OBSERVATION_SIZE, STATE_DRONE, STATE_SHARED, observation_names
+
+TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
+_MAX_REDRAWS = 1000
+
+
+class MultiliftVec:
+    """E environments of one task. The core does not reset by itself.
+
+    Args:
+        config: what to build.
+        purpose: first part of every episode's seed: training, evaluation during training, or evaluation.
+        first_env: number of the first environment; environment e here is number first_env + e.
+
+    Attributes:
+        num_envs, num_drones, observation_size, action_size, state_size: E, N, D, A, S.
+        observation_names, action_names: names of the D and A numbers.
+        reward_terms: names of the reward terms.
+        failure_causes: names of the values of `info["failure_cause"]`.
+        world: the physics; `world.state` is the true state.
+        task: the task; `task.goal` and `task.errors` say where the payload should be.
+    """
+
+    def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
+        task = find_task(config.task)
+        self.config, self.purpose, self.first_env = config, purpose, first_env
+        system, control = config.system, config.control
+        self.num_envs, self.num_drones = config.env.num_envs, system.num_drones
+        self._ticks = whole_ratio(config.sim.control_hz, config.env.policy_hz, "env.policy_hz", "sim.control_hz")
+        self.max_steps = round(config.env.episode_seconds * config.env.policy_hz)
+        if self.max_steps < 1:
+            raise ConfigError(f"env.episode_seconds={config.env.episode_seconds} is shorter than one step; raise it")
+        e, n = self.num_envs, self.num_drones
+        self._gains = make_gains(control, system)
+        self._interface = ACTIONS[control.action](control)
+        self._smoothing = (control.reference_frequency, control.reference_speed, 1.0 / config.sim.control_hz)
+        self.world = World(system, e, config.env.num_threads)
+        self.reference = Reference.zeros(e, n)
+        self.task = task(config, self.world, self.reference)
+        self.action_names = self._interface.names
+        self.action_size, self.observation_size = len(self.action_names), OBSERVATION_SIZE
+        self.observation_names = observation_names()
+        self.state_size = STATE_SHARED + n * STATE_DRONE
+        self.reward_terms, self.failure_causes = tuple(task.REWARD), CAUSES
+        self._action = np.zeros((e, n, self.action_size))
+        self._previous = np.zeros_like(self._action)
+        self._thrust = np.zeros((e, n, 4))
+        self._observation = np.zeros((e, n, OBSERVATION_SIZE), np.float32)
+        self._state = np.zeros((e, self.state_size), np.float32)
+        self._mass = np.full(e, system.payload_mass)
+        self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
+        self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
+
+    def reset(
+        self, seed: int | None = None, mask: np.ndarray | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start new episodes in the environments in `mask` (E,) (None: all).
+
+        Args:
+            seed: start at episode 0 of this seed; None goes to each environment's next episode.
+            mask: bool (E,).
+            options: reserved; must be empty.
+
+        Returns:
+            Observations of all environments (E, N, D) float32, rows outside the mask unchanged, and info.
+
+        Raises:
+            ValueError: a mask of wrong shape or type, a negative seed, or an unknown option.
+        """
+        if options:
+            raise ValueError(f"unknown reset option '{next(iter(options))}'; this task has none")
+        mask = np.ones(self.num_envs, bool) if mask is None else self._checked_mask(mask)
+        if seed is not None:
+            if seed < 0:
+                raise ValueError(f"seed must not be negative, but is {seed}")
+            self.seeds[mask], self.episodes[mask] = seed, -1
+        self.episodes[mask] += 1
+        drawn = np.flatnonzero(mask)
+        for e in drawn:
+            self._draw(int(e))
+        self.world.set_payload_mass(mask, self._mass)
+        self.world.load(mask)
+        self._action[mask] = self._previous[mask] = 0.0
+        self.steps[mask], self._ended[mask] = 0, False
+        self.task.terms[mask] = 0.0
+        for e in drawn:
+            start_reference(e, self.world.state, self.reference)
+            self.task.observe(e, e + 1, self._action, self._observation, self._state)
+        none = np.zeros(self.num_envs, bool)
+        return self._observation.copy(), self._info(none, none)
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance all environments by one policy step.
+
+        Args:
+            action: (E, N, A) floating point; values beyond [-1, 1] are clipped.
+
+        Returns:
+            observation (E, N, D) float32, reward (E, N) float32, terminated (E,), truncated (E,), info.
+
+        Raises:
+            ValueError: wrong shape or dtype, or an action that is not finite.
+            RuntimeError: an environment has ended and was not reset.
+        """
+        self._accept(action)
+        self.world.run(self._advance)
+        self.world.check_warnings()
+        self.steps += 1
+        diverged = self.world.diverged
+        if diverged.any():
+            self.task.cause[diverged], self.task.terms[diverged] = DIVERGED, 0.0
+        terminated = self.task.cause > 0
+        truncated = ~terminated & (self.steps >= self.max_steps)
+        self._ended = terminated | truncated
+        reward = np.repeat(self.task.terms.sum(axis=1, dtype=np.float64)[:, None], self.num_drones, axis=1)
+        info = self._info(terminated, truncated)
+        return self._observation.copy(), reward.astype(np.float32), terminated, truncated, info
+
+    def state(self) -> np.ndarray:
+        """Return the global state (E, S) float32, which holds what is hidden from the drones."""
+        return self._state.copy()
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return copies of everything that later steps depend on."""
+        saved = {f"world.{key}": array for key, array in self.world.state_dict().items()}
+        saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
+        saved |= {f"reference.{key}": array.copy() for key, array in self.reference._asdict().items()}
+        for name in ("_action", "_observation", "_state", "seeds", "episodes", "steps", "_ended"):
+            saved[name] = getattr(self, name).copy()
+        return saved
+
+    def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
+        """Continue bit for bit from what `state_dict` returned."""
+        groups: dict[str, dict[str, np.ndarray]] = {"world": {}, "task": {}, "reference": {}}
+        for key, array in saved.items():
+            group, _, name = key.partition(".")
+            if name:
+                groups[group][name] = array
+            else:
+                getattr(self, key)[:] = array
+        self.world.load_state_dict(groups["world"])
+        self.task.load_state_dict(groups["task"])
+        for name, array in groups["reference"].items():
+            getattr(self.reference, name)[:] = array
+
+    def _advance(self, shard: Shard) -> None:
+        """One policy step of one shard, on its own thread."""
+        lo, hi, world, interval = shard.lo, shard.hi, self.world, self.world.system.control_interval
+        self._interface.apply(lo, hi, self._action, self.task.goal, self.reference)
+        for _ in range(self._ticks):
+            smooth(lo, hi, self.reference, *self._smoothing)
+            fly(lo, hi, world.state, self.reference, self.task.goal.pull, self._thrust, self._gains)
+            world.advance(shard, self._thrust, interval)
+        self.task.check(lo, hi, self.task.dt)
+        self.task.score(lo, hi, self._action, self._previous)
+        self.task.observe(lo, hi, self._action, self._observation, self._state)
+
+    def _draw(self, e: int) -> None:
+        """Draw hidden parameters and a sound start for one environment."""
+        key = (self.purpose, self.first_env + e, int(self.episodes[e]))
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(int(self.seeds[e]), spawn_key=key)))
+        randomize(self.world, e, rng, self.config.randomization, self._mass)
+        for _ in range(_MAX_REDRAWS):
+            self.task.start(e, rng, float(self._mass[e]))
+            if self.task.begin(e):
+                return
+        raise ConfigError(
+            f"no start of task {self.task.name} is free of failure ({CAUSES[self.task.cause[e]]}) in {_MAX_REDRAWS} draws; "
+            "narrow the start ranges in task_options or change the rig"
+        )
+
+    def _accept(self, action: np.ndarray) -> None:
+        action = np.asarray(action)
+        if action.shape != self._action.shape:
+            raise ValueError(f"action has shape {action.shape}, expected (environments, drones, numbers) {self._action.shape}")
+        if action.dtype.kind != "f":
+            raise ValueError(f"action has dtype {action.dtype}, expected floating point numbers in [-1, 1]")
+        if not np.isfinite(action).all():
+            e, n, k = np.argwhere(~np.isfinite(action))[0]
+            raise ValueError(
+                f"action of drone_{n} in environment {e} is not finite ({self.action_names[k]}={action[e, n, k]}); "
+                "look for NaN in the policy"
+            )
+        if self._ended.any():
+            raise RuntimeError(
+                f"environment {int(np.argmax(self._ended))} has ended or was never reset: call reset(mask=...) before step"
+            )
+        self._previous[:] = self._action
+        np.clip(action, -1.0, 1.0, out=self._action, casting="same_kind")
+
+    def _info(self, terminated: np.ndarray, truncated: np.ndarray) -> dict[str, Any]:
+        return {
+            "success": truncated & self.task.succeeded(),
+            "failure": terminated.copy(),
+            "diverged": self.world.diverged.copy(),
+            "failure_cause": np.where(terminated, self.task.cause, 0),
+            "reward_terms": {name: self.task.terms[:, i].copy() for i, name in enumerate(self.reward_terms)},
+        }
+
+    def _checked_mask(self, mask: np.ndarray) -> np.ndarray:
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(
+                f"mask has shape {mask.shape} and dtype {mask.dtype}, expected bool {(self.num_envs,)}, one for each environment"
+            )
+        return mask
+
+
+def resolve_config(
+    task: str | Config, *, num_envs: int | None = None, num_threads: int | None = None,
+    num_drones: int | None = None, seed: int | None = None, **overrides: Any,
+) -> Config:  # fmt: skip
+    """Return the configuration that every door builds from; None means the configured value."""
+    named = {"env.num_envs": num_envs, "env.num_threads": num_threads, "env.num_drones": num_drones, "seed": seed}
+    overrides |= {key: value for key, value in named.items() if value is not None}
+    return build_config(task.model_dump(), overrides) if isinstance(task, Config) else load_config(task, overrides)
+
+
+def make_vec(
+    task: str | Config = "hover", *, num_envs: int | None = None, num_threads: int | None = None,
+    num_drones: int | None = None, seed: int | None = None, first_env: int = 0, **overrides: Any,
+) -> MultiliftVec:  # fmt: skip
+    """Return E environments of a task on the batched core.
+
+    Args:
+        task: a configuration's name, the path of one, or a Config.
+        num_envs: E.
+        num_threads: threads that step them; 0 for one on each CPU. Results do not depend on it.
+        num_drones: N.
+        seed: seed of the first reset.
+        first_env: number of the first environment, for replaying one of a larger batch.
+        **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
+
+    Raises:
+        ConfigError: an unknown key, a wrong value or an impossible system.
+    """
+    config = resolve_config(
+        task, num_envs=num_envs, num_threads=num_threads, num_drones=num_drones, seed=seed, **overrides
+    )
+    return MultiliftVec(config, first_env=first_env)

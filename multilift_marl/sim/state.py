@@ -1,0 +1,75 @@
+"""What the simulation tells: plain arrays with the environment as first axis. E environments, N drones."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class SystemState(NamedTuple):
+    """The physical state (float64, SI units; world z up, body x forward, y left, z up)."""
+
+    payload_position: np.ndarray
+    """(E, 3) centre of mass, world frame [m]."""
+    payload_rotation: np.ndarray
+    """(E, 3, 3) body to world; the identity for a point payload."""
+    payload_velocity: np.ndarray
+    """(E, 3) world frame [m/s]."""
+    payload_body_rates: np.ndarray
+    """(E, 3) body frame [rad/s]."""
+    drone_position: np.ndarray
+    """(E, N, 3) centre of mass, world frame [m]."""
+    drone_rotation: np.ndarray
+    """(E, N, 3, 3) body to world."""
+    drone_velocity: np.ndarray
+    """(E, N, 3) world frame [m/s]."""
+    drone_body_rates: np.ndarray
+    """(E, N, 3) body frame [rad/s]."""
+    rotor_speed: np.ndarray
+    """(E, N, 4) [rad/s]."""
+    cable_tension: np.ndarray
+    """(E, N) in the last physics step [N]; exactly 0 when slack."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, num_drones: int) -> SystemState:
+        """Return a state at the origin."""
+        e, n = num_envs, num_drones
+        state = cls(
+            *(np.zeros(shape) for shape in ((e, 3), (e, 3, 3), (e, 3), (e, 3))),
+            *(np.zeros(shape) for shape in ((e, n, 3), (e, n, 3, 3), (e, n, 3), (e, n, 3), (e, n, 4), (e, n))),
+        )
+        state.payload_rotation[:] = np.eye(3)
+        state.drone_rotation[:] = np.eye(3)
+        return state
+
+
+class Plant(NamedTuple):
+    """True parameters and loads that may differ between environments and that no drone is told."""
+
+    payload_mass: np.ndarray
+    """(E,) [kg]."""
+    payload_force: np.ndarray
+    """(E, 3) constant external force on the payload's centre of mass, world frame [N]."""
+    wind: np.ndarray
+    """(E, 3) air velocity, world frame [m/s]."""
+
+
+class Record(NamedTuple):
+    """What accumulates over an episode, at every physics step."""
+
+    energy: np.ndarray
+    """(E,) ∫ Σ rotor torque · rotor speed [J]."""
+    tension_min: np.ndarray
+    """(E,) smallest cable tension [N]."""
+    tension_max: np.ndarray
+    """(E,) largest cable tension [N]."""
+    slack_time: np.ndarray
+    """(E,) time with any cable slack [s]."""
+    stretch_max: np.ndarray
+    """(E,) largest tension over stiffness, relative to the cable's length [-]."""
+
+    @classmethod
+    def zeros(cls, num_envs: int) -> Record:
+        """Return an empty record."""
+        return cls(*(np.zeros(num_envs) for _ in cls._fields))

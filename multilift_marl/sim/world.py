@@ -1,0 +1,226 @@
+"""Many simulations of one system: MuJoCo's batched stepping, one shard of environments for each thread."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+from multilift_marl.config.system import System
+from multilift_marl.math3d import mat_to_quat
+from multilift_marl.sim.cables import limit_solref
+from multilift_marl.sim.dynamics import apply_loads, hover_drone, make_constants, read_rows, write_rows
+from multilift_marl.sim.scene import build_model
+from multilift_marl.sim.state import Plant, Record, SystemState
+
+_log = logging.getLogger("multilift_marl.mujoco")
+REST_HEIGHT = 1.5  # [m] of the payload after World.reset
+
+
+@dataclass
+class Shard:
+    """Environments lo to hi, stepped by one thread."""
+
+    lo: int
+    hi: int
+    batch: Batch
+    tension: np.ndarray
+    """(hi - lo, N) live view of the tension sensors [N]."""
+
+
+class World:
+    """Physics alone: E simulations of a system, rotor thrusts in, physical state out.
+
+    Args:
+        system: what to simulate, such as `load_config("hover").system`.
+        num_envs: E.
+        num_threads: threads; 0 for one on each available CPU. Results do not depend on it, bit for bit.
+
+    Attributes:
+        state: SystemState of all environments; live arrays, E first.
+        plant: true parameters and loads; write `wind` and `payload_force` freely, the mass by `set_payload_mass`.
+        record: what accumulated since the reset.
+        diverged: (E,) bool, until reset.
+    """
+
+    def __init__(self, system: System, num_envs: int, num_threads: int = 0):
+        _quiet_mujoco()
+        self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
+        self.model, self.layout = build_model(system)
+        self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
+        first = self.shards[0].batch
+        offsets = [_offset(first, name) for name in ("qpos", "qvel", "qfrc_applied", "qacc_warmstart")]
+        self.constants = make_constants(system, self.layout, *offsets)
+        self.state = SystemState.zeros(num_envs, self.num_drones)
+        self.plant = Plant(
+            payload_mass=np.full(num_envs, system.payload_mass),
+            payload_force=np.zeros((num_envs, 3)),
+            wind=np.tile(system.wind, (num_envs, 1)),
+        )
+        self.record = Record.zeros(num_envs)
+        self.diverged = np.zeros(num_envs, bool)
+        self._pool, self._pool_owner = None, 0
+        self.reset()
+
+    def reset(self, mask: np.ndarray | None = None) -> SystemState:
+        """Put the environments in `mask` (E,) (None: all) at rest in formation, payload 1.5 m above the ground."""
+        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool)
+        system, state = self.system, self.state
+        state.payload_position[mask] = [0, 0, REST_HEIGHT]
+        state.payload_rotation[mask] = np.eye(3)
+        state.payload_velocity[mask] = state.payload_body_rates[mask] = 0
+        state.drone_position[mask] = system.slots + [0, 0, REST_HEIGHT]
+        state.drone_velocity[mask] = state.drone_body_rates[mask] = 0
+        vehicle = system.vehicle
+        for e in np.flatnonzero(mask):
+            for n, pull in enumerate(system.formation_force):
+                hover_drone(e, n, state, tuple(pull), 0.0, vehicle.mass, vehicle.thrust_coefficient)
+        self.set_payload_mass(mask, np.full(self.num_envs, system.payload_mass))
+        self.plant.payload_force[mask] = 0
+        self.plant.wind[mask] = system.wind
+        self.load(mask)
+        return state
+
+    def step(self, thrust: np.ndarray, nstep: int = 1) -> SystemState:
+        """Advance all environments by `nstep` physics steps.
+
+        Args:
+            thrust: commanded thrust of each rotor (E, N, 4) [N]; the rotors follow with their lag and limits.
+            nstep: physics steps.
+
+        Returns:
+            The live state. Tensions are those of the last step, all else is current.
+
+        Raises:
+            ValueError: wrong shape, or a thrust that is not finite.
+        """
+        thrust = np.ascontiguousarray(thrust, np.float64)
+        if thrust.shape != (self.num_envs, self.num_drones, 4):
+            raise ValueError(f"thrust has shape {thrust.shape}, expected {(self.num_envs, self.num_drones, 4)}")
+        if not np.isfinite(thrust).all():
+            raise ValueError("thrust holds NaN or infinite values; give each rotor's thrust in newtons")
+        self.run(lambda shard: self.advance(shard, thrust, nstep))
+        return self.state
+
+    def advance(self, shard: Shard, thrust: np.ndarray, nstep: int) -> None:
+        """Advance one shard; see `step`. Does not check its arguments."""
+        rows, lo, hi, batch = shard.batch.state, shard.lo, shard.hi, shard.batch
+        for _ in range(nstep):
+            apply_loads(rows, lo, hi, thrust, self.state, self.plant, self.record, self.constants)
+            try:
+                batch.step()
+            except SimulationError as error:
+                self.diverged[lo + np.asarray(error.ids, int)] = True
+            read_rows(rows, lo, hi, shard.tension, self.state, self.record, self.diverged, self.constants)
+
+    def run(self, work: Callable[[Shard], None]) -> None:
+        """Call `work` for every shard, each on a thread of its own."""
+        if len(self.shards) == 1:
+            return work(self.shards[0])
+        if self._pool is None or self._pool_owner != os.getpid():  # threads do not survive a fork
+            self._pool = ThreadPoolExecutor(len(self.shards) - 1, thread_name_prefix="multilift")
+            self._pool_owner = os.getpid()
+        others = [self._pool.submit(work, shard) for shard in self.shards[1:]]
+        try:
+            work(self.shards[0])
+        finally:
+            for other in others:
+                other.result()
+
+    def set_payload_mass(self, mask: np.ndarray, mass: np.ndarray) -> None:
+        """Give the payload of the environments in `mask` (E,) a true `mass` (E,) [kg]; inertia scales with it.
+
+        The constants that MuJoCo derives from masses follow, and so do the cables' constraint parameters.
+        """
+        changed = mask & (mass != self.plant.payload_mass)
+        if not changed.any():
+            return
+        self.plant.payload_mass[changed] = mass[changed]
+        body, system = self.layout.payload_body, self.system
+        for shard in self.shards:
+            local = changed[shard.lo : shard.hi]
+            if not local.any():
+                continue
+            new = mass[shard.lo : shard.hi][local]
+            shard.batch.expand("body_mass")[local, body] = new
+            shard.batch.expand("body_inertia")[local, body] = (
+                system.payload_inertia * (new / system.payload_mass)[:, None]
+            )
+            solref = shard.batch.expand("tendon_solref_lim")
+            shard.batch.set_const(local)
+            inverse_weight = shard.batch.expanded("tendon_invweight0")[local]
+            solref[local] = limit_solref(system.cable_stiffness, system.cable_damping, inverse_weight)
+
+    def load(self, mask: np.ndarray) -> None:
+        """Make `state` of the environments in `mask` (E,) the simulations' own; their records start anew."""
+        for shard in self.shards:
+            local = mask[shard.lo : shard.hi]
+            if local.any():
+                shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
+                write_rows(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.record, self.constants)
+        self.diverged[mask] = False
+
+    def check_warnings(self) -> None:
+        """Mark environments for which MuJoCo has counted a warning as diverged."""
+        for shard in self.shards:
+            if shard.batch.warning.any():
+                self.diverged[shard.lo : shard.hi] |= shard.batch.warning[:, :, 1].any(axis=1)
+
+    def qpos(self, env: int) -> np.ndarray:
+        """Return MuJoCo's generalised coordinates of one environment, to draw it."""
+        shard = next(shard for shard in self.shards if shard.lo <= env < shard.hi)
+        return shard.batch.bind("qpos")[env - shard.lo]
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return copies of all that the future of the simulations depends on."""
+        saved = {f"state.{name}": array.copy() for name, array in self.state._asdict().items()}
+        saved |= {f"plant.{name}": array.copy() for name, array in self.plant._asdict().items()}
+        saved |= {f"record.{name}": array.copy() for name, array in self.record._asdict().items()}
+        saved["rows"] = np.concatenate([shard.batch.state for shard in self.shards])
+        saved["warning"] = np.concatenate([shard.batch.warning for shard in self.shards])
+        saved["diverged"] = self.diverged.copy()
+        return saved
+
+    def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
+        """Continue bit for bit from what `state_dict` returned, at any number of threads."""
+        self.set_payload_mass(np.ones(self.num_envs, bool), saved["plant.payload_mass"])
+        for prefix, group in (("state", self.state), ("plant", self.plant), ("record", self.record)):
+            for name, array in group._asdict().items():
+                array[:] = saved[f"{prefix}.{name}"]
+        for shard in self.shards:
+            shard.batch.state[:] = saved["rows"][shard.lo : shard.hi]
+            shard.batch.warning[:] = saved["warning"][shard.lo : shard.hi]
+        self.diverged[:] = saved["diverged"]
+
+    def _make_shards(self, num_threads: int) -> list[Shard]:
+        edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int)
+        shards = []
+        for lo, hi in zip(edges[:-1], edges[1:], strict=True):
+            batch = Batch(self.model, int(hi - lo), nthread=1)
+            shards.append(Shard(int(lo), int(hi), batch, batch.bind("sensordata")))
+        return shards
+
+
+def quaternions(rotation: np.ndarray) -> np.ndarray:
+    """Return unit quaternions (..., 4), w first, of rotation matrices (..., 3, 3)."""
+    flat = rotation.reshape(-1, 9)
+    return np.array([mat_to_quat(tuple(m)) for m in flat]).reshape(*rotation.shape[:-2], 4)
+
+
+def _offset(batch: Batch, name: str) -> int:
+    """Return where a state field starts in a row of `batch.state`."""
+    view = batch.bind(name)
+    start = view.__array_interface__["data"][0] - batch.state.__array_interface__["data"][0]
+    return start // batch.state.itemsize
+
+
+def _quiet_mujoco() -> None:
+    """Send MuJoCo's warnings to the log "multilift_marl.mujoco" in place of a file in the working directory."""
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(_log.debug)

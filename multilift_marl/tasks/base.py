@@ -1,0 +1,124 @@
+"""The contract between a task and the environment core."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import ValidationError
+
+from multilift_marl.config.schema import Config, Section
+from multilift_marl.control.formation import Goal, Reference, Rig
+from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.sim.world import World
+from multilift_marl.tasks import observations
+from multilift_marl.tasks.failures import find_failures, make_limits
+from multilift_marl.tasks.terms import Errors, measure
+
+INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
+
+
+class Task:
+    """A cooperative transport task for E environments of N drones.
+
+    A subclass says how an episode starts (`start`), what the team is paid and when it does well (`score`), and what
+    counts as success at the end (`succeeded`). Goal, errors, failures and observations are kept here; time limit,
+    seeding, divergence and clipping of actions belong to the core.
+
+    Class attributes:
+        name: registry name.
+        Options: its `task_options`, typed.
+        REWARD: default weight of every reward term; `reward.<term>` overrides.
+
+    Attributes:
+        goal, errors: Goal, Errors; live arrays.
+        cause: failure cause (E,), an index into `failures.CAUSES`.
+        terms: weighted reward terms (E, T) in the order of `REWARD`.
+        good_time: time since the payload was last outside the success region (E,) [s].
+        min_separation: smallest distance between drones in the episode (E,) [m].
+    """
+
+    name: ClassVar[str]
+    Options: ClassVar[type[Section]] = Section
+    REWARD: ClassVar[dict[str, float]] = {}
+
+    def __init__(self, config: Config, world: World, reference: Reference):
+        e, n, system = world.num_envs, world.num_drones, world.system
+        self.world, self.reference = world, reference
+        self.options = self._options(config.task_options)
+        self.weights = self._weights(config.reward)
+        self.dt = 1.0 / config.env.policy_hz
+        self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
+        self.rig = Rig(system.anchors, system.slots, system.slot_azimuth, system.formation_force)
+        self.limits = make_limits(system)
+        tension = np.linalg.norm(system.formation_force, axis=1)
+        self._nominal = np.append(np.stack([system.cable_length, tension], axis=1), [[system.payload_mass, 0]], axis=0)
+        self.cause, self.good_time = np.zeros(e, np.int64), np.zeros(e)
+        self.min_separation = np.zeros(e)
+        self.terms = np.zeros((e, len(self.REWARD)))
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw a start of one environment: write its goal and `world.state`, for a payload of true `mass` [kg]."""
+        raise NotImplementedError
+
+    def score(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> None:
+        """Write `terms` and update `good_time` of environments lo to hi.
+
+        Args:
+            lo, hi: the environments.
+            action, previous: this action and the last one (E, N, A).
+        """
+        raise NotImplementedError
+
+    def succeeded(self) -> np.ndarray:
+        """Return which environments (E,) would be successes if they ended now."""
+        raise NotImplementedError
+
+    def begin(self, env: int) -> bool:
+        """Reset the measurements of one environment to its drawn start; return whether that start is sound."""
+        self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
+        self.good_time[env], self.min_separation[env] = 0.0, 1e9
+        self.check(env, env + 1, 0.0)
+        return self.cause[env] == 0
+
+    def check(self, lo: int, hi: int, dt: float) -> None:
+        """Measure errors of environments lo to hi, integrate them over `dt` [s], and look for failures."""
+        measure(lo, hi, self.world.state, self.goal, self.errors, dt, INTEGRAL_LIMIT)
+        find_failures(lo, hi, self.world.state, self.errors, self.limits, self.cause, self.min_separation)
+
+    def observe(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> None:
+        """Write observations (E, N, D) and global states (E, S) of environments lo to hi."""
+        observations.observe_team(
+            lo, hi, self.world.state, self.world.plant, self.goal, self.reference, self.errors, action,
+            self.rig, self._nominal, observation, critic,
+        )  # fmt: skip
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return copies of the task's arrays that outlive a step."""
+        saved = {name: getattr(self, name).copy() for name in ("cause", "good_time", "min_separation")}
+        for group in ("goal", "errors"):
+            saved |= {f"{group}.{name}": array.copy() for name, array in getattr(self, group)._asdict().items()}
+        return saved
+
+    def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
+        """Restore what `state_dict` returned."""
+        for key, array in saved.items():
+            owner, _, name = key.rpartition(".")
+            getattr(getattr(self, owner) if owner else self, name)[:] = array
+
+    def _options(self, values: dict[str, Any]) -> Section:
+        try:
+            return self.Options.model_validate(values)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = str(first["loc"][0])
+            if first["type"] == "extra_forbidden":
+                hint = nearest(key, self.Options.model_fields)
+                raise ConfigError(f"unknown key 'task_options.{key}' of task {self.name}{hint}") from None
+            raise ConfigError(f"task_options.{key}: {first['msg']}, but is {first['input']!r}") from None
+
+    def _weights(self, values: dict[str, float]) -> np.ndarray:
+        for term in values:
+            if term not in self.REWARD:
+                raise ConfigError(f"unknown key 'reward.{term}' of task {self.name}{nearest(term, self.REWARD)}")
+        return np.array(list((self.REWARD | values).values()), float)

@@ -1,0 +1,140 @@
+"""Hover: hold the payload at a target pose, whatever its mass and whatever pushes it."""
+
+from __future__ import annotations
+
+from math import cos, pi, radians, sin, sqrt
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.schema import Float, Section
+from multilift_marl.control.formation import place_formation
+from multilift_marl.math3d import add, axis_angle, heading, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
+from multilift_marl.sim.dynamics import hover_drone
+from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.terms import tolerance
+
+
+class HoverOptions(Section):
+    """Ranges of the start and bounds of success."""
+
+    target_xy: Float = Field(1.0, ge=0, description="[m] target x and y within ± this")
+    target_height: tuple[Float, Float] = Field((1.0, 2.0), description="[m] lowest and highest target")
+    target_yaw: Float = Field(45.0, ge=0, le=180, description="[deg] target heading within ± this")
+    start_radius: Float = Field(0.5, ge=0, description="[m] start within a ball of this radius about the target")
+    start_tilt: Float = Field(10.0, ge=0, le=90, description="[deg] largest tilt of the payload at the start")
+    start_speed: Float = Field(0.3, ge=0, description="[m/s] largest speed of the team at the start")
+    success_distance: Float = Field(0.05, gt=0, description="[m] payload within this of its target ...")
+    success_angle: Float = Field(5.0, gt=0, description="[deg] ... and within this of its attitude ...")
+    success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds of the episode")
+
+
+class Hover(Task):
+    """Hold the payload at a pose; see docs/hover.md."""
+
+    name: ClassVar[str] = "hover"
+    Options: ClassVar[type[Section]] = HoverOptions
+    REWARD: ClassVar[dict[str, float]] = {
+        "position": 0.4,
+        "precision": 0.25,
+        "attitude": 0.15,
+        "level": 0.1,
+        "stillness": 0.1,
+        "action_rate": -0.05,
+    }
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw target, displacement, tilt and velocity; see `Task.start`."""
+        option, world, vehicle = self.options, self.world, self.world.system.vehicle
+        ranges = StartRanges(
+            option.target_xy, *option.target_height, radians(option.target_yaw),
+            option.start_radius, radians(option.start_tilt), option.start_speed,
+        )  # fmt: skip
+        load = mass / world.system.payload_mass
+        team = (world.system.cable_length, world.system.cable_stiffness, load, vehicle.mass, vehicle.thrust_coefficient)
+        _start(env, rng, world.state, self.goal, self.rig, ranges, team)
+
+    def score(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> None:
+        """Pay for closeness, attitude and stillness; see `Task.score`."""
+        success = (self.options.success_distance, radians(self.options.success_angle))
+        _score(
+            lo, hi, self.world.state, self.errors, action, previous, self.weights, success, self.dt,
+            self.terms, self.good_time,
+        )  # fmt: skip
+
+    def succeeded(self) -> np.ndarray:
+        """Within the success region throughout the last seconds."""
+        return self.good_time >= self.options.success_seconds - 1e-9
+
+
+class StartRanges(NamedTuple):
+    """HoverOptions of the start, in SI units."""
+
+    xy: float
+    low: float
+    high: float
+    yaw: float
+    radius: float
+    tilt: float
+    speed: float
+
+
+@kernel
+def in_ball(rng, radius):
+    """Return a vector uniform in a ball."""
+    z, azimuth = rng.uniform(-1.0, 1.0), rng.uniform(-pi, pi)
+    r = radius * rng.uniform(0.0, 1.0) ** (1.0 / 3.0)
+    flat = r * sqrt(1.0 - z * z)
+    return (flat * cos(azimuth), flat * sin(azimuth), r * z)
+
+
+@kernel
+def _start(e, rng, state, goal, rig, ranges, team):
+    cable_length, cable_stiffness, load, drone_mass, thrust_coefficient = team
+    x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
+    put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))
+    putmat(goal.rotation[e], rot_z(rng.uniform(-ranges.yaw, ranges.yaw)))
+    place_formation(e, goal, rig)
+    moved = in_ball(rng, ranges.radius)
+    axis = in_ball(rng, 1.0)
+    tilt = axis_angle(scale(1.0 / max(norm(axis), 1e-9), axis), rng.uniform(0.0, ranges.tilt))
+    velocity = in_ball(rng, ranges.speed)
+    payload = add((goal.position[e, 0], goal.position[e, 1], goal.position[e, 2]), moved)
+    attitude = matmul(tilt, matrow(goal.rotation, e))
+    if rig.anchors.shape[0] == 1 or not np.any(rig.anchors != 0.0):
+        attitude = matrow(goal.rotation, e) if np.any(rig.anchors != 0.0) else rot_z(0.0)
+    put(state.payload_position[e], payload)
+    put(state.payload_velocity[e], velocity)
+    putmat(state.payload_rotation[e], attitude)
+    state.payload_body_rates[e] = 0.0
+    for n in range(rig.slots.shape[0]):
+        anchor = add(payload, mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
+        cable = sub(add(vec(goal.slots, e, n), moved), anchor)
+        direction = scale(1.0 / norm(cable), cable)
+        tension = load * norm(vec(goal.pull, e, n))
+        put(state.drone_position[e, n], add(anchor, scale(cable_length[n] + tension / cable_stiffness[n], direction)))
+        put(state.drone_velocity[e, n], velocity)
+        state.drone_body_rates[e, n] = 0.0
+        hover_drone(e, n, state, scale(tension, direction), heading(matrow(goal.rotation, e)), drone_mass, thrust_coefficient)
+
+
+@kernel
+def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms, good_time):
+    for e in range(lo, hi):
+        distance, angle = errors.distance[e], errors.angle[e]
+        speed = norm((state.payload_velocity[e, 0], state.payload_velocity[e, 1], state.payload_velocity[e, 2]))
+        spin = norm((state.payload_body_rates[e, 0], state.payload_body_rates[e, 1], state.payload_body_rates[e, 2]))
+        change, count = 0.0, action.shape[1] * action.shape[2]
+        for n in range(action.shape[1]):
+            for k in range(action.shape[2]):
+                change += (action[e, n, k] - previous[e, n, k]) ** 2
+        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
+        terms[e, 1] = weights[1] * tolerance(distance, 0.02)
+        terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
+        terms[e, 3] = weights[3] * tolerance(angle, radians(1.0))
+        terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
+        terms[e, 5] = weights[5] * change / count
+        good = distance <= success[0] and angle <= success[1]
+        good_time[e] = good_time[e] + dt if good else 0.0

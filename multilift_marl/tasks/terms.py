@@ -1,0 +1,55 @@
+"""The one shaped reward primitive, and what every task measures: errors against the goal and their integrals."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.math3d import clip, matmul, matrow, norm, put, rotation_vector, row, sub, transpose
+
+
+@kernel
+def tolerance(value, margin):
+    """Return 1 at value 0, falling with a long tail: 1/2 at `margin`, 1/10 at three times the margin."""
+    return 1.0 / (1.0 + (value / margin) ** 2)
+
+
+class Errors(NamedTuple):
+    """How far the payload is from its goal."""
+
+    position: np.ndarray
+    """(E, 3) payload minus target, world frame [m]."""
+    rotation: np.ndarray
+    """(E, 3) rotation vector from target to payload attitude, world frame [rad]."""
+    distance: np.ndarray
+    """(E,) [m]."""
+    angle: np.ndarray
+    """(E,) [rad]."""
+    position_integral: np.ndarray
+    """(E, 3) ∫ position dt, each component clipped [m s]."""
+    rotation_integral: np.ndarray
+    """(E, 3) ∫ rotation dt, each component clipped [rad s]."""
+
+    @classmethod
+    def zeros(cls, num_envs: int) -> Errors:
+        """Return zero errors."""
+        e = num_envs
+        return cls(*(np.zeros(shape) for shape in ((e, 3), (e, 3), (e,), (e,), (e, 3), (e, 3))))
+
+
+@kernel
+def measure(lo, hi, state, goal, errors, dt, largest):
+    """Update the errors of environments lo to hi and integrate them over `dt` [s], each integral within ± `largest`."""
+    for e in range(lo, hi):
+        put(errors.position[e], sub(row(state.payload_position, e), row(goal.position, e)))
+        turned = matmul(matrow(state.payload_rotation, e), transpose(matrow(goal.rotation, e)))
+        put(errors.rotation[e], rotation_vector(turned))
+        errors.distance[e] = norm(row(errors.position, e))
+        errors.angle[e] = norm(row(errors.rotation, e))
+        for j in range(3):
+            moved = errors.position_integral[e, j] + dt * errors.position[e, j]
+            errors.position_integral[e, j] = clip(moved, -largest, largest)
+            moved = errors.rotation_integral[e, j] + dt * errors.rotation[e, j]
+            errors.rotation_integral[e, j] = clip(moved, -largest, largest)
