@@ -131,6 +131,9 @@ class TrainConfig(Section):
     """PPO for a team with shared parameters."""
 
     algorithm: Literal["mappo", "ippo"] = Field("mappo", description="mappo: central critic; ippo: local critic")
+    residual: Literal["formation", "formation_integral"] = Field(
+        "formation", description="script that an untrained policy flies and the learned one corrects"
+    )
     frames: Int = Field(6_000_000, ge=1, description="environment steps in all")
     horizon: Int = Field(32, ge=1, description="steps of each environment between updates")
     epochs: Int = Field(4, ge=1, description="passes over each batch")

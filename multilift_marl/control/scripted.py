@@ -1,12 +1,15 @@
-"""Scripted teams, with the interface of learned policies: the yardsticks."""
+"""Scripted teams, with the interface of learned policies: the yardsticks, and what learned ones start from."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from multilift_marl.errors import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from multilift_marl.envs.core import MultiliftVec
 
 INTEGRAL_GAIN = 0.5  # [1/s]
 
@@ -14,12 +17,18 @@ INTEGRAL_GAIN = 0.5  # [1/s]
 class Formation:
     """Every drone holds its slot about the target payload pose: the zero action of the `reference` interface."""
 
-    def __init__(self, observation_names: Sequence[str], max_offset: float):
-        self.observation_names, self.max_offset = tuple(observation_names), max_offset
+    def __init__(self, vec: MultiliftVec):
+        self._names, self._actions = vec.observation_names, vec.action_names
+        self._max_offset = vec.config.control.max_offset
+        self._matrix = self.matrix()
+
+    def matrix(self) -> np.ndarray:
+        """Return M (A, D) float32 with which the action is M times the observation, clipped to [-1, 1]."""
+        return np.zeros((len(self._actions), len(self._names)), np.float32)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (..., N, 4) for observations (..., N, D)."""
-        return np.zeros((*np.shape(observation)[:-1], 4), np.float32)
+        """Return actions (..., N, A) for observations (..., N, D)."""
+        return np.clip(np.einsum("...d,ad->...a", np.asarray(observation, np.float32), self._matrix), -1, 1)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget nothing: the integral is part of the observation."""
@@ -28,18 +37,18 @@ class Formation:
 class FormationIntegral(Formation):
     """The formation with its slots moved against the clipped integral of the payload's position error."""
 
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (..., N, 4) for observations (..., N, D)."""
-        action = super().act(observation)
-        first = self.observation_names.index("payload_error_integral_0")
-        action[..., :3] = -INTEGRAL_GAIN / self.max_offset * np.asarray(observation)[..., first : first + 3]
-        return np.clip(action, -1, 1)
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        matrix = super().matrix()
+        for axis in range(3):
+            matrix[axis, self._names.index(f"payload_error_integral_{axis}")] = -INTEGRAL_GAIN / self._max_offset
+        return matrix
 
 
 SCRIPTED: dict[str, type[Formation]] = {"formation": Formation, "formation_integral": FormationIntegral}
 
 
-def make_scripted(name: str, vec) -> Formation:
+def make_scripted(name: str, vec: MultiliftVec) -> Formation:
     """Return the scripted policy `name` for the environments `vec`.
 
     Raises:
@@ -47,4 +56,4 @@ def make_scripted(name: str, vec) -> Formation:
     """
     if name not in SCRIPTED:
         raise ConfigError(f"unknown scripted policy '{name}'{nearest(name, SCRIPTED)}")
-    return SCRIPTED[name](vec.observation_names, vec.config.control.max_offset)
+    return SCRIPTED[name](vec)

@@ -131,7 +131,7 @@ def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms,
             for k in range(action.shape[2]):
                 change += (action[e, n, k] - previous[e, n, k]) ** 2
         terms[e, 0] = weights[0] * tolerance(distance, 0.25)
-        terms[e, 1] = weights[1] * tolerance(distance, 0.02)
+        terms[e, 1] = weights[1] * tolerance(distance, 0.01)
         terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
         terms[e, 3] = weights[3] * tolerance(angle, radians(1.0))
         terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3)

@@ -1,0 +1,110 @@
+"""The record of a run: TensorBoard events, metrics.csv, versions.json."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from torch.utils.tensorboard import SummaryWriter
+
+_PACKAGES = ("multilift_marl", "numpy", "mujoco", "numba", "torch", "torchrl", "tensordict", "gymnasium", "pettingzoo")
+
+
+class RunLog:
+    """Writes each iteration's numbers to TensorBoard and to metrics.csv.
+
+    Args:
+        folder: the run's folder.
+        iteration: rows after this iteration, left by a run that was stopped, are dropped.
+    """
+
+    def __init__(self, folder: Path, iteration: int = 0):
+        self._path = folder / "metrics.csv"
+        self._rows = [row for row in read_metrics(folder) if int(row["iteration"]) <= iteration]
+        self._columns = list(self._rows[0]) if self._rows else []
+        if self._rows:
+            self._rewrite()
+        self._writer = SummaryWriter(str(folder), purge_step=iteration + 1 if iteration else None)
+
+    def write(self, row: dict[str, float], values: dict[str, float]) -> None:
+        """Write one iteration: `row` holds iteration and frames, `values` the numbers; TensorBoard's step is frames."""
+        line = {**row, **values}
+        new = [name for name in line if name not in self._columns]
+        self._rows.append(line)
+        if new:  # columns that come only with an evaluation
+            self._columns += new
+            self._rewrite()
+        else:
+            with open(self._path, "a", newline="", encoding="utf-8") as file:
+                csv.DictWriter(file, self._columns, restval="").writerow(line)
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, row["frames"])
+
+    def close(self) -> None:
+        """Flush and close the event file."""
+        self._writer.close()
+
+    def _rewrite(self) -> None:
+        with open(self._path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self._columns, restval="")
+            writer.writeheader()
+            writer.writerows(self._rows)
+
+
+def read_metrics(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's metrics.csv, empty if there are none yet."""
+    path = folder / "metrics.csv"
+    if not path.is_file():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def write_versions(folder: Path) -> None:
+    """Write versions.json: git commit, packages, Python and CPU."""
+    (folder / "versions.json").write_text(
+        json.dumps(
+            {
+                "git_commit": _git_commit(),
+                "python": platform.python_version(),
+                "platform": platform.platform(),
+                "cpu": _cpu(),
+                "packages": {name: _version(name) for name in _PACKAGES},
+            },
+            indent=2,
+        )
+        + "\n",
+        encoding="utf-8",
+    )
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _git_commit() -> str | None:
+    """Return the commit of the checkout that holds this package, marked "-dirty" if it has changes."""
+    here = Path(__file__).parent
+    command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        tracked = subprocess.run(["git", "-C", str(here), "ls-files", "--error-unmatch", __file__], capture_output=True)
+        done = subprocess.run(command, capture_output=True, text=True)
+    except OSError:  # no git on this machine
+        return None
+    return done.stdout.strip() if done.returncode == 0 and tracked.returncode == 0 else None
+
+
+def _cpu() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor()

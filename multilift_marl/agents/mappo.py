@@ -1,0 +1,124 @@
+"""PPO for teams: MAPPO with a critic of the global state, IPPO with a critic of each drone's own observation."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import IndependentNormal, PopArtValueNorm, ProbabilisticActor
+from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
+from torchrl.objectives.value import MultiAgentGAE
+
+from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic
+from multilift_marl.config.schema import TrainConfig
+from multilift_marl.control.scripted import make_scripted
+from multilift_marl.envs.torchrl_env import MultiliftEnv
+
+
+@dataclass
+class Learner:
+    """What learns: networks, loss, advantage estimator, optimiser."""
+
+    config: TrainConfig
+    actor: Actor
+    critic: nn.Module
+    policy: ProbabilisticActor
+    loss: MAPPOLoss
+    advantage: MultiAgentGAE
+    optimizer: torch.optim.Adam
+
+
+def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
+    """Return an untrained learner for `env`."""
+    # 1. The policy: own observation to a Gaussian over the own action.
+    vec = env.vec
+    base = torch.from_numpy(make_scripted(config.residual, vec).matrix())
+    actor = Actor(vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
+    agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
+    policy = ProbabilisticActor(
+        TensorDictModule(actor, in_keys=[agents["observation"]], out_keys=[agents["loc"], agents["scale"]]),
+        in_keys=[agents["loc"], agents["scale"]],
+        out_keys=[agents["action"]],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+        log_prob_key=("agents", "action_log_prob"),
+    )
+
+    # 2. The critic: values are sums of rewards over about 1/(1 - gamma) steps.
+    scale = 1.0 / max(1.0 - config.gamma, 0.01)
+    if config.algorithm == "mappo":
+        critic, source = CentralCritic(vec.state_size, vec.num_drones, config.hidden, scale), "state"
+    else:
+        critic, source = LocalCritic(vec.observation_size, config.hidden, scale), agents["observation"]
+    value = TensorDictModule(critic, in_keys=[source], out_keys=[agents["state_value"]])
+
+    # 3. The loss and the advantage estimator. Time-outs are bootstrapped: only `terminated` ends a return.
+    keys = {"value": agents["state_value"], "reward": agents["reward"], "done": "done", "terminated": "terminated"}
+    loss = (MAPPOLoss if config.algorithm == "mappo" else IPPOLoss)(
+        policy, value, value_norm=PopArtValueNorm(shape=1, beta=0.999), clip_epsilon=config.clip,
+        entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.value_weight,
+        loss_critic_type="l2", normalize_advantage=False,
+    )  # fmt: skip
+    loss.set_keys(**keys, action=agents["action"], sample_log_prob=("agents", "action_log_prob"))
+    advantage = MultiAgentGAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=value)
+    advantage.set_keys(**keys)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate, eps=1e-5)
+    return Learner(config, actor, critic, policy, loss, advantage, optimizer)
+
+
+def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
+    """Improve the policy on one batch of rollouts [E, T]; return diagnostics.
+
+    Args:
+        learner: changed in place.
+        batch: what the collector returned.
+    """
+    config, start = learner.config, time.perf_counter()
+    # 1. Advantages, from values of the critic before the update.
+    with torch.no_grad():
+        learner.advantage(batch)
+    residual = batch["value_target"] - batch["agents", "state_value"]
+    explained = 1 - residual.var() / batch["value_target"].var().clamp(min=1e-8)
+    keep = [("agents", key) for key in ("observation", "action", "action_log_prob")] + ["state", "value_target"]
+    data = batch.select(*keep, "advantage").reshape(-1)
+    advantage = data["advantage"]
+    data["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
+
+    # 2. Some epochs of minibatches, fewer if the policy moves too far.
+    size, diagnostics, stop = data.shape[0] // config.minibatches, [], False
+    for _ in range(config.epochs):
+        order = torch.randperm(data.shape[0])
+        for chunk in order.split(size):
+            losses = learner.loss(data[chunk])
+            total = losses["loss_objective"] + losses["loss_critic"]
+            if config.entropy > 0:
+                total = total + losses["loss_entropy"]
+            learner.optimizer.zero_grad(set_to_none=True)
+            total.backward()
+            norm = nn.utils.clip_grad_norm_(learner.loss.parameters(), config.max_grad_norm)
+            learner.optimizer.step()
+            values = [losses["kl_approx"], losses["clip_fraction"], losses["loss_objective"], losses["loss_critic"], norm]
+            diagnostics.append(torch.stack([value.detach().mean() for value in values]))
+        if torch.stack(diagnostics[-config.minibatches :])[:, 0].mean() > config.target_kl:
+            stop = True
+            break
+
+    # 3. Statistics of the observations, for the next rollouts.
+    learner.actor.normalizer.update(batch["agents", "observation"])
+    source = "state" if config.algorithm == "mappo" else ("agents", "observation")
+    learner.critic.normalizer.update(batch[source])
+
+    mean = torch.stack(diagnostics).mean(0)
+    names = ("approx_kl", "clip_fraction", "loss_policy", "loss_critic", "gradient_norm")
+    result = dict(zip(names, mean.tolist(), strict=True))
+    entropy = 0.5 * torch.log(2 * torch.pi * torch.e * learner.actor.log_std.detach().exp() ** 2).sum()
+    return result | {
+        "explained_variance": explained.item(),
+        "entropy": entropy.item(),
+        "stopped_early": float(stop),
+        "learning_seconds": time.perf_counter() - start,
+    }

@@ -1,0 +1,82 @@
+"""Trained policies for use: NumPy in, NumPy out, torch inside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+from multilift_marl.agents.networks import Actor
+from multilift_marl.config.load import build_config
+from multilift_marl.errors import CheckpointError
+
+_SHIPPED = Path(__file__).resolve().parents[1] / "policies"
+_KEPT = ("config", "actor", "observation_names", "action_names", "frames")  # what a policy needs of a checkpoint
+
+
+class LearnedPolicy:
+    """The deterministic policy of a checkpoint, the same network for every drone and any number of them.
+
+    Attributes:
+        config: the configuration it was trained with.
+        observation_names, action_names: what its inputs and outputs mean.
+    """
+
+    def __init__(self, content: dict[str, Any], source: str):
+        self.config = build_config(content["config"])
+        self.observation_names, self.action_names = tuple(content["observation_names"]), tuple(content["action_names"])
+        self.source = source
+        weights, size = content["actor"], (len(self.observation_names), len(self.action_names))
+        self.actor = Actor(*size, self.config.train.hidden, self.config.train.initial_std, torch.zeros(size[1], size[0]))
+        try:
+            self.actor.load_state_dict(weights)
+        except RuntimeError as error:
+            raise CheckpointError(f"{source} holds a network of another shape; train again") from error
+
+    @torch.no_grad()
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the mean action (..., N, A) float32 within [-1, 1] for observations (..., N, D).
+
+        Raises:
+            ValueError: observations of another size than the policy was trained with.
+        """
+        observation = np.asarray(observation, np.float32)
+        if observation.shape[-1] != len(self.observation_names):
+            raise ValueError(
+                f"observation has {observation.shape[-1]} numbers, the policy of {self.source} was trained with "
+                f"{len(self.observation_names)}; use the environment configuration that it was trained in"
+            )
+        return self.actor(torch.from_numpy(observation))[0].clamp(-1, 1).numpy()
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Forget nothing: the policy has no memory of its own."""
+
+
+def load_policy(name: str | Path) -> LearnedPolicy:
+    """Return a trained policy.
+
+    Args:
+        name: a run folder (its best checkpoint is taken), a checkpoint file, or the name of a shipped policy ("hover").
+
+    Raises:
+        CheckpointError: missing, truncated or foreign.
+    """
+    path = Path(name)
+    if path.is_dir():
+        best = path / "checkpoints" / "best.pt"
+        path = best if best.is_file() else path / "checkpoints" / "last.pt"
+    elif not path.is_file() and (_SHIPPED / f"{name}.pt").is_file():
+        path = _SHIPPED / f"{name}.pt"
+    content = load_checkpoint(path)
+    if missing := [key for key in _KEPT if key not in content]:
+        raise CheckpointError(f"{path} holds no policy ('{missing[0]}' is missing); give a checkpoint of a training run")
+    return LearnedPolicy(content, str(path))
+
+
+def strip_checkpoint(path: str | Path, out: str | Path) -> None:
+    """Write the policy alone, without optimiser and environments, of the checkpoint `path` to `out`."""
+    content = load_checkpoint(path)
+    save_checkpoint(Path(out), {key: content[key] for key in _KEPT})

@@ -1,0 +1,211 @@
+"""A training run: collect, learn, evaluate, log, save; resumable at any iteration, bit for bit."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torchrl.collectors import Collector
+from tqdm import tqdm
+
+from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+from multilift_marl.agents.logging import RunLog, write_versions
+from multilift_marl.agents.mappo import make_learner, update
+from multilift_marl.config.load import build_config, dump_config
+from multilift_marl.config.schema import Config
+from multilift_marl.envs.core import TRAINING_EVALUATION
+from multilift_marl.envs.torchrl_env import MultiliftEnv
+from multilift_marl.evaluation.metrics import summarize
+from multilift_marl.evaluation.rollout import fly_episodes
+
+
+class Trainer:
+    """Trains one configuration in one run folder.
+
+    Args:
+        config: what to train.
+        folder: the run's folder, made by `new_run` or left by a run to resume.
+        checkpoint: content of the checkpoint to go on from.
+    """
+
+    def __init__(self, config: Config, folder: Path, checkpoint: dict[str, Any] | None = None):
+        torch.set_num_threads(1)  # small networks: threads cost more than they give
+        torch.manual_seed(config.seed)
+        self.config, self.folder = config, folder
+        self.env = MultiliftEnv(config)
+        self.learner = make_learner(config.train, self.env)
+        self.frames_per_batch = config.env.num_envs * config.train.horizon
+        self.iterations = -(-config.train.frames // self.frames_per_batch)
+        self.iteration, self.seconds = 0, 0.0
+        self.best = (-1.0, -float("inf"))  # success, negative error
+        self._returns = np.zeros(config.env.num_envs)  # of the episodes in flight
+        self._stop = False
+        if checkpoint is not None:
+            self._restore(checkpoint)
+        self.collector = Collector(
+            self.env, self.learner.policy, frames_per_batch=self.frames_per_batch, total_frames=-1, track_traj_ids=False
+        )
+        self._batches = iter(self.collector)
+        if checkpoint is not None:
+            torch.set_rng_state(checkpoint["rng"])
+        self.log = RunLog(folder, self.iteration)
+
+    def run(self) -> bool:
+        """Train to the end; return False if the user stopped it. Ctrl-C saves and stops, a second one stops at once."""
+        previous = signal.signal(signal.SIGINT, self._interrupt)
+        name = f"{self.config.task} {self.config.train.algorithm}"
+        bar = tqdm(total=self.iterations, initial=self.iteration, desc=name, unit="it", dynamic_ncols=True)
+        shown: dict[str, str] = {}
+        try:
+            while self.iteration < self.iterations and not self._stop:
+                values = self.step()
+                if "return" in values:
+                    shown["return"] = f"{values['return']:.0f}"
+                last = self.iteration == self.iterations
+                if self.iteration % self.config.eval.every == 0 or last:
+                    values |= self.evaluate()
+                    shown["success"] = f"{values['eval/success_rate']:.0%}"
+                    shown["error"] = f"{100 * values['eval/payload_position_error_m']:.1f} cm"
+                self.log.write({"iteration": self.iteration, "frames": self.frames}, values)
+                if self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
+                    self.save("last")
+                bar.set_postfix(shown)
+                bar.update()
+        finally:
+            bar.close()
+            self.log.close()
+            signal.signal(signal.SIGINT, previous)
+        return not self._stop
+
+    def step(self) -> dict[str, float]:
+        """Collect one batch, learn from it, and return the iteration's numbers."""
+        start = time.perf_counter()
+        progress = self.iteration / self.iterations
+        rate = self.config.train.learning_rate * (1 - (1 - self.config.train.final_learning_rate) * progress)
+        for group in self.learner.optimizer.param_groups:
+            group["lr"] = rate
+        batch = next(self._batches)
+        sampling = time.perf_counter() - start
+        values = update(self.learner, batch)
+        learning = values.pop("learning_seconds")
+        values |= self._episodes(batch)
+        self.iteration += 1
+        self.seconds += time.perf_counter() - start
+        return values | {
+            "learning_rate": rate,
+            "fps": self.frames_per_batch / (sampling + learning),
+            "share_sampling": sampling / (sampling + learning),
+            "share_learning": learning / (sampling + learning),
+        }
+
+    @property
+    def frames(self) -> int:
+        """Environment steps so far."""
+        return self.iteration * self.frames_per_batch
+
+    def evaluate(self) -> dict[str, float]:
+        """Fly the deterministic policy on the seeds of evaluation during training; keep the best checkpoint."""
+        from multilift_marl.agents.policy import LearnedPolicy  # a copy, without exploration
+
+        policy = LearnedPolicy(self._content(), "the run")
+        episodes = fly_episodes(
+            self.config, lambda vec: policy, self.config.eval.episodes, self.config.seed, TRAINING_EVALUATION
+        )
+        summary = summarize(episodes)
+        names = ("success_rate", "payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")
+        values = {f"eval/{name}": summary[name]["mean"] for name in names}
+        score = (values["eval/success_rate"], -values["eval/payload_position_error_m"])
+        if score > self.best:
+            self.best = score
+            self.save("best")
+        return values
+
+    def save(self, name: str) -> None:
+        """Write checkpoints/<name>.pt."""
+        save_checkpoint(self.folder / "checkpoints" / f"{name}.pt", self._content() | self._training_state())
+
+    def _content(self) -> dict[str, Any]:
+        """Return what a policy needs."""
+        vec = self.env.vec
+        return {
+            "config": self.config.model_dump(mode="json"),
+            "actor": self.learner.actor.state_dict(),
+            "observation_names": list(vec.observation_names),
+            "action_names": list(vec.action_names),
+            "frames": self.frames,
+        }
+
+    def _training_state(self) -> dict[str, Any]:
+        """Return what else training depends on."""
+        return {
+            "loss": self.learner.loss.state_dict(),  # actor and critic with normalisers, value normaliser
+            "optimizer": self.learner.optimizer.state_dict(),
+            "rng": torch.get_rng_state(),
+            "env": self.env.get_state(),
+            "returns": torch.from_numpy(self._returns.copy()),
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "best": list(self.best),
+        }
+
+    def _restore(self, content: dict[str, Any]) -> None:
+        self.learner.loss.load_state_dict(content["loss"])
+        self.learner.optimizer.load_state_dict(content["optimizer"])
+        self.env.set_state(content["env"])
+        self._returns[:] = content["returns"].numpy()
+        self.iteration, self.seconds, self.best = content["iteration"], content["seconds"], tuple(content["best"])
+
+    def _episodes(self, batch: Any) -> dict[str, float]:
+        """Return statistics of the rollouts: reward terms, and of the episodes that ended: return, success, causes."""
+        rewards = batch["next", "agents", "reward"].mean(dim=(-2, -1)).double().numpy()
+        done = batch["next", "done"].squeeze(-1).numpy()
+        finished = []
+        for t in range(rewards.shape[1]):
+            self._returns += rewards[:, t]
+            finished += self._returns[done[:, t]].tolist()
+            self._returns[done[:, t]] = 0.0
+        info = batch["next", "info"]
+        terms = info["reward_terms"].mean(dim=(0, 1)).tolist()
+        values = {f"reward/{name}": term for name, term in zip(self.env.vec.reward_terms, terms, strict=True)}
+        values["reward/total"] = float(rewards.mean())
+        if finished:
+            values["return"] = float(np.mean(finished))
+            values["success"] = info["success"].sum().item() / len(finished)
+            values["failure"] = info["failure"].sum().item() / len(finished)
+        values["diverged"] = info["diverged"].sum().item()
+        return values
+
+    def _interrupt(self, signum: int, frame: Any) -> None:
+        if self._stop:
+            raise KeyboardInterrupt
+        self._stop = True
+        tqdm.write("stopping after this iteration; press Ctrl-C again to stop at once")
+
+
+def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Path:
+    """Make and return runs/<name>-<time>-s<seed>/ with the resolved configuration and the versions in it."""
+    stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}-s{config.seed}"
+    folder, again = runs / stem, 1
+    while folder.exists():
+        again += 1
+        folder = runs / f"{stem}-{again}"
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
+    write_versions(folder)
+    return folder
+
+
+def resume_run(folder: Path, overrides: dict[str, Any]) -> Trainer:
+    """Return a trainer that goes on from the last checkpoint of `folder`.
+
+    Raises:
+        CheckpointError: there is none that can be read.
+        ConfigError: an override that a run in progress cannot take.
+    """
+    content = load_checkpoint(folder / "checkpoints" / "last.pt")
+    config = build_config(content["config"], overrides)
+    return Trainer(config, folder, content)

@@ -1,0 +1,65 @@
+"""`python train.py config=hover`, installed as `multilift-train`."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from multilift_marl.cli.common import run_command
+from multilift_marl.config.load import load_config
+from multilift_marl.errors import ConfigError
+
+_USAGE = """Train a team.
+
+  python train.py config=hover [key=value ...]     a new run in runs/<config>-<time>-s<seed>/
+  python train.py resume=<run|latest>              go on with a run from its last checkpoint
+
+  config   a shipped configuration's name or the path of a YAML file (default hover)
+  resume   a run folder; takes only train.frames, train.checkpoint_every, eval.* and env.num_threads beside it"""
+
+_RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.episodes", "env.num_threads")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train; return the exit status."""
+    return run_command(_train, _USAGE, arguments)
+
+
+def _train(values: dict[str, Any]) -> int:
+    warnings.filterwarnings("ignore", module=r"torchrl|tensordict")
+    from multilift_marl.agents.checkpoint import find_run
+    from multilift_marl.agents.trainer import Trainer, new_run, resume_run
+
+    if "resume" in values:
+        folder = find_run(values.pop("resume"))
+        for key in values:
+            if key not in _RESUMABLE:
+                raise ConfigError(f"'{key}' cannot change when a run is resumed; start a new run, or give one of: {', '.join(_RESUMABLE)}")
+        trainer = resume_run(folder, values)
+        print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
+    else:
+        name = str(values.pop("config", "hover"))
+        config = load_config(name, values)
+        _ = config.system  # refuse an impossible system before a folder is made
+        folder = new_run(config, Path(name).stem)
+        trainer = Trainer(config, folder)
+        print(f"training {config.train.frames:,} steps in {folder}")
+    finished = trainer.run()
+    minutes = trainer.seconds / 60
+    if not finished:
+        print(f"stopped after {minutes:.1f} min of training; go on with: python train.py resume={folder}")
+        return 130
+    print(
+        f"trained {trainer.frames:,} steps in {minutes:.1f} min: success {trainer.best[0]:.1%}, "
+        f"payload error {-100 * trainer.best[1]:.2f} cm (best evaluation during training)\n"
+        f"curves:   tensorboard --logdir {folder}\n"
+        f"evaluate: python evaluate.py run={folder} episodes=200 seed=1000 baseline=formation_integral video=true"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,113 @@
+"""The TorchRL door: a natively batched EnvBase with masked resets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from multilift_marl.config.schema import Config
+from multilift_marl.envs.core import TRAINING, MultiliftVec, resolve_config
+
+
+class MultiliftEnv(EnvBase):
+    """E environments of N drones as one TorchRL environment of batch size [E], on the CPU.
+
+    Keys: ("agents", "observation") (E, N, D), ("agents", "action") (E, N, A), ("agents", "reward") (E, N, 1), root
+    `state` (E, S) for critics, root `done`, `terminated`, `truncated` (E, 1), and `info` with `success`, `failure`,
+    `diverged` (E, 1) and `reward_terms` (E, T).
+
+    Args:
+        config: what to build.
+        purpose: see MultiliftVec.
+        first_env: see MultiliftVec.
+
+    Attributes:
+        vec: the batched core underneath.
+    """
+
+    def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
+        self.vec = vec = MultiliftVec(config, purpose, first_env)
+        super().__init__(device="cpu", batch_size=[vec.num_envs])
+        e, n, flag = vec.num_envs, vec.num_drones, Binary(1, (vec.num_envs, 1), dtype=torch.bool)
+        self.observation_spec = Composite(
+            agents=Composite(observation=Unbounded((e, n, vec.observation_size)), shape=(e, n)),
+            state=Unbounded((e, vec.state_size)),
+            info=Composite(
+                success=flag.clone(), failure=flag.clone(), diverged=flag.clone(),
+                reward_terms=Unbounded((e, len(vec.reward_terms))), shape=(e,),
+            ),
+            shape=(e,),
+        )  # fmt: skip
+        self.action_spec = Composite(
+            agents=Composite(action=Bounded(-1.0, 1.0, (e, n, vec.action_size)), shape=(e, n)), shape=(e,)
+        )
+        self.reward_spec = Composite(agents=Composite(reward=Unbounded((e, n, 1)), shape=(e, n)), shape=(e,))
+        self.done_spec = Composite(
+            {key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=(e,)
+        )
+        self._seed: int | None = None
+        self._resumed = False
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        mask = tensordict.get("_reset", None) if tensordict is not None else None
+        if mask is None and self._resumed:
+            self._resumed = False  # the restored episodes go on
+            observation, info = self.vec._observation.copy(), self.vec._info(*(np.zeros(self.vec.num_envs, bool),) * 2)
+        else:
+            seed, self._seed = self._seed, None
+            observation, info = self.vec.reset(seed, None if mask is None else mask.reshape(-1).numpy())
+        out = self._package(observation, info)
+        for key in ("done", "terminated", "truncated"):
+            out[key] = torch.zeros(self.vec.num_envs, 1, dtype=torch.bool)
+        return out
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        action = tensordict["agents", "action"].detach().numpy()
+        observation, reward, terminated, truncated, info = self.vec.step(action)
+        out = self._package(observation, info)
+        out["agents", "reward"] = torch.from_numpy(reward).unsqueeze(-1)
+        out["terminated"] = torch.from_numpy(terminated).unsqueeze(-1)
+        out["truncated"] = torch.from_numpy(truncated).unsqueeze(-1)
+        out["done"] = out["terminated"] | out["truncated"]
+        return out
+
+    def _package(self, observation: np.ndarray, info: dict[str, Any]) -> TensorDict:
+        e, n = self.vec.num_envs, self.vec.num_drones
+        flags = {key: torch.from_numpy(info[key]).unsqueeze(-1) for key in ("success", "failure", "diverged")}
+        terms = torch.from_numpy(self.vec.task.terms.astype(np.float32))
+        return TensorDict(
+            {
+                "agents": TensorDict({"observation": torch.from_numpy(observation)}, (e, n)),
+                "state": torch.from_numpy(self.vec.state()),
+                "info": TensorDict({**flags, "reward_terms": terms}, (e,)),
+            },
+            (e,),
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = seed
+
+    def get_state(self) -> dict[str, torch.Tensor]:
+        """Return everything that later steps depend on, as tensors."""
+        return {key: torch.from_numpy(array) for key, array in self.vec.state_dict().items()}
+
+    def set_state(self, saved: dict[str, torch.Tensor]) -> None:
+        """Continue bit for bit from what `get_state` returned: the next full reset returns the restored episodes."""
+        self.vec.load_state_dict({key: tensor.numpy() for key, tensor in saved.items()})
+        self._resumed = True
+
+
+def torchrl_env(
+    task: str | Config = "hover", *, num_envs: int | None = None, num_threads: int | None = None,
+    num_drones: int | None = None, seed: int | None = None, first_env: int = 0, **overrides: Any,
+) -> MultiliftEnv:  # fmt: skip
+    """Return E environments of a task as a TorchRL environment; arguments as for `make_vec`."""
+    config = resolve_config(
+        task, num_envs=num_envs, num_threads=num_threads, num_drones=num_drones, seed=seed, **overrides
+    )
+    return MultiliftEnv(config, first_env=first_env)

@@ -1,0 +1,1 @@
+"""Evaluation: episodes on fixed seeds, metrics with intervals, reports and plots."""

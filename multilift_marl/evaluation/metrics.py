@@ -1,0 +1,67 @@
+"""From episodes to metrics with intervals: Wilson for rates, bootstrap for means and paired differences."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+
+from multilift_marl.tasks.failures import CAUSES
+
+_Z = 1.959964  # two-sided 95 %
+_RESAMPLES = 2000
+_SUCCESSFUL = ("payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s")
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """Return the 95 % Wilson score interval of a rate (Wilson 1927)."""
+    rate, square = successes / trials, _Z**2 / trials
+    centre = (rate + square / 2) / (1 + square)
+    half = _Z / (1 + square) * sqrt(rate * (1 - rate) / trials + square / (4 * trials))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def bootstrap(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """Return the 95 % percentile bootstrap interval of the mean of `values` (n,), the same for the same values."""
+    rng = np.random.default_rng(seed)
+    means = values[rng.integers(0, len(values), (_RESAMPLES, len(values)))].mean(axis=1)
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict]:
+    """Return {metric: {"mean", "ci95": [low, high]}} of what `fly_episodes` measured.
+
+    Errors include failed episodes at the failure bound; "<metric>_successful" takes successful episodes alone and is
+    None where there are none.
+    """
+    success, cause = episodes["success_rate"], episodes["failure_cause"]
+    count = len(success)
+    result = {"success_rate": _rate(int(success.sum()), count)}
+    for name, values in episodes.items():
+        if name in ("success_rate", "failure_cause"):
+            continue
+        result[name] = _mean(values)
+        if name in _SUCCESSFUL:
+            result[f"{name}_successful"] = _mean(values[success]) if success.any() else None
+    for index, name in enumerate(CAUSES):
+        if index > 0:
+            result[f"failure_{name}_rate"] = _rate(int((cause == index).sum()), count)
+    return result
+
+
+def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> dict[str, dict]:
+    """Return the mean paired difference, policy minus baseline, of every metric on the same episodes."""
+    return {
+        name: _mean(values.astype(float) - baseline[name].astype(float))
+        for name, values in policy.items()
+        if name != "failure_cause"
+    }
+
+
+def _mean(values: np.ndarray) -> dict:
+    return {"mean": float(values.mean()), "ci95": list(bootstrap(values))}
+
+
+def _rate(successes: int, trials: int) -> dict:
+    return {"mean": successes / trials, "ci95": list(wilson(successes, trials))}

@@ -1,0 +1,167 @@
+"""Fly whole episodes with a policy and measure them: the raw numbers of every report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from multilift_marl.config.load import build_config
+from multilift_marl.config.schema import Config
+from multilift_marl.envs.core import EVALUATION, MultiliftVec
+from multilift_marl.tasks.failures import CAUSES, MAX_DISTANCE
+
+SETTLED = 0.05  # [m] settling time counts until the payload stays within this
+FINAL_SECONDS = 2.0  # errors are means over these last seconds
+_BATCH = 256
+
+
+class Policy(Protocol):
+    """What can fly a team: learned or scripted."""
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return actions (..., N, A) for observations (..., N, D)."""
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Begin new episodes in the environments of the mask."""
+
+
+class Trace(NamedTuple):
+    """One episode over time, T steps."""
+
+    time: np.ndarray
+    """(T,) [s]."""
+    payload_position: np.ndarray
+    """(T, 3) [m]."""
+    target_position: np.ndarray
+    """(T, 3) [m]."""
+    drone_position: np.ndarray
+    """(T, N, 3) [m]."""
+    distance: np.ndarray
+    """(T,) payload from its target [m]."""
+    angle: np.ndarray
+    """(T,) payload from its target attitude [deg]."""
+    tension: np.ndarray
+    """(T, N) [N]."""
+
+
+def fly_episodes(
+    config: Config, make_policy: Callable[[MultiliftVec], Policy], episodes: int, seed: int,
+    purpose: int = EVALUATION, progress: Callable[[int], Any] | None = None,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Fly episodes 0 to `episodes` - 1 of an evaluation seed, the same at any batch size.
+
+    Args:
+        config: the environment.
+        make_policy: returns the policy for given environments.
+        episodes: how many; episode i is environment i's first.
+        seed: evaluation seed.
+        purpose: of the seeds.
+        progress: called with the number of episodes finished.
+
+    Returns:
+        Metrics of each episode by name, (episodes,) each; see the contract in docs/evaluation.md. Errors of a failed
+        episode stand at the failure bound. "failure_cause" holds indices into `CAUSES`.
+    """
+    parts = []
+    for first in range(0, episodes, _BATCH):
+        count = min(_BATCH, episodes - first)
+        part = build_config(config.model_dump(), {"env.num_envs": count})
+        vec = MultiliftVec(part, purpose, first_env=first)
+        parts.append(_fly_batch(vec, make_policy(vec), seed))
+        if progress is not None:
+            progress(first + count)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.ndarray]:
+    e, dt = vec.num_envs, vec.task.dt
+    observation, _ = vec.reset(seed=seed)
+    policy.reset()
+    running = np.ones(e, bool)
+    total, length, settling = np.zeros(e), np.zeros(e), np.zeros(e)
+    square, change = np.zeros(e), np.zeros(e)
+    final_distance, final_angle, final_steps = np.zeros(e), np.zeros(e), np.zeros(e)
+    result = {name: np.zeros(e) for name in _AT_END}
+    result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
+    previous = np.zeros((e, vec.num_drones, vec.action_size))
+    for step in range(vec.max_steps):
+        action = policy.act(observation)
+        observation, reward, terminated, truncated, info = vec.step(action)
+        errors = vec.task.errors
+        total += running * reward.mean(axis=1, dtype=np.float64)
+        length += running
+        change += running * ((np.clip(action, -1, 1) - previous) ** 2).mean(axis=(1, 2))
+        square += running * errors.distance**2
+        settling = np.where(running & (errors.distance > SETTLED), (step + 1) * dt, settling)
+        if step >= vec.max_steps - round(FINAL_SECONDS / dt):
+            final_distance += running * errors.distance
+            final_angle += running * np.rad2deg(errors.angle)
+            final_steps += running
+        previous = np.clip(action, -1, 1)
+        ended = running & (terminated | truncated)
+        if ended.any():
+            result["success_rate"][ended] = info["success"][ended]
+            result["failure_cause"][ended] = info["failure_cause"][ended]
+            for name, source in _at_end(vec).items():
+                result[name][ended] = source[ended]
+            running &= ~ended
+        if not running.any():
+            break
+        if (over := terminated | truncated).any():  # their later episodes are flown, but not counted
+            observation, _ = vec.reset(mask=over)
+            policy.reset(over)
+            previous[over] = 0.0
+    failed, steps = result["failure_cause"] > 0, np.maximum(final_steps, 1)
+    limit = vec.max_steps * dt
+    return result | {
+        "payload_position_error_m": np.where(failed, MAX_DISTANCE, final_distance / steps),
+        "payload_attitude_error_deg": np.where(failed, 180.0, final_angle / steps),
+        "payload_rmse_m": np.where(failed, MAX_DISTANCE, np.sqrt(square / np.maximum(length, 1))),
+        "settling_time_s": np.where(failed, limit, settling),
+        "return": total,
+        "action_rate": np.sqrt(change / np.maximum(length, 1)),
+    }
+
+
+_AT_END = ("cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j")
+
+
+def _at_end(vec: MultiliftVec) -> dict[str, np.ndarray]:
+    """Return what has accumulated over the episodes, (E,) each, in the order of `_AT_END`."""
+    record = vec.world.record
+    values = (record.tension_min, record.tension_max, record.slack_time, vec.task.min_separation, record.energy)
+    return dict(zip(_AT_END, values, strict=True))
+
+
+def trace_episode(
+    config: Config, make_policy: Callable[[MultiliftVec], Policy], episode: int, seed: int,
+    on_step: Callable[[MultiliftVec], None] | None = None,
+) -> Trace:  # fmt: skip
+    """Fly one evaluation episode and return its trace; `on_step` sees the environment after every step (for a video)."""
+    vec = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}), EVALUATION, first_env=episode)
+    policy = make_policy(vec)
+    observation, _ = vec.reset(seed=seed)
+    policy.reset()
+    rows = []
+    for step in range(vec.max_steps):
+        observation, _, terminated, truncated, _ = vec.step(policy.act(observation))
+        state, task = vec.world.state, vec.task
+        rows.append(
+            (
+                (step + 1) * task.dt, state.payload_position[0].copy(), task.goal.position[0].copy(),
+                state.drone_position[0].copy(), task.errors.distance[0], np.rad2deg(task.errors.angle[0]),
+                state.cable_tension[0].copy(),
+            )
+        )  # fmt: skip
+        if on_step is not None:
+            on_step(vec)
+        if terminated[0] or truncated[0]:
+            break
+    return Trace(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def cause_name(index: int) -> str:
+    """Return the name of a failure cause."""
+    return CAUSES[index]
