@@ -1,9 +1,33 @@
 """Multi-agent reinforcement learning for cooperative aerial transport on MuJoCo."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from multilift_marl import sim
 from multilift_marl.config import load_config
 from multilift_marl.envs.core import make_vec
 from multilift_marl.tasks import list_tasks
 
+if TYPE_CHECKING:
+    from multilift_marl.agents.policy import load_policy
+    from multilift_marl.envs.multilift_v0 import parallel_env
+    from multilift_marl.envs.torchrl_env import torchrl_env
+
 __version__ = "0.1.0"
-__all__ = ["list_tasks", "load_config", "make_vec", "sim"]
+__all__ = ["list_tasks", "load_config", "load_policy", "make_vec", "parallel_env", "sim", "torchrl_env"]
+
+_LAZY = {
+    "parallel_env": "multilift_marl.envs.multilift_v0",
+    "load_policy": "multilift_marl.agents.policy",
+    "torchrl_env": "multilift_marl.envs.torchrl_env",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the doors that need more than NumPy and MuJoCo only when they are asked for."""
+    if name in _LAZY:
+        from importlib import import_module
+
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'multilift_marl' has no attribute '{name}'")

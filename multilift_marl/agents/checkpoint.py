@@ -32,13 +32,17 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     if not path.is_file():
-        raise CheckpointError(f"no checkpoint {path}: give a run folder, one of its checkpoints or a shipped policy's name")
+        raise CheckpointError(
+            f"no checkpoint {path}: give a run folder, one of its checkpoints or a shipped policy's name"
+        )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files
         whole = zipfile.is_zipfile(path)
         reason = "holds more than tensors and numbers" if whole else "is truncated or no checkpoint at all"
-        raise CheckpointError(f"{path} {reason}; use another checkpoint of the run, such as best.pt or last.pt") from error
+        raise CheckpointError(
+            f"{path} {reason}; use another checkpoint of the run, such as best.pt or last.pt"
+        ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path} was not written by multilift_marl (or by another version); train again")
     return content

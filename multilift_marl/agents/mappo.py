@@ -48,18 +48,18 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
         log_prob_key=("agents", "action_log_prob"),
     )
 
-    # 2. The critic: values are sums of rewards over about 1/(1 - gamma) steps.
-    scale = 1.0 / max(1.0 - config.gamma, 0.01)
+    # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
+    value_norm = PopArtValueNorm(shape=1, beta=0.999)
     if config.algorithm == "mappo":
-        critic, source = CentralCritic(vec.state_size, vec.num_drones, config.hidden, scale), "state"
+        critic, source = CentralCritic(vec.state_size, vec.num_drones, config.hidden, value_norm), "state"
     else:
-        critic, source = LocalCritic(vec.observation_size, config.hidden, scale), agents["observation"]
+        critic, source = LocalCritic(vec.observation_size, config.hidden, value_norm), agents["observation"]
     value = TensorDictModule(critic, in_keys=[source], out_keys=[agents["state_value"]])
 
     # 3. The loss and the advantage estimator. Time-outs are bootstrapped: only `terminated` ends a return.
     keys = {"value": agents["state_value"], "reward": agents["reward"], "done": "done", "terminated": "terminated"}
     loss = (MAPPOLoss if config.algorithm == "mappo" else IPPOLoss)(
-        policy, value, value_norm=PopArtValueNorm(shape=1, beta=0.999), clip_epsilon=config.clip,
+        policy, value, value_norm=value_norm, clip_epsilon=config.clip,
         entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.value_weight,
         loss_critic_type="l2", normalize_advantage=False,
     )  # fmt: skip
@@ -99,9 +99,16 @@ def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
                 total = total + losses["loss_entropy"]
             learner.optimizer.zero_grad(set_to_none=True)
             total.backward()
-            norm = nn.utils.clip_grad_norm_(learner.loss.parameters(), config.max_grad_norm)
+            norm = nn.utils.clip_grad_norm_(learner.actor.parameters(), config.max_grad_norm)
+            nn.utils.clip_grad_norm_(learner.critic.parameters(), config.max_grad_norm)
             learner.optimizer.step()
-            values = [losses["kl_approx"], losses["clip_fraction"], losses["loss_objective"], losses["loss_critic"], norm]
+            values = [
+                losses["kl_approx"],
+                losses["clip_fraction"],
+                losses["loss_objective"],
+                losses["loss_critic"],
+                norm,
+            ]
             diagnostics.append(torch.stack([value.detach().mean() for value in values]))
         if torch.stack(diagnostics[-config.minibatches :])[:, 0].mean() > config.target_kl:
             stop = True

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
+
+if TYPE_CHECKING:  # policies need torch only
+    from torchrl.modules import ValueNorm
 
 
 class Normalizer(nn.Module):
@@ -75,29 +79,31 @@ class Actor(nn.Module):
 
 
 class CentralCritic(nn.Module):
-    """Value of the team from the global state: (..., S) to (..., N, 1), the same for every drone (MAPPO)."""
+    """Value of the team from the global state: (..., S) to (..., N, 1), the same for every drone (MAPPO).
 
-    def __init__(self, state_size: int, num_drones: int, hidden: Sequence[int], value_scale: float):
+    The network's output is in units of the value normaliser, which the loss keeps up to date.
+    """
+
+    def __init__(self, state_size: int, num_drones: int, hidden: Sequence[int], value_norm: ValueNorm):
         super().__init__()
-        self.normalizer = Normalizer(state_size)
-        self.net = mlp(state_size, hidden, 1, gain=1.0)
-        self.num_drones, self.value_scale = num_drones, value_scale
+        self.normalizer, self.value_norm = Normalizer(state_size), value_norm
+        self.net = mlp(state_size, hidden, 1, gain=0.1)
+        self.num_drones = num_drones
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
         """Return the value for each drone."""
-        value = self.value_scale * self.net(self.normalizer(state))
+        value = self.value_norm.denormalize(self.net(self.normalizer(state)))
         return value.unsqueeze(-2).expand(*value.shape[:-1], self.num_drones, 1)
 
 
 class LocalCritic(nn.Module):
     """Value of each drone from its own observation: (..., N, D) to (..., N, 1) (IPPO)."""
 
-    def __init__(self, observation_size: int, hidden: Sequence[int], value_scale: float):
+    def __init__(self, observation_size: int, hidden: Sequence[int], value_norm: ValueNorm):
         super().__init__()
-        self.normalizer = Normalizer(observation_size)
-        self.net = mlp(observation_size, hidden, 1, gain=1.0)
-        self.value_scale = value_scale
+        self.normalizer, self.value_norm = Normalizer(observation_size), value_norm
+        self.net = mlp(observation_size, hidden, 1, gain=0.1)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """Return the value for each drone."""
-        return self.value_scale * self.net(self.normalizer(observation))
+        return self.value_norm.denormalize(self.net(self.normalizer(observation)))

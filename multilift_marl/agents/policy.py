@@ -30,7 +30,9 @@ class LearnedPolicy:
         self.observation_names, self.action_names = tuple(content["observation_names"]), tuple(content["action_names"])
         self.source = source
         weights, size = content["actor"], (len(self.observation_names), len(self.action_names))
-        self.actor = Actor(*size, self.config.train.hidden, self.config.train.initial_std, torch.zeros(size[1], size[0]))
+        train = self.config.train
+        with torch.random.fork_rng(devices=[]):  # initial weights, overwritten at once, must not cost random numbers
+            self.actor = Actor(*size, train.hidden, train.initial_std, torch.zeros(size[1], size[0]))
         try:
             self.actor.load_state_dict(weights)
         except RuntimeError as error:
@@ -72,8 +74,15 @@ def load_policy(name: str | Path) -> LearnedPolicy:
         path = _SHIPPED / f"{name}.pt"
     content = load_checkpoint(path)
     if missing := [key for key in _KEPT if key not in content]:
-        raise CheckpointError(f"{path} holds no policy ('{missing[0]}' is missing); give a checkpoint of a training run")
+        raise CheckpointError(
+            f"{path} holds no policy ('{missing[0]}' is missing); give a checkpoint of a training run"
+        )
     return LearnedPolicy(content, str(path))
+
+
+def shipped_policies() -> list[str]:
+    """Return the names of the policies inside the package."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.pt"))
 
 
 def strip_checkpoint(path: str | Path, out: str | Path) -> None:

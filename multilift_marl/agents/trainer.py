@@ -47,10 +47,17 @@ class Trainer:
         if checkpoint is not None:
             self._restore(checkpoint)
         self.collector = Collector(
-            self.env, self.learner.policy, frames_per_batch=self.frames_per_batch, total_frames=-1, track_traj_ids=False
+            self.env,
+            self.learner.policy,
+            frames_per_batch=self.frames_per_batch,
+            total_frames=-1,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
         )
         self._batches = iter(self.collector)
-        if checkpoint is not None:
+        if checkpoint is None:
+            self.env.vec.stagger()
+        else:
             torch.set_rng_state(checkpoint["rng"])
         self.log = RunLog(folder, self.iteration)
 

@@ -37,7 +37,10 @@ def _train(values: dict[str, Any]) -> int:
         folder = find_run(values.pop("resume"))
         for key in values:
             if key not in _RESUMABLE:
-                raise ConfigError(f"'{key}' cannot change when a run is resumed; start a new run, or give one of: {', '.join(_RESUMABLE)}")
+                raise ConfigError(
+                    f"'{key}' cannot change when a run is resumed: start a new run, or give one of "
+                    f"{', '.join(_RESUMABLE)}"
+                )
         trainer = resume_run(folder, values)
         print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
     else:

@@ -77,9 +77,7 @@ def dump_config(config: Config) -> str:
 
 def explain() -> str:
     """Return every key with its default and meaning, for --help."""
-    return "\n".join(
-        f"  {key:<32} {_plain(default):<14} {text}" for key, default, text in _leaves(Config, "")
-    )
+    return "\n".join(f"  {key:<32} {_plain(default):<14} {text}" for key, default, text in _leaves(Config, ""))
 
 
 def _plain(value: Any) -> str:
@@ -123,7 +121,11 @@ def _copy(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _sentence(error: Mapping[str, Any], where: str) -> str:
     """Return one sentence for pydantic's first complaint."""
-    path = [part for part in error["loc"] if isinstance(part, str) and not part.startswith(("function-", "tuple[", "constrained"))]
+    path = [
+        part
+        for part in error["loc"]
+        if isinstance(part, str) and not part.startswith(("function-", "tuple[", "constrained"))
+    ]
     section: type[Section] = Config
     for part in path[:-1]:
         annotation = section.model_fields[part].annotation if part in section.model_fields else None

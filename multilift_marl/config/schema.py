@@ -138,7 +138,7 @@ class TrainConfig(Section):
     horizon: Int = Field(32, ge=1, description="steps of each environment between updates")
     epochs: Int = Field(4, ge=1, description="passes over each batch")
     minibatches: Int = Field(8, ge=1, description="minibatches of each pass")
-    learning_rate: Float = Field(5e-4, gt=0, description="[-] of Adam, at the start")
+    learning_rate: Float = Field(1e-3, gt=0, description="[-] of Adam, at the start")
     final_learning_rate: Float = Field(0.1, ge=0, le=1, description="[-] fraction of it left at the end (linear)")
     gamma: Float = Field(0.99, ge=0, le=1, description="[-] discount of one policy step")
     gae_lambda: Float = Field(0.95, ge=0, le=1, description="[-] of generalised advantage estimation")

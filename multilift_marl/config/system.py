@@ -115,7 +115,9 @@ def resolve_system(config: Config) -> System:
         min_separation=MIN_SEPARATION * scale,
         wind=np.asarray(config.wind.velocity, float),
         timestep=config.sim.timestep,
-        control_interval=whole_ratio(1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"),
+        control_interval=whole_ratio(
+            1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"
+        ),
     )
     _check_possible(system, length)
     return system
@@ -155,7 +157,9 @@ def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.n
     if payload.shape == "point":
         size = np.full(3, 0.1 * scale)
         if np.any(anchors != 0):
-            raise ConfigError("payload.anchors of a point payload must all be [0, 0, 0]; use payload.shape=box for others")
+            raise ConfigError(
+                "payload.anchors of a point payload must all be [0, 0, 0]; use payload.shape=box for others"
+            )
     return anchors, size
 
 
@@ -179,7 +183,9 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
     radial = anchors[:, :2] - centre
     distance = np.linalg.norm(radial, axis=1, keepdims=True)
     even = 2 * np.pi * np.arange(n) / n
-    radial = np.where(distance > 1e-6, radial / np.maximum(distance, 1e-6), np.stack([np.cos(even), np.sin(even)], axis=1))
+    radial = np.where(
+        distance > 1e-6, radial / np.maximum(distance, 1e-6), np.stack([np.cos(even), np.sin(even)], axis=1)
+    )
     if n == 1:
         radial = np.zeros((1, 2))
     nominal = weight / n * np.concatenate([np.tan(angle) * radial, np.ones((n, 1))], axis=1)
@@ -195,11 +201,13 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
     residual = np.abs(balance @ force.ravel() - load).max()
     if residual > 1e-6 * weight:
         raise ConfigError(
-            f"payload.anchors {np.round(anchors, 3).tolist()} cannot hold the payload level: place them around its centre of mass"
+            f"payload.anchors {np.round(anchors, 3).tolist()} cannot hold the payload level: place them around its "
+            "centre of mass"
         )
     if np.any(force[:, 2] < 0.02 * weight / n):
         raise ConfigError(
-            f"payload.anchors: cable {int(force[:, 2].argmin())} would have to push; move the anchors around the centre of mass"
+            f"payload.anchors: cable {int(force[:, 2].argmin())} would have to push; move the anchors around the "
+            "centre of mass"
         )
     return force
 
@@ -210,13 +218,14 @@ def _check_possible(system: System, length: np.ndarray) -> None:
     if np.any(outside > length):
         i = int(np.argmax(outside - length))
         raise ConfigError(
-            f"payload.anchors: anchor {i} is out of reach, {outside[i]:.2f} m outside the payload; move it onto the payload"
+            f"payload.anchors: anchor {i} is out of reach, {outside[i]:.2f} m outside the payload; move it onto the "
+            "payload"
         )
     thrust = 4 * vehicle.rotor_thrust_max
     if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
         raise ConfigError(
-            f"{n} × {vehicle.name} lift {n * thrust:.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of payload and "
-            f"drones, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
+            f"{n} × {vehicle.name} lift {n * thrust:.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of payload "
+            f"and drones, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
         )
     hover = np.linalg.norm(system.formation_force + [0, 0, vehicle.mass * GRAVITY], axis=1)
     if np.any(hover > thrust / 1.05):
@@ -237,11 +246,14 @@ def _check_possible(system: System, length: np.ndarray) -> None:
 def _per_drone(value: float | tuple[float, ...], n: int, key: str) -> np.ndarray:
     values = np.atleast_1d(np.asarray(value, float))
     if len(values) not in (1, n) or (isinstance(value, tuple) and len(values) != n):
-        raise ConfigError(f"{key} lists {len(values)} values for env.num_drones={n}: give one value or one for each drone")
+        raise ConfigError(
+            f"{key} lists {len(values)} values for env.num_drones={n}: give one value or one for each drone"
+        )
     return np.broadcast_to(values, (n,)).copy()
 
 
 def whole_ratio(fast: float, slow: float, slow_key: str, fast_key: str) -> int:
+    """Return fast/slow, two rates, as a whole number; the keys name them in the ConfigError if it is none."""
     ratio = round(fast / slow)
     if ratio < 1 or abs(fast / slow - ratio) > 1e-6:
         raise ConfigError(f"{slow_key}={slow:g} must divide {fast_key}={fast:g} into whole steps")

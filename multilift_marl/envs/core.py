@@ -108,9 +108,7 @@ class MultiliftVec:
         none = np.zeros(self.num_envs, bool)
         return self._observation.copy(), self._info(none, none)
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all environments by one policy step.
 
         Args:
@@ -136,6 +134,13 @@ class MultiliftVec:
         reward = np.repeat(self.task.terms.sum(axis=1, dtype=np.float64)[:, None], self.num_drones, axis=1)
         info = self._info(terminated, truncated)
         return self._observation.copy(), reward.astype(np.float32), terminated, truncated, info
+
+    def stagger(self) -> None:
+        """Shorten the episodes in progress to evenly spread lengths, so that time limits no longer coincide.
+
+        A learner then sees all phases of an episode in every batch.
+        """
+        self.steps[:] = np.arange(self.num_envs) * self.max_steps // self.num_envs
 
     def state(self) -> np.ndarray:
         """Return the global state (E, S) float32, which holds what is hidden from the drones."""
@@ -186,14 +191,16 @@ class MultiliftVec:
             if self.task.begin(e):
                 return
         raise ConfigError(
-            f"no start of task {self.task.name} is free of failure ({CAUSES[self.task.cause[e]]}) in {_MAX_REDRAWS} draws; "
-            "narrow the start ranges in task_options or change the rig"
+            f"no start of task {self.task.name} is free of failure ({CAUSES[self.task.cause[e]]}) in {_MAX_REDRAWS} "
+            "draws; narrow the start ranges in task_options or change the rig"
         )
 
     def _accept(self, action: np.ndarray) -> None:
         action = np.asarray(action)
         if action.shape != self._action.shape:
-            raise ValueError(f"action has shape {action.shape}, expected (environments, drones, numbers) {self._action.shape}")
+            raise ValueError(
+                f"action has shape {action.shape}, expected {self._action.shape} (environments, drones, numbers)"
+            )
         if action.dtype.kind != "f":
             raise ValueError(f"action has dtype {action.dtype}, expected floating point numbers in [-1, 1]")
         if not np.isfinite(action).all():
@@ -204,7 +211,7 @@ class MultiliftVec:
             )
         if self._ended.any():
             raise RuntimeError(
-                f"environment {int(np.argmax(self._ended))} has ended or was never reset: call reset(mask=...) before step"
+                f"environment {int(np.argmax(self._ended))} has ended or was never reset: call reset(mask=...) first"
             )
         self._previous[:] = self._action
         np.clip(action, -1.0, 1.0, out=self._action, casting="same_kind")
@@ -221,9 +228,7 @@ class MultiliftVec:
     def _checked_mask(self, mask: np.ndarray) -> np.ndarray:
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
-            raise ValueError(
-                f"mask has shape {mask.shape} and dtype {mask.dtype}, expected bool {(self.num_envs,)}, one for each environment"
-            )
+            raise ValueError(f"mask has shape {mask.shape} and dtype {mask.dtype}, expected bool {(self.num_envs,)}")
         return mask
 
 

@@ -47,9 +47,7 @@ class MultiliftEnv(EnvBase):
             agents=Composite(action=Bounded(-1.0, 1.0, (e, n, vec.action_size)), shape=(e, n)), shape=(e,)
         )
         self.reward_spec = Composite(agents=Composite(reward=Unbounded((e, n, 1)), shape=(e, n)), shape=(e,))
-        self.done_spec = Composite(
-            {key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=(e,)
-        )
+        self.done_spec = Composite({key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=(e,))
         self._seed: int | None = None
         self._resumed = False
 

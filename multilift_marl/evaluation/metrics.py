@@ -33,7 +33,7 @@ def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict]:
     """Return {metric: {"mean", "ci95": [low, high]}} of what `fly_episodes` measured.
 
     Errors include failed episodes at the failure bound; "<metric>_successful" takes successful episodes alone and is
-    None where there are none.
+    missing where there are none.
     """
     success, cause = episodes["success_rate"], episodes["failure_cause"]
     count = len(success)
@@ -42,8 +42,8 @@ def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict]:
         if name in ("success_rate", "failure_cause"):
             continue
         result[name] = _mean(values)
-        if name in _SUCCESSFUL:
-            result[f"{name}_successful"] = _mean(values[success]) if success.any() else None
+        if name in _SUCCESSFUL and success.any():
+            result[f"{name}_successful"] = _mean(values[success])
     for index, name in enumerate(CAUSES):
         if index > 0:
             result[f"failure_{name}_rate"] = _rate(int((cause == index).sum()), count)

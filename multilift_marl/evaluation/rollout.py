@@ -139,7 +139,7 @@ def trace_episode(
     config: Config, make_policy: Callable[[MultiliftVec], Policy], episode: int, seed: int,
     on_step: Callable[[MultiliftVec], None] | None = None,
 ) -> Trace:  # fmt: skip
-    """Fly one evaluation episode and return its trace; `on_step` sees the environment after every step (for a video)."""
+    """Fly one evaluation episode and return its trace; `on_step` sees the environment after every step."""
     vec = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}), EVALUATION, first_env=episode)
     policy = make_policy(vec)
     observation, _ = vec.reset(seed=seed)
@@ -160,8 +160,3 @@ def trace_episode(
         if terminated[0] or truncated[0]:
             break
     return Trace(*(np.array(column) for column in zip(*rows, strict=True)))
-
-
-def cause_name(index: int) -> str:
-    """Return the name of a failure cause."""
-    return CAUSES[index]

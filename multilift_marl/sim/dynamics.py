@@ -220,7 +220,7 @@ def _sound(line, tension, c):
 
 @kernel
 def hover_drone(e, n, state, pull, yaw, mass, thrust_coefficient):
-    """Give drone n of environment e the attitude and rotor speeds at which it holds still, pulling its cable by `pull` [N]."""
+    """Let drone n of environment e hold still: attitude and rotor speeds that pull its cable by `pull` [N]."""
     force = add(pull, (0.0, 0.0, mass * GRAVITY))
     putmat(state.drone_rotation[e, n], thrust_frame(force, yaw))
     for k in range(4):
@@ -229,7 +229,7 @@ def hover_drone(e, n, state, pull, yaw, mass, thrust_coefficient):
 
 @kernel
 def write_rows(rows, lo, hi, mask, state, record, c):
-    """Write the state of the environments in `mask` into `batch.state`; their cables take the tension of their stretch."""
+    """Write the state of the environments in `mask` into `batch.state`; tensions follow from the stretch."""
     for e in range(lo, hi):
         if not mask[e]:
             continue

@@ -96,11 +96,12 @@ def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
 
 
 def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
-    body = spec.worldbody.add_body(name="payload", pos=[0, 0, 1.5])
+    point = system.payload_shape == "point"  # its slide joints count from the body's place, so that must be the origin
+    body = spec.worldbody.add_body(name="payload", pos=[0, 0, 0 if point else 1.5])
     body.mass, body.explicitinertial = system.payload_mass, True
     body.inertia, body.ipos = system.payload_inertia, [0, 0, 0]
     colour = [0.86, 0.66, 0.35, 1]
-    if system.payload_shape == "point":
+    if point:
         for name, axis in zip("xyz", np.eye(3), strict=True):
             body.add_joint(name=f"payload/{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
         body.add_geom(name="payload", type=_GEOM.mjGEOM_SPHERE, size=[system.payload_size[0] / 2, 0, 0], rgba=colour)

@@ -13,7 +13,7 @@ class SystemState(NamedTuple):
     payload_position: np.ndarray
     """(E, 3) centre of mass, world frame [m]."""
     payload_rotation: np.ndarray
-    """(E, 3, 3) body to world; the identity for a point payload."""
+    """(E, 3, 3) body to world; of a point payload what a task has set, without effect."""
     payload_velocity: np.ndarray
     """(E, 3) world frame [m/s]."""
     payload_body_rates: np.ndarray

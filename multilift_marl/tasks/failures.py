@@ -9,7 +9,7 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
-from multilift_marl.math3d import add, column, dot, mat, matrow, mul, norm, row, scale, segment_distance, sub, unit, vec
+from multilift_marl.math3d import add, column, dot, mat, matrow, mul, norm, row, segment_distance, sub, unit, vec
 from multilift_marl.sim.scene import drone_half_height
 
 CAUSES = (
@@ -68,7 +68,7 @@ def make_limits(system: System) -> Limits:
 
 @kernel
 def find_failures(lo, hi, state, errors, limits, cause, min_separation):
-    """Write the first failure cause of environments lo to hi, 0 for none, and update the smallest separation (E,) [m]."""
+    """Write the first failure cause (0: none) of environments lo to hi; update the least separation (E,) [m]."""
     for e in range(lo, hi):
         cause[e] = _cause(e, state, errors, limits, min_separation)
 

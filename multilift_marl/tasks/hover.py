@@ -11,7 +11,21 @@ from pydantic import Field
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import Float, Section
 from multilift_marl.control.formation import place_formation
-from multilift_marl.math3d import add, axis_angle, heading, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
+from multilift_marl.math3d import (
+    add,
+    axis_angle,
+    heading,
+    matmul,
+    matrow,
+    mul,
+    norm,
+    put,
+    putmat,
+    rot_z,
+    scale,
+    sub,
+    vec,
+)
 from multilift_marl.sim.dynamics import hover_drone
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.terms import tolerance
@@ -102,9 +116,9 @@ def _start(e, rng, state, goal, rig, ranges, team):
     tilt = axis_angle(scale(1.0 / max(norm(axis), 1e-9), axis), rng.uniform(0.0, ranges.tilt))
     velocity = in_ball(rng, ranges.speed)
     payload = add((goal.position[e, 0], goal.position[e, 1], goal.position[e, 2]), moved)
-    attitude = matmul(tilt, matrow(goal.rotation, e))
-    if rig.anchors.shape[0] == 1 or not np.any(rig.anchors != 0.0):
-        attitude = matrow(goal.rotation, e) if np.any(rig.anchors != 0.0) else rot_z(0.0)
+    attitude = matrow(goal.rotation, e)
+    if np.any(rig.anchors != 0.0):  # a point has no attitude: it counts as aligned
+        attitude = matmul(tilt, attitude)
     put(state.payload_position[e], payload)
     put(state.payload_velocity[e], velocity)
     putmat(state.payload_rotation[e], attitude)
@@ -117,7 +131,9 @@ def _start(e, rng, state, goal, rig, ranges, team):
         put(state.drone_position[e, n], add(anchor, scale(cable_length[n] + tension / cable_stiffness[n], direction)))
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
-        hover_drone(e, n, state, scale(tension, direction), heading(matrow(goal.rotation, e)), drone_mass, thrust_coefficient)
+        hover_drone(
+            e, n, state, scale(tension, direction), heading(matrow(goal.rotation, e)), drone_mass, thrust_coefficient
+        )
 
 
 @kernel

@@ -29,9 +29,11 @@ OBSERVATION = (
     Component("thrust_axis", 3, "slot", "-", "own body z axis"),
     Component("heading", 2, "target", "-", "cosine and sine of own heading relative to the target's"),
     Component("body_rates", 3, "body", "rad/s", "own angular velocity"),
-    Component("reference_error", 3, "slot", "m", "own smoothed reference minus own slot"),
+    Component("tracking_error", 3, "slot", "m", "own position minus own smoothed reference"),
     Component("reference_velocity", 3, "slot", "m/s", "velocity of own smoothed reference"),
-    Component("anchor_error", 3, "slot", "m", "own cable's attachment on the payload minus its place at the target pose"),
+    Component(
+        "anchor_error", 3, "slot", "m", "own cable's attachment on the payload minus its place at the target pose"
+    ),
     Component("cable", 3, "slot", "-", "from own attachment to own hook, over the cable's natural length"),
     Component("payload_error", 3, "slot", "m", "payload position minus target"),
     Component("payload_velocity", 3, "slot", "m/s", "payload velocity"),
@@ -65,7 +67,7 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
 
     The global state holds, in the target's heading frame, the payload's errors, velocities and integrals, then what
     is hidden from the drones (payload mass over nominal minus 1, force, wind), then for each drone its slot error,
-    velocity, thrust axis, body rates, reference error, cable tension over nominal, and previous action.
+    velocity, thrust axis, body rates, tracking error, cable tension over nominal, and previous action.
 
     Args:
         lo, hi: the environments.
@@ -99,7 +101,7 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
             position, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
             slot = vec(goal.slots, e, n)
             slot_error, velocity = sub(position, slot), vec(state.drone_velocity, e, n)
-            reference_error = sub(vec(reference.position, e, n), slot)
+            tracking_error = sub(position, vec(reference.position, e, n))
             rates = vec(state.drone_body_rates, e, n)
             anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
             at_payload = add(payload, mul(attitude, anchor))
@@ -112,7 +114,7 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
             yaw = heading(frame) - goal.yaw[e]
             own[i], own[i + 1] = cos(yaw), sin(yaw)
             i = _write(own, i + 2, rates)
-            i = _write(own, i, turn(cn, sn, reference_error))
+            i = _write(own, i, turn(cn, sn, tracking_error))
             i = _write(own, i, turn(cn, sn, vec(reference.velocity, e, n)))
             i = _write(own, i, turn(cn, sn, anchor_error))
             i = _write(own, i, turn(cn, sn, scale(1.0 / nominal[n, 0], cable)))
@@ -128,7 +130,7 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
             at = _write(out, at, turn(c, s, velocity))
             at = _write(out, at, turn(c, s, column(frame, 2)))
             at = _write(out, at, rates)
-            at = _write(out, at, turn(c, s, reference_error))
+            at = _write(out, at, turn(c, s, tracking_error))
             out[at] = state.cable_tension[e, n] / nominal[n, 1] - 1.0
             at += 1
             for k in range(4):

@@ -1,0 +1,143 @@
+"""`python evaluate.py run=latest`, installed as `multilift-evaluate`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from multilift_marl.cli.common import run_command
+from multilift_marl.config.load import build_config
+from multilift_marl.config.schema import Config
+from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.errors import ConfigError, RenderingError, nearest
+from multilift_marl.evaluation.report import format_table, make_report, write_report
+from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
+
+_USAGE = """Judge a trained team on fixed seeds, beside the scripted ones on the same episodes.
+
+  python evaluate.py run=latest episodes=200 seed=1000 baseline=formation_integral video=true [key=value ...]
+
+  run         a run folder, its name, "latest", or the name of a shipped policy ("hover")     (latest)
+  checkpoint  best, last, or a file                                                           (best)
+  episodes    how many                                                                        (200)
+  seed        evaluation seed: episode i is the same for every policy                         (1000)
+  baseline    script in the plots beside the policy; none: fly the policy alone               (formation_integral)
+  video       true: also an mp4 of the first episode                                          (false)
+  out         folder for metrics.json, plots and video                                        (<run>/eval/<time>)
+
+Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
+
+_DEFAULTS = {
+    "run": "latest", "checkpoint": "best", "episodes": 200, "seed": 1000, "baseline": "formation_integral",
+    "video": False, "out": None,
+}  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Evaluate; return the exit status."""
+    return run_command(_evaluate, _USAGE, arguments)
+
+
+def _evaluate(values: dict[str, Any]) -> int:
+    own = {key: values.pop(key, default) for key, default in _DEFAULTS.items()}
+    _check(own)
+    policy, folder = _find_policy(str(own["run"]), str(own["checkpoint"]))
+    config = build_config(policy.config.model_dump(), {"env.num_threads": 0} | values)
+    _ = config.system
+    makers = {"policy": lambda vec: policy}
+    if own["baseline"] != "none":
+        makers |= {name: lambda vec, name=name: make_scripted(name, vec) for name in SCRIPTED}
+    out = Path(own["out"]) if own["out"] else folder / "eval" / time.strftime("%Y%m%d-%H%M%S")
+    out.mkdir(parents=True, exist_ok=True)
+
+    flown = {name: _fly(config, maker, name, own) for name, maker in makers.items()}
+    learned = flown.pop("policy")
+    report = make_report(config, own["seed"], learned, flown)
+    write_report(out / "metrics.json", report)
+    print(f"\n{policy.source}: {own['episodes']} episodes, seed {own['seed']}; mean (95 % interval)\n")
+    print(format_table(report))
+    print(f"\nwrote {out / 'metrics.json'}")
+    _draw(config, makers, own, out, folder)
+    return 0
+
+
+def _check(own: dict[str, Any]) -> None:
+    for key in ("episodes", "seed"):
+        text = own[key]
+        whole = isinstance(text, int | float | str) and not isinstance(text, bool)
+        try:
+            number = float(text) if whole else float("nan")
+        except ValueError:
+            number = float("nan")
+        if not number.is_integer() or number < (1 if key == "episodes" else 0):
+            raise ConfigError(f"{key} must be a whole number, at least {1 if key == 'episodes' else 0}, but is {text!r}")
+        own[key] = int(number)
+    if own["baseline"] not in (*SCRIPTED, "none"):
+        raise ConfigError(f"unknown baseline '{own['baseline']}'{nearest(str(own['baseline']), [*SCRIPTED, 'none'])}")
+    if not isinstance(own["video"], bool):
+        raise ConfigError(f"video must be true or false, but is {own['video']!r}")
+
+
+def _find_policy(run: str, checkpoint: str) -> tuple[Any, Path]:
+    """Return the policy and the folder that its evaluations belong to."""
+    from multilift_marl.agents.checkpoint import find_run
+    from multilift_marl.agents.policy import load_policy, shipped_policies
+
+    if run in shipped_policies() and not Path(run).exists():
+        return load_policy(run), Path("runs") / f"shipped-{run}"
+    folder = find_run(run)
+    file = folder / "checkpoints" / f"{checkpoint}.pt" if checkpoint in ("best", "last") else Path(checkpoint)
+    return load_policy(folder if checkpoint == "best" else file), folder
+
+
+def _fly(config: Config, maker: Any, name: str, own: dict[str, Any]) -> dict:
+    from tqdm import tqdm
+
+    with tqdm(total=own["episodes"], desc=name, unit="episode", leave=False) as bar:
+        return fly_episodes(config, maker, own["episodes"], own["seed"], progress=lambda n: bar.update(n - bar.n))
+
+
+def _draw(config: Config, makers: dict[str, Any], own: dict[str, Any], out: Path, folder: Path) -> None:
+    """Plot the first episode of policy and baseline, and the training; film the policy if asked."""
+    from multilift_marl.agents.logging import read_metrics
+    from multilift_marl.evaluation import plots
+
+    frames, on_step, renderer = [], None, None
+    if own["video"]:
+        from multilift_marl import rendering
+
+        try:
+
+            def on_step(vec: Any) -> None:
+                nonlocal renderer
+                renderer = renderer or rendering.Renderer(vec)
+                if vec.steps[0] % 2 == 0:
+                    frames.append(renderer.frame())
+
+            trace = trace_episode(config, makers["policy"], 0, own["seed"], on_step)
+            rendering.write_video(out / "episode_0.mp4", frames, config.env.policy_hz / 2)
+            print(f"wrote {out / 'episode_0.mp4'}")
+        except RenderingError as error:
+            print(f"no video: {error}", file=sys.stderr)
+            trace = trace_episode(config, makers["policy"], 0, own["seed"])
+        finally:
+            if renderer is not None:
+                renderer.close()
+    else:
+        trace = trace_episode(config, makers["policy"], 0, own["seed"])
+    traces = {"policy": trace}
+    if own["baseline"] != "none":
+        traces[own["baseline"]] = trace_episode(config, makers[own["baseline"]], 0, own["seed"])
+    plots.plot_errors(out / "errors.png", traces)
+    plots.plot_tensions(out / "tensions.png", trace, "policy, episode 0")
+    plots.plot_paths(out / "paths.png", trace, "policy, episode 0")
+    if rows := read_metrics(folder):
+        plots.plot_training(out / "training.png", rows)
+    print(f"wrote plots in {out}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

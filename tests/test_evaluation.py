@@ -1,0 +1,199 @@
+"""Evaluation: metrics by closed form, the same episodes at any batch size, the whole command."""
+
+import json
+
+import numpy as np
+import pytest
+
+import multilift_marl as ml
+from multilift_marl.agents.trainer import Trainer, new_run
+from multilift_marl.cli.evaluate import main as evaluate
+from multilift_marl.config import load_config
+from multilift_marl.control.scripted import make_scripted
+from multilift_marl.envs.core import EVALUATION, MultiliftVec
+from multilift_marl.evaluation import rollout
+from multilift_marl.evaluation.metrics import bootstrap, compare, summarize, wilson
+from multilift_marl.evaluation.report import format_table, make_report
+from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
+
+CONTRACT = {
+    "success_rate", "payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s",
+    "return", "cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j",
+    "action_rate", "failure_ground_rate", "failure_diverged_rate",
+}  # fmt: skip
+
+
+def script(name):
+    return lambda vec: make_scripted(name, vec)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    return fly_episodes(load_config("hover"), script("formation_integral"), 12, seed=5)
+
+
+def test_wilson_interval_matches_published_values():
+    # Newcombe, Statistics in Medicine 17, 1998, table I: 81/263, 15/148, 0/20, 1/29
+    for successes, trials, low, high in ((81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0, 0.1611), (1, 29, 0.0061, 0.1718)):  # fmt: skip
+        np.testing.assert_allclose(wilson(successes, trials), (low, high), atol=6e-5)
+
+
+def test_bootstrap_covers_the_mean_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    hits = sum(low <= 1.0 <= high for low, high in (bootstrap(rng.normal(1, 2, 60)) for _ in range(200)))
+    assert 0.89 <= hits / 200 <= 0.99
+    assert bootstrap(np.full(9, 3.0)) == (3.0, 3.0)
+
+
+def test_summary_counts_failures_at_the_bound(flown):
+    worse = {name: values.copy() for name, values in flown.items()}
+    worse["success_rate"][:3], worse["failure_cause"][:3] = False, 1
+    worse["payload_position_error_m"][:3] = 3.0
+    summary = summarize(worse)
+    assert set(summary) >= CONTRACT
+    assert summary["success_rate"]["mean"] == 0.75
+    assert summary["failure_ground_rate"]["mean"] == 0.25
+    good = worse["payload_position_error_m"][3:].mean()
+    assert summary["payload_position_error_m_successful"]["mean"] == pytest.approx(good)
+    assert summary["payload_position_error_m"]["mean"] == pytest.approx((3 * 3.0 + 9 * good) / 12)
+
+
+def test_no_success_leaves_out_what_has_no_mean(flown):
+    none = {name: values.copy() for name, values in flown.items()}
+    none["success_rate"][:] = False
+    assert "settling_time_s_successful" not in summarize(none)
+
+
+def test_paired_differences(flown):
+    better = {name: values.copy() for name, values in flown.items()}
+    better["return"] = flown["return"] + 2.5
+    paired = compare(better, flown)
+    assert paired["return"]["mean"] == pytest.approx(2.5)
+    assert paired["return"]["ci95"] == pytest.approx([2.5, 2.5])
+    assert paired["energy_j"]["mean"] == 0
+
+
+def test_episodes_do_not_depend_on_the_batch_size(flown, monkeypatch):
+    monkeypatch.setattr(rollout, "_BATCH", 5)
+    again = fly_episodes(load_config("hover", {"env.num_threads": 1}), script("formation_integral"), 12, seed=5)
+    for name, values in flown.items():
+        np.testing.assert_array_equal(values, again[name], err_msg=name)
+
+
+def test_other_seeds_and_purposes_are_other_episodes(flown):
+    other = fly_episodes(load_config("hover"), script("formation_integral"), 12, seed=6)
+    training = fly_episodes(load_config("hover"), script("formation_integral"), 12, seed=5, purpose=0)
+    assert not np.isin(flown["return"], other["return"]).any()
+    assert not np.isin(flown["return"], training["return"]).any()
+
+
+def test_trace_is_the_same_flight(flown):
+    config = load_config("hover")
+    trace = trace_episode(config, script("formation_integral"), 3, seed=5)
+    assert trace.time[-1] == pytest.approx(8.0)
+    assert trace.distance[-100:].mean() == pytest.approx(flown["payload_position_error_m"][3], rel=1e-12)
+    assert trace.angle[-100:].mean() == pytest.approx(flown["payload_attitude_error_deg"][3], rel=1e-12)
+    error = np.linalg.norm(trace.payload_position - trace.target_position, axis=1)
+    np.testing.assert_allclose(trace.distance, error, rtol=1e-12)
+    outside = trace.time[trace.distance > 0.05]
+    assert flown["settling_time_s"][3] == pytest.approx(outside.max() if len(outside) else 0.0)
+    assert trace.drone_position.shape == (400, 4, 3) and trace.tension.shape == (400, 4)
+
+
+def test_energy_of_a_hovering_team_is_its_rotors_power_times_time():
+    options = {f"task_options.{key}": 0.0 for key in ("start_radius", "start_tilt", "start_speed")}
+    calm = {"randomization.payload_mass": 0.0, "randomization.payload_force": 0.0, "env.episode_seconds": 2.0}
+    config = load_config("hover", options | calm)
+    episodes = fly_episodes(config, script("formation"), 2, seed=0)
+    vehicle, system = config.system.vehicle, config.system
+    thrust = np.linalg.norm(system.formation_force + [0, 0, vehicle.mass * 9.81], axis=1)
+    speed = np.sqrt(thrust / 4 / vehicle.thrust_coefficient)
+    power = (vehicle.torque_ratio * thrust * speed).sum()
+    np.testing.assert_allclose(episodes["energy_j"], 2.0 * power, rtol=1e-3)
+    np.testing.assert_allclose(episodes["cable_tension_min_n"], np.linalg.norm(system.formation_force[0]), rtol=1e-3)
+    assert (episodes["slack_time_s"] == 0).all() and (episodes["action_rate"] == 0).all()
+
+
+def test_evaluation_seeds_are_the_contracts():
+    vec = MultiliftVec(load_config("hover", {"env.num_envs": 1}), EVALUATION, first_env=7)
+    vec.reset(seed=1000)
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(1000, spawn_key=(2, 7, 0))))
+    factor = rng.uniform(-1, 1)
+    assert vec.world.plant.payload_mass[0] == pytest.approx(1.4 * (1 + 0.2 * factor), rel=1e-12)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    small = {"env.num_envs": 4, "train.horizon": 8, "train.frames": 64, "eval.episodes": 2, "eval.every": 1}
+    config = load_config("hover", small)
+    trainer = Trainer(config, new_run(config, "hover", tmp_path_factory.mktemp("runs")))
+    trainer.run()
+    return trainer.folder
+
+
+def test_command_writes_metrics_plots_and_table(run, tmp_path, capsys):
+    arguments = [f"run={run}", "episodes=4", "seed=1000", f"out={tmp_path}", "env.num_drones=3", "payload.mass=1.2"]
+    assert evaluate(arguments) == 0
+    shown = capsys.readouterr().out
+    for word in ("success", "position error", "attitude error", "settling time", "formation_integral"):
+        assert word in shown
+    report = json.loads((tmp_path / "metrics.json").read_text())
+    assert report["episodes"] == 4 and report["seed"] == 1000
+    assert report["config"]["env"]["num_drones"] == 3 and report["config"]["payload"]["mass"] == 1.2
+    assert set(report["baselines"]) == {"formation", "formation_integral"} == set(report["paired"])
+    for summary in (report["policy"], *report["baselines"].values()):
+        assert set(summary) >= CONTRACT
+        for value in summary.values():
+            assert value["ci95"][0] <= value["mean"] <= value["ci95"][1]
+    assert {"errors.png", "tensions.png", "paths.png", "training.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_command_films_the_first_episode(run, tmp_path):
+    import imageio.v3 as iio
+
+    settings = ["episodes=1", "video=true", "baseline=none", "env.episode_seconds=0.4", f"out={tmp_path}"]
+    assert evaluate([f"run={run}", *settings]) == 0
+    frames = iio.imread(tmp_path / "episode_0.mp4")
+    assert len(frames) == 10 and frames.std() > 10
+
+
+def test_without_graphics_evaluation_goes_on(run, tmp_path, monkeypatch, capsys):
+    from multilift_marl import rendering
+    from multilift_marl.errors import RenderingError
+
+    def no_graphics(*arguments, **keywords):
+        raise RenderingError("no graphics here")
+
+    monkeypatch.setattr(rendering, "Renderer", no_graphics)
+    assert evaluate([f"run={run}", "episodes=1", "video=true", "env.episode_seconds=0.4", f"out={tmp_path}"]) == 0
+    assert "no video: no graphics here" in capsys.readouterr().err
+    assert (tmp_path / "metrics.json").is_file() and (tmp_path / "errors.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("baseline=formatoin", "unknown baseline 'formatoin'; did you mean 'formation'?"),
+        ("episodes=0", "episodes must be a whole number, at least 1, but is 0"),
+        ("episodes=many", "episodes must be a whole number, at least 1, but is 'many'"),
+        ("video=perhaps", "video must be true or false, but is 'perhaps'"),
+        ("checkpoint=none.pt", "no checkpoint none.pt"),
+        ("payload.mas=1", "unknown key 'payload.mas'; did you mean 'mass'?"),
+    ],
+)
+def test_command_line_errors(run, capsys, argument, message):
+    assert evaluate([f"run={run}", argument]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_shipped_policy_beats_the_scripts(tmp_path):
+    policy = ml.load_policy("hover")
+    flights = {
+        name: fly_episodes(load_config("hover"), maker, 64, seed=4321)
+        for name, maker in {"policy": lambda vec: policy, "script": script("formation_integral")}.items()
+    }
+    report = make_report(policy.config, 4321, flights["policy"], {"script": flights["script"]})
+    assert report["policy"]["success_rate"]["mean"] >= 0.95
+    assert report["policy"]["payload_position_error_m"]["mean"] <= 0.01
+    assert report["paired"]["script"]["return"]["ci95"][0] > 0
+    assert "success" in format_table(report)

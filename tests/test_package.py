@@ -1,0 +1,157 @@
+"""The package as users get it: the wheel, the base without torch, the documents."""
+
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+import multilift_marl as ml
+from multilift_marl.tasks.failures import CAUSES
+from multilift_marl.tasks.hover import Hover, HoverOptions
+from multilift_marl.tasks.observations import OBSERVATION
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def python(code, cwd, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True, env=os.environ | environment
+    )
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    out = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(ROOT)]
+    done = subprocess.run(build, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return next(out.glob("*.whl"))
+
+
+def test_wheel_carries_code_configs_and_policies(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "multilift_marl/configs/hover.yaml" in names
+    assert "multilift_marl/policies/hover.pt" in names
+    assert {name.split("/")[0] for name in names if "dist-info" not in name} == {"multilift_marl"}
+
+
+def test_wheel_works_where_nothing_else_is(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    code = (
+        "import multilift_marl as ml; assert 'site' in ml.__file__, ml.__file__; "
+        "vec = ml.make_vec('hover', num_envs=2); obs, _ = vec.reset(seed=1); "
+        "print(vec.step(ml.load_policy('hover').act(obs))[1].shape)"
+    )
+    done = python(code, tmp_path, PYTHONPATH=str(tmp_path / "site"))
+    assert done.stdout.strip() == "(2, 4)", done.stderr
+
+
+def test_base_needs_neither_torch_nor_a_display(tmp_path):
+    code = (
+        "import sys\n"
+        "for name in ('torch', 'torchrl', 'tensordict', 'matplotlib', 'imageio', 'tqdm', 'tensorboard'):\n"
+        "    sys.modules[name] = None\n"
+        "import multilift_marl as ml\n"
+        "from multilift_marl.envs import multilift_v0\n"
+        "env = multilift_v0.parallel_env('hover')\n"
+        "env.reset(seed=0)\n"
+        "env.step({agent: env.action_space(agent).sample() for agent in env.agents})\n"
+        "print(ml.list_tasks())\n"
+    )
+    done = python(code, tmp_path, DISPLAY="", MUJOCO_GL="")
+    assert done.stdout.strip() == "['hover']", done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_extra_is_named(tmp_path):
+    code = "import sys; sys.modules['torch'] = None\nfrom multilift_marl.cli.train import main; sys.exit(main([]))"
+    done = python(code, tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "error: torch is missing; pip install 'multilift_marl[train]'\n"
+
+
+def test_public_names():
+    assert set(ml.__all__) == {
+        "list_tasks", "load_config", "load_policy", "make_vec", "parallel_env", "sim", "torchrl_env"
+    }  # fmt: skip
+    for name in ml.__all__:
+        assert getattr(ml, name).__doc__
+
+
+def test_hover_document_names_everything():
+    text = (ROOT / "docs" / "hover.md").read_text()
+    for part in OBSERVATION:
+        assert f"| `{part.name}` | {part.size} | {part.frame} | {part.unit} |" in text, part.name
+    for term, weight in Hover.REWARD.items():
+        assert f"| `{term}` | {weight:g} |" in text, term
+    for option in HoverOptions.model_fields:
+        assert f"`{option}`" in text, option
+    for cause in CAUSES[1:]:
+        assert f"`{cause}`" in text, cause
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_and_files_of_documents_exist(document):
+    for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
+        if not target.startswith("http"):
+            assert (document.parent / target).exists(), target
+
+
+def blocks(language, document):
+    return re.findall(rf"```{language}\n(.*?)```", document.read_text(), re.DOTALL)
+
+
+@pytest.mark.parametrize("code", [b for d in DOCUMENTS for b in blocks("python", d)])
+def test_python_of_documents_runs(code, tmp_path):
+    done = python(code, tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def commands():
+    for document in DOCUMENTS:
+        for block in blocks("bash", document):
+            for line in block.replace("\\\n", " ").splitlines():
+                for part in line.split("&&"):
+                    part = part.split("#")[0].strip()
+                    if part.startswith("python ") and "-m venv" not in part:
+                        yield part
+
+
+def test_commands_of_documents_run_in_order(tmp_path):
+    """Every `python …` of the documents runs, made short: trainings to one iteration, evaluations to two episodes."""
+    seen = sorted(set(commands()), key=lambda command: ("train.py" not in command, "resume" in command, command))
+    assert any("train.py config=hover" in command for command in seen)
+    short = "env.num_envs=4 train.horizon=8 train.frames=32 eval.episodes=2"
+    for command in seen:
+        script = command.split()[1]
+        if script == "-m" or script.startswith("-"):
+            continue  # module commands such as pytest itself
+        command = command.replace(script, str(ROOT / script), 1).replace("python", sys.executable, 1)
+        if script == "train.py" and "resume" not in command:
+            command += f" {short}"
+        if script == "evaluate.py":
+            command = re.sub(r"episodes=\d+", "episodes=2", command) + " env.episode_seconds=0.4"
+        if script.startswith("bench/"):
+            command += " repeats=1 seconds=0.05 env.num_envs=4"
+        done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+
+
+def test_configs_only_override_what_exists():
+    for name in ("hover",):
+        values = yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text())
+        assert values["task"] in ml.list_tasks()
+        assert ml.load_config(name).task == values["task"]
+
+
+def test_ci_runs_the_readmes_test_command():
+    script = (ROOT / ".ci" / "run").read_text()
+    block = next(block for block in blocks("bash", ROOT / "README.md") if "pytest" in block)
+    for line in block.strip().splitlines():
+        assert line.strip() in script, line
