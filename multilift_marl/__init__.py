@@ -7,27 +7,30 @@ from typing import TYPE_CHECKING, Any
 from multilift_marl import sim
 from multilift_marl.config import load_config
 from multilift_marl.envs.core import make_vec
+from multilift_marl.envs.multilift_v0 import parallel_env
+from multilift_marl.envs.multilift_v0 import register as _register_with_pettingzoo
 from multilift_marl.tasks import list_tasks
 
 if TYPE_CHECKING:
     from multilift_marl.agents.policy import load_policy
-    from multilift_marl.envs.multilift_v0 import parallel_env
     from multilift_marl.envs.torchrl_env import torchrl_env
 
 __version__ = "0.1.0"
 __all__ = ["list_tasks", "load_config", "load_policy", "make_vec", "parallel_env", "sim", "torchrl_env"]
 
-_LAZY = {
-    "parallel_env": "multilift_marl.envs.multilift_v0",
+_NEED_TORCH = {
     "load_policy": "multilift_marl.agents.policy",
     "torchrl_env": "multilift_marl.envs.torchrl_env",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Import the doors that need more than NumPy and MuJoCo only when they are asked for."""
-    if name in _LAZY:
+    """Import what needs torch only when it is asked for."""
+    if name in _NEED_TORCH:
         from importlib import import_module
 
-        return getattr(import_module(_LAZY[name]), name)
+        return getattr(import_module(_NEED_TORCH[name]), name)
     raise AttributeError(f"module 'multilift_marl' has no attribute '{name}'")
+
+
+_register_with_pettingzoo()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import cos, exp, pi, sin
+from math import pi
 
 import numpy as np
 import pytest
@@ -280,17 +280,20 @@ def test_a_free_drone_follows_its_reference_to_the_centimetre():
 CALM = {"randomization.payload_mass": 0.0, "randomization.payload_force": 0.0}
 
 
-def test_an_attached_team_follows_its_references(num_drones):
-    vec = make(num_envs=4, num_drones=num_drones, **CALM)
+@pytest.mark.parametrize("num_drones", [2, 3, 4, 6])
+def test_a_team_moves_as_one_along_its_references(num_drones):
+    at_rest = {f"task_options.start_{name}": 0 for name in ("radius", "speed", "tilt")}
+    vec = make(num_envs=2, num_drones=num_drones, **CALM, **at_rest)
     vec.reset(seed=0)
-    action, errors = np.zeros((4, num_drones, 4)), []
-    for step in range(300):
-        action[..., :3] = 0.4 if 100 <= step < 200 else 0.0
-        vec.step(action)
-        errors.append(np.linalg.norm(vec.world.state.drone_position - vec.reference.position, axis=-1))
-    errors = np.array(errors)
-    assert errors[50:].max() < 0.10
-    assert np.median(errors[50:]) < 0.02
+    outward_x, outward_y = np.moveaxis(vec.task.goal.slot_frame, -1, 0)
+    aside = np.stack([0.5 * outward_x, -0.5 * outward_y, 0.2 + 0 * outward_x, 0 * outward_x], axis=-1)
+    for _ in range(250):
+        vec.step(aside)
+        errors = np.linalg.norm(vec.world.state.drone_position - vec.reference.position, axis=-1)
+        assert errors.max() < 0.05
+    assert errors.max() < 0.02
+    moved = vec.world.state.drone_position - vec.task.goal.slots
+    np.testing.assert_allclose(moved, np.broadcast_to([0.25, 0, 0.1], moved.shape), atol=0.02)
 
 
 @pytest.mark.parametrize("num_drones", [3, 4, 6])

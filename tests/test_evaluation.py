@@ -34,7 +34,13 @@ def flown():
 
 def test_wilson_interval_matches_published_values():
     # Newcombe, Statistics in Medicine 17, 1998, table I: 81/263, 15/148, 0/20, 1/29
-    for successes, trials, low, high in ((81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0, 0.1611), (1, 29, 0.0061, 0.1718)):  # fmt: skip
+    published = (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    )
+    for successes, trials, low, high in published:
         np.testing.assert_allclose(wilson(successes, trials), (low, high), atol=6e-5)
 
 

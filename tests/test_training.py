@@ -205,7 +205,10 @@ def test_normalizer_equals_the_statistics_of_all_batches():
     ("damage", "message"),
     [
         (lambda path: path.unlink(), r"no checkpoint .*last\.pt: give a run folder"),
-        (lambda path: path.write_bytes(path.read_bytes()[:2000]), r"last\.pt is truncated or no checkpoint at all; use"),
+        (
+            lambda path: path.write_bytes(path.read_bytes()[:2000]),
+            r"last\.pt is truncated or no checkpoint at all; use",
+        ),
         (lambda path: path.write_bytes(b"something else"), r"is truncated or no checkpoint at all; use another"),
         (lambda path: torch.save({"weights": torch.zeros(3)}, path), r"was not written by multilift_marl"),
         (lambda path: torch.save({"code": subprocess.run}, path), r"holds more than tensors and numbers; use another"),
@@ -234,7 +237,7 @@ def test_missing_run_is_named(tmp_path, name):
 def test_observations_of_another_environment_are_refused(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.save("last")
-    with pytest.raises(ValueError, match="observation has 7 numbers, the policy of .* was trained with"):
+    with pytest.raises(ValueError, match=r"observation has 7 numbers, the policy of .* was trained with"):
         load_policy(trainer.folder).act(np.zeros((1, 4, 7), np.float32))
 
 
@@ -275,7 +278,9 @@ def test_help_explains_every_key(capsys):
 def test_log_drops_rows_after_the_checkpoint(tmp_path):
     log = RunLog(tmp_path)
     for iteration in range(1, 6):
-        log.write({"iteration": iteration, "frames": 10 * iteration}, {"a": 1.0} | ({"b": 2.0} if iteration == 3 else {}))
+        log.write(
+            {"iteration": iteration, "frames": 10 * iteration}, {"a": 1.0} | ({"b": 2.0} if iteration == 3 else {})
+        )
     log.close()
     log = RunLog(tmp_path, iteration=3)
     log.write({"iteration": 4, "frames": 40}, {"a": 9.0})

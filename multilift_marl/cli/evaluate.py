@@ -73,7 +73,9 @@ def _check(own: dict[str, Any]) -> None:
         except ValueError:
             number = float("nan")
         if not number.is_integer() or number < (1 if key == "episodes" else 0):
-            raise ConfigError(f"{key} must be a whole number, at least {1 if key == 'episodes' else 0}, but is {text!r}")
+            raise ConfigError(
+                f"{key} must be a whole number, at least {1 if key == 'episodes' else 0}, but is {text!r}"
+            )
         own[key] = int(number)
     if own["baseline"] not in (*SCRIPTED, "none"):
         raise ConfigError(f"unknown baseline '{own['baseline']}'{nearest(str(own['baseline']), [*SCRIPTED, 'none'])}")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.math3d import add, put, turn, vec
@@ -24,9 +25,9 @@ class ReferenceAction:
     def __init__(self, control: ControlConfig):
         self.max_offset, self.max_yaw = control.max_offset, control.max_yaw
 
-    def apply(self, lo: int, hi: int, action: np.ndarray, goal: Goal, reference: Reference) -> None:
-        """Write the commands of environments lo to hi for `action` (E, N, 4) in [-1, 1]."""
-        _command_offset(lo, hi, action, goal, reference, self.max_offset, self.max_yaw)
+    def bind(self, lo: int, hi: int, action: np.ndarray, goal: Goal, reference: Reference) -> Callable[[], None]:
+        """Return the call that writes the commands of environments lo to hi for `action` (E, N, 4) in [-1, 1]."""
+        return bind(_command_offset, lo, hi, action, goal, reference, self.max_offset, self.max_yaw)
 
 
 @kernel

@@ -11,6 +11,7 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import GRAVITY, System
 from multilift_marl.control.allocation import allocate, allocation_matrix
+from multilift_marl.control.formation import smooth
 from multilift_marl.math3d import (
     add,
     column,
@@ -112,6 +113,13 @@ def attitude_torque(attitude, rates, desired, desired_rate, g):
         gyroscopic[1] - g.inertia[1] * (g.k_R[1] * e_r[1] + g.k_w[1] * e_w[1] + transport[1]),
         gyroscopic[2] - g.inertia[2] * (g.k_R[2] * e_r[2] + g.k_w[2] * e_w[2] + transport[2]),
     )
+
+
+@kernel
+def control(lo, hi, state, reference, pull, thrust, g, frequency, speed, dt):
+    """One control step: `smooth` the references, then `fly` after them."""
+    smooth(lo, hi, reference, frequency, speed, dt)
+    fly(lo, hi, state, reference, pull, thrust, g)
 
 
 @kernel

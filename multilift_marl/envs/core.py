@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from multilift_marl._jit import bind
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.config.system import whole_ratio
 from multilift_marl.control.actions import ACTIONS
-from multilift_marl.control.formation import Reference, smooth, start_reference
-from multilift_marl.control.geometric import fly, make_gains
+from multilift_marl.control.formation import Reference, start_reference
+from multilift_marl.control.geometric import control, make_gains
 from multilift_marl.errors import ConfigError
 from multilift_marl.sim.randomization import randomize
 from multilift_marl.sim.world import Shard, World
@@ -43,16 +44,16 @@ class MultiliftVec:
     def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
         task = find_task(config.task)
         self.config, self.purpose, self.first_env = config, purpose, first_env
-        system, control = config.system, config.control
+        system, settings = config.system, config.control
         self.num_envs, self.num_drones = config.env.num_envs, system.num_drones
         self._ticks = whole_ratio(config.sim.control_hz, config.env.policy_hz, "env.policy_hz", "sim.control_hz")
         self.max_steps = round(config.env.episode_seconds * config.env.policy_hz)
         if self.max_steps < 1:
             raise ConfigError(f"env.episode_seconds={config.env.episode_seconds} is shorter than one step; raise it")
         e, n = self.num_envs, self.num_drones
-        self._gains = make_gains(control, system)
-        self._interface = ACTIONS[control.action](control)
-        self._smoothing = (control.reference_frequency, control.reference_speed, 1.0 / config.sim.control_hz)
+        self._gains = make_gains(settings, system)
+        self._interface = ACTIONS[settings.action](settings)
+        self._smoothing = (settings.reference_frequency, settings.reference_speed, 1.0 / config.sim.control_hz)
         self.world = World(system, e, config.env.num_threads)
         self.reference = Reference.zeros(e, n)
         self.task = task(config, self.world, self.reference)
@@ -63,12 +64,12 @@ class MultiliftVec:
         self.reward_terms, self.failure_causes = tuple(task.REWARD), CAUSES
         self._action = np.zeros((e, n, self.action_size))
         self._previous = np.zeros_like(self._action)
-        self._thrust = np.zeros((e, n, 4))
         self._observation = np.zeros((e, n, OBSERVATION_SIZE), np.float32)
         self._state = np.zeros((e, self.state_size), np.float32)
         self._mass = np.full(e, system.payload_mass)
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
+        self._bind()
 
     def reset(
         self, seed: int | None = None, mask: np.ndarray | None = None, options: dict | None = None
@@ -94,14 +95,13 @@ class MultiliftVec:
                 raise ValueError(f"seed must not be negative, but is {seed}")
             self.seeds[mask], self.episodes[mask] = seed, -1
         self.episodes[mask] += 1
-        drawn = np.flatnonzero(mask)
+        drawn = np.flatnonzero(mask).tolist()
         for e in drawn:
-            self._draw(int(e))
+            self._draw(e)
         self.world.set_payload_mass(mask, self._mass)
         self.world.load(mask)
         self._action[mask] = self._previous[mask] = 0.0
         self.steps[mask], self._ended[mask] = 0, False
-        self.task.terms[mask] = 0.0
         for e in drawn:
             start_reference(e, self.world.state, self.reference)
             self.task.observe(e, e + 1, self._action, self._observation, self._state)
@@ -169,17 +169,28 @@ class MultiliftVec:
         for name, array in groups["reference"].items():
             getattr(self.reference, name)[:] = array
 
+    def _bind(self) -> None:
+        """Bind what is called in every step to its arrays, for each shard."""
+        world, task, reference = self.world, self.task, self.reference
+        self._calls: dict[int, tuple] = {}
+        for shard in world.shards:
+            span = (shard.lo, shard.hi)
+            act = self._interface.bind(*span, self._action, task.goal, reference)
+            follow = bind(
+                control, *span, world.state, reference, task.goal.pull, world.thrust, self._gains, *self._smoothing
+            )
+            after = task.after_step(*span, self._action, self._previous, self._observation, self._state)
+            self._calls[shard.lo] = (act, follow, after)
+
     def _advance(self, shard: Shard) -> None:
         """One policy step of one shard, on its own thread."""
-        lo, hi, world, interval = shard.lo, shard.hi, self.world, self.world.system.control_interval
-        self._interface.apply(lo, hi, self._action, self.task.goal, self.reference)
+        act, follow, after = self._calls[shard.lo]
+        act()
         for _ in range(self._ticks):
-            smooth(lo, hi, self.reference, *self._smoothing)
-            fly(lo, hi, world.state, self.reference, self.task.goal.pull, self._thrust, self._gains)
-            world.advance(shard, self._thrust, interval)
-        self.task.check(lo, hi, self.task.dt)
-        self.task.score(lo, hi, self._action, self._previous)
-        self.task.observe(lo, hi, self._action, self._observation, self._state)
+            follow()
+            self.world.advance(shard, self.world.system.control_interval)
+        for call in after:
+            call()
 
     def _draw(self, e: int) -> None:
         """Draw hidden parameters and a sound start for one environment."""
@@ -203,15 +214,15 @@ class MultiliftVec:
             )
         if action.dtype.kind != "f":
             raise ValueError(f"action has dtype {action.dtype}, expected floating point numbers in [-1, 1]")
+        if self._ended.any():
+            raise RuntimeError(
+                f"environment {int(np.argmax(self._ended))} has ended or was never reset: call reset(mask=...) first"
+            )
         if not np.isfinite(action).all():
             e, n, k = np.argwhere(~np.isfinite(action))[0]
             raise ValueError(
                 f"action of drone_{n} in environment {e} is not finite ({self.action_names[k]}={action[e, n, k]}); "
                 "look for NaN in the policy"
-            )
-        if self._ended.any():
-            raise RuntimeError(
-                f"environment {int(np.argmax(self._ended))} has ended or was never reset: call reset(mask=...) first"
             )
         self._previous[:] = self._action
         np.clip(action, -1.0, 1.0, out=self._action, casting="same_kind")

@@ -54,13 +54,17 @@ def write_report(path: Path, report: dict) -> None:
 def format_table(report: dict, name: str = "policy") -> str:
     """Return the report as a Markdown table: mean and 95 % interval of each metric, a column for each policy."""
     columns = {name: report["policy"], **report["baselines"]}
-    causes = {key for summary in columns.values() for key in summary if key.startswith("failure_") and summary[key]["mean"]}
+    causes = {
+        key for summary in columns.values() for key in summary if key.startswith("failure_") and summary[key]["mean"]
+    }
     rows = [*_ROWS, *((key, f"{key[8:-5].replace('_', ' ')} [%]", 100, 1) for key in sorted(causes))]
     cells = [["", *columns]]
     for key, heading, factor, digits in rows:
         cells.append([heading, *(_cell(summary.get(key), factor, digits) for summary in columns.values())])
     widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
-    lines = ["| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in cells]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in cells
+    ]
     lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
     return "\n".join(lines)
 

@@ -10,7 +10,7 @@ import numpy as np
 from multilift_marl.config.load import build_config
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
-from multilift_marl.tasks.failures import CAUSES, MAX_DISTANCE
+from multilift_marl.tasks.failures import MAX_DISTANCE
 
 SETTLED = 0.05  # [m] settling time counts until the payload stays within this
 FINAL_SECONDS = 2.0  # errors are means over these last seconds

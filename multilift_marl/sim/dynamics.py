@@ -70,12 +70,11 @@ class Constants(NamedTuple):
     """Offset of qpos in a row of `batch.state`; likewise the next ones."""
     qvel: int
     force: int
-    warmstart: int
     payload_nq: int
     payload_nv: int
 
 
-def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: int, warmstart: int) -> Constants:
+def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: int) -> Constants:
     """Return the constants of `system`."""
     vehicle, h = system.vehicle, system.timestep / system.vehicle.rotor_time_constant
     return Constants(
@@ -97,7 +96,6 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         qpos=qpos,
         qvel=qvel,
         force=force,
-        warmstart=warmstart,
         payload_nq=layout.payload_nq,
         payload_nv=layout.payload_nv,
     )

@@ -1,18 +1,23 @@
-"""From a system to a MuJoCo model. Only this file knows how bodies, cables and sensors are laid out in MuJoCo's arrays."""
+"""From a system to a MuJoCo model. Only this file knows how bodies, cables and sensors lie in MuJoCo's arrays."""
 
 from __future__ import annotations
 
+from itertools import combinations, product
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.config.vehicles import Vehicle
 from multilift_marl.sim.cables import IMPEDANCE, limit_solref
 
 _GEOM, _OBJECT = mujoco.mjtGeom, mujoco.mjtObj
 _VISUAL_GROUP = 2
-DRONE_COLOURS = ((0.12, 0.47, 0.71, 1), (0.84, 0.37, 0.0, 1), (0.17, 0.63, 0.17, 1), (0.58, 0.40, 0.74, 1))
+DRONE_COLOURS = (  # told apart by the colour-blind too (Okabe & Ito 2008), none of them green like the target
+    (0.00, 0.45, 0.70, 1), (0.84, 0.37, 0.00, 1), (0.80, 0.47, 0.65, 1),
+    (0.34, 0.71, 0.91, 1), (0.90, 0.62, 0.00, 1), (0.35, 0.35, 0.38, 1),
+)  # fmt: skip
 
 
 class Layout(NamedTuple):
@@ -34,7 +39,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
 
     Args:
         system: what to build.
-        visuals: add rotors, arms, a sky and the translucent target (a mocap body); physics is the same without.
+        visuals: add rotors, sky, light and the translucent target (a mocap body); physics is the same without.
     """
     spec = mujoco.MjSpec()
     spec.modelname = "multilift"
@@ -50,6 +55,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
         _add_drone(spec, system, i, visuals)
         _add_cable(spec, system, i)
     if visuals:
+        _add_light(spec.body("payload"))
         _add_target(spec, system)
     return spec
 
@@ -65,7 +71,7 @@ def build_model(system: System, visuals: bool = False) -> tuple[mujoco.MjModel, 
 def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
     world = spec.worldbody
     floor = world.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.05])
-    for name, pos, forward in (("side", [0.0, -5.2, 2.5], [0, 1, -0.12]), ("top", [0.0, 0.0, 8.0], [0, 1e-3, -1])):
+    for name, pos, forward in (("side", [0.0, -5.2, 3.4], [0, 1, -0.3]), ("top", [0.0, 0.0, 8.0], [0, 1e-3, -1])):
         forward = np.asarray(forward, float) / np.linalg.norm(forward)
         right = np.cross(forward, [0, 0, 1])
         right /= np.linalg.norm(right)
@@ -73,26 +79,38 @@ def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, np.stack([right, up, -forward], axis=1).ravel())
         world.add_camera(name=name, pos=pos, quat=quat, fovy=45)
-    if not visuals:
-        return
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1920, 1080
-    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.45] * 3, [0.45] * 3
-    spec.visual.headlight.specular = [0.1] * 3
-    spec.visual.quality.shadowsize = 4096
-    texture = mujoco.mjtTexture
-    builtin = mujoco.mjtBuiltin
+    if visuals:
+        _add_surroundings(spec, floor)
+
+
+def _add_surroundings(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
+    """Add a pale sky, a floor of 1 m squares that fades into it, and soft light."""
+    visual, horizon = spec.visual, [0.88, 0.92, 0.96]
+    spec.stat.extent, spec.stat.center = 4.0, [0, 0, 1.5]  # fixed, so that every team is lit alike
+    visual.headlight.ambient, visual.headlight.diffuse, visual.headlight.specular = [0.42] * 3, [0.22] * 3, [0.05] * 3
+    visual.quality.shadowsize, visual.map.shadowclip = 2048, 1.2
+    visual.rgba.haze, visual.rgba.fog = [*horizon, 1], [*horizon, 1]
+    visual.map.fogstart, visual.map.fogend, visual.map.znear, visual.map.zfar = 2.5, 7.0, 0.01, 50
+    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
     spec.add_texture(
         name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=builtin.mjBUILTIN_GRADIENT,
-        rgb1=[0.93, 0.96, 1.0], rgb2=[0.62, 0.74, 0.88], width=64, height=384,
+        rgb1=[0.30, 0.52, 0.82], rgb2=horizon, width=64, height=384,
     )  # fmt: skip
     spec.add_texture(
         name="grid", type=texture.mjTEXTURE_2D, builtin=builtin.mjBUILTIN_CHECKER, mark=mujoco.mjtMark.mjMARK_EDGE,
-        rgb1=[0.80, 0.82, 0.84], rgb2=[0.76, 0.78, 0.80], markrgb=[0.9, 0.9, 0.9], width=256, height=256,
+        rgb1=[0.70, 0.73, 0.76], rgb2=[0.66, 0.69, 0.73], markrgb=[0.86, 0.88, 0.90], width=512, height=512,
     )  # fmt: skip
-    material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True, reflectance=0.03)
+    material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True, specular=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
     floor.material = "grid"
-    world.add_light(pos=[1, -2, 8], dir=[-0.1, 0.25, -1], castshadow=True, diffuse=[0.5] * 3, specular=[0.1] * 3)
+
+
+def _add_light(payload: mujoco.MjsBody) -> None:
+    """Hang a sun above the payload, so that its shadows reach wherever the team flies."""
+    payload.add_light(
+        name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK,
+        pos=[-1.0, -1.0, 5.0], dir=[0.15, 0.15, -1], castshadow=True, diffuse=[0.42] * 3, specular=[0.15] * 3,
+    )  # fmt: skip
 
 
 def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
@@ -127,19 +145,23 @@ def _add_drone(spec: mujoco.MjSpec, system: System, i: int, visuals: bool) -> No
     body.add_site(name=f"{name}/hook", pos=[0, 0, 0], size=[0.008, 0, 0], rgba=[0.2, 0.2, 0.2, 1])
     for r, position in enumerate(vehicle.rotor_positions):
         body.add_site(name=f"{name}/rotor_{r}", pos=position, size=[0.008, 0, 0], group=4)
-    if not visuals:
-        return
+    if visuals:
+        _add_rotorcraft(body, vehicle, colour)
+
+
+def _add_rotorcraft(body: mujoco.MjsBody, vehicle: Vehicle, colour: tuple[float, ...]) -> None:
+    """Draw hull, arms and rotor discs; the front ones in the drone's colour."""
+    arm, dark, pale = vehicle.arm, [0.13, 0.13, 0.15, 1], [0.30, 0.32, 0.36, 0.55]
     plain = {"contype": 0, "conaffinity": 0, "group": _VISUAL_GROUP, "mass": 0}
-    thick = 0.07 * vehicle.arm
-    body.add_geom(type=_GEOM.mjGEOM_ELLIPSOID, size=[0.45 * vehicle.arm, 0.34 * vehicle.arm, 0.24 * vehicle.arm], rgba=colour, **plain)
-    for r, position in enumerate(vehicle.rotor_positions):
-        tip = position + [0, 0, 0.25 * vehicle.arm]
-        body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[0, 0, 0, *position], size=[thick, 0, 0], rgba=[0.15, 0.15, 0.17, 1], **plain)
-        body.add_geom(type=_GEOM.mjGEOM_CYLINDER, fromto=[*position, *tip], size=[thick, 0, 0], rgba=[0.15, 0.15, 0.17, 1], **plain)
-        front = [0.85, 0.2, 0.2, 0.55] if position[0] > 0 else [0.25, 0.25, 0.3, 0.45]
-        body.add_geom(
-            type=_GEOM.mjGEOM_CYLINDER, pos=tip, size=[0.6 * vehicle.arm, 0.02 * vehicle.arm, 0], rgba=front, **plain
-        )
+    hull = np.array([0.50, 0.36, 0.26]) * arm
+    body.add_geom(type=_GEOM.mjGEOM_ELLIPSOID, size=hull, rgba=colour, **plain)
+    for position in vehicle.rotor_positions:
+        tip, disc = position + [0, 0, 0.22 * arm], [0.62 * arm, 0.02 * arm, 0]
+        thick = [0.08 * arm, 0, 0]
+        body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[0, 0, 0, *position], size=thick, rgba=dark, **plain)
+        body.add_geom(type=_GEOM.mjGEOM_CYLINDER, fromto=[*position, *tip], size=thick, rgba=dark, **plain)
+        tint = [*colour[:3], 0.75] if position[0] > 0 else pale
+        body.add_geom(type=_GEOM.mjGEOM_CYLINDER, pos=tip, size=disc, rgba=tint, **plain)
 
 
 def drone_half_height(system: System) -> float:
@@ -152,7 +174,7 @@ def _add_cable(spec: mujoco.MjSpec, system: System, i: int) -> None:
     cable.wrap_site(f"drone_{i}/hook")
     cable.wrap_site(f"payload/anchor_{i}")
     cable.solimp_limit = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2]
-    cable.width, cable.rgba = 0.004, [0.1, 0.1, 0.1, 1]
+    cable.width, cable.rgba = 0.006, [0.08, 0.08, 0.1, 1]
     spec.add_sensor(
         name=f"cable_{i}/tension", type=mujoco.mjtSensor.mjSENS_TENDONLIMITFRC,
         objtype=_OBJECT.mjOBJ_TENDON, objname=f"cable_{i}",
@@ -160,9 +182,17 @@ def _add_cable(spec: mujoco.MjSpec, system: System, i: int) -> None:
 
 
 def _add_target(spec: mujoco.MjSpec, system: System) -> None:
+    """Add the target: a translucent payload with firm edges, a little larger, so that one that has arrived fits in."""
     body = spec.worldbody.add_body(name="target", mocap=True, pos=[0, 0, -10])
-    plain = {"contype": 0, "conaffinity": 0, "group": _VISUAL_GROUP, "rgba": [0.1, 0.75, 0.35, 0.28]}
+    plain = {"contype": 0, "conaffinity": 0, "group": _VISUAL_GROUP}
+    faint, firm = [0.0, 0.75, 0.35, 0.18], [0.0, 0.60, 0.25, 1]
+    half = system.payload_size / 2 + 0.04 * system.payload_size.min()
     if system.payload_shape == "point":
-        body.add_geom(type=_GEOM.mjGEOM_SPHERE, size=[system.payload_size[0] / 2, 0, 0], **plain)
-    else:
-        body.add_geom(type=_GEOM.mjGEOM_BOX, size=system.payload_size / 2, **plain)
+        body.add_geom(type=_GEOM.mjGEOM_SPHERE, size=[half[0], 0, 0], rgba=[*firm[:3], 0.5], **plain)
+        return
+    body.add_geom(type=_GEOM.mjGEOM_BOX, size=half, rgba=faint, **plain)
+    thick = [0.03 * system.payload_size.min(), 0, 0]
+    corners = half * np.array(list(product((-1, 1), repeat=3)))
+    for a, b in combinations(corners, 2):
+        if np.count_nonzero(a != b) == 1:
+            body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[*a, *b], size=thick, rgba=firm, **plain)

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
+from multilift_marl._jit import bind
 from multilift_marl.config.system import System
 from multilift_marl.math3d import mat_to_quat
 from multilift_marl.sim.cables import limit_solref
@@ -30,8 +31,10 @@ class Shard:
     lo: int
     hi: int
     batch: Batch
-    tension: np.ndarray
-    """(hi - lo, N) live view of the tension sensors [N]."""
+    apply: Callable[[], None]
+    """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
+    read: Callable[[], None]
+    """`read_rows` of these environments."""
 
 
 class World:
@@ -44,6 +47,7 @@ class World:
 
     Attributes:
         state: SystemState of all environments; live arrays, E first.
+        thrust: commanded thrust of each rotor (E, N, 4) [N].
         plant: true parameters and loads; write `wind` and `payload_force` freely, the mass by `set_payload_mass`.
         record: what accumulated since the reset.
         diverged: (E,) bool, until reset.
@@ -53,10 +57,7 @@ class World:
         _quiet_mujoco()
         self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
         self.model, self.layout = build_model(system)
-        self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
-        first = self.shards[0].batch
-        offsets = [_offset(first, name) for name in ("qpos", "qvel", "qfrc_applied", "qacc_warmstart")]
-        self.constants = make_constants(system, self.layout, *offsets)
+        self.thrust = np.zeros((num_envs, self.num_drones, 4))
         self.state = SystemState.zeros(num_envs, self.num_drones)
         self.plant = Plant(
             payload_mass=np.full(num_envs, system.payload_mass),
@@ -65,6 +66,7 @@ class World:
         )
         self.record = Record.zeros(num_envs)
         self.diverged = np.zeros(num_envs, bool)
+        self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool, self._pool_owner = None, 0
         self.reset()
 
@@ -100,24 +102,24 @@ class World:
         Raises:
             ValueError: wrong shape, or a thrust that is not finite.
         """
-        thrust = np.ascontiguousarray(thrust, np.float64)
+        thrust = np.asarray(thrust, np.float64)
         if thrust.shape != (self.num_envs, self.num_drones, 4):
             raise ValueError(f"thrust has shape {thrust.shape}, expected {(self.num_envs, self.num_drones, 4)}")
         if not np.isfinite(thrust).all():
             raise ValueError("thrust holds NaN or infinite values; give each rotor's thrust in newtons")
-        self.run(lambda shard: self.advance(shard, thrust, nstep))
+        self.thrust[:] = thrust
+        self.run(lambda shard: self.advance(shard, nstep))
         return self.state
 
-    def advance(self, shard: Shard, thrust: np.ndarray, nstep: int) -> None:
-        """Advance one shard; see `step`. Does not check its arguments."""
-        rows, lo, hi, batch = shard.batch.state, shard.lo, shard.hi, shard.batch
+    def advance(self, shard: Shard, nstep: int) -> None:
+        """Advance one shard with the thrusts in `thrust`; see `step`."""
         for _ in range(nstep):
-            apply_loads(rows, lo, hi, thrust, self.state, self.plant, self.record, self.constants)
+            shard.apply()
             try:
-                batch.step()
+                shard.batch.step()
             except SimulationError as error:
-                self.diverged[lo + np.asarray(error.ids, int)] = True
-            read_rows(rows, lo, hi, shard.tension, self.state, self.record, self.diverged, self.constants)
+                self.diverged[shard.lo + np.asarray(error.ids, int)] = True
+            shard.read()
 
     def run(self, work: Callable[[Shard], None]) -> None:
         """Call `work` for every shard, each on a thread of its own."""
@@ -174,6 +176,8 @@ class World:
 
     def qpos(self, env: int) -> np.ndarray:
         """Return MuJoCo's generalised coordinates of one environment, to draw it."""
+        if not 0 <= env < self.num_envs:
+            raise ValueError(f"there is no environment {env}; give one from 0 to {self.num_envs - 1}")
         shard = next(shard for shard in self.shards if shard.lo <= env < shard.hi)
         return shard.batch.bind("qpos")[env - shard.lo]
 
@@ -201,9 +205,16 @@ class World:
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int)
         shards = []
-        for lo, hi in zip(edges[:-1], edges[1:], strict=True):
-            batch = Batch(self.model, int(hi - lo), nthread=1)
-            shards.append(Shard(int(lo), int(hi), batch, batch.bind("sensordata")))
+        for lo, hi in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            batch = Batch(self.model, hi - lo, nthread=1)
+            offsets = [_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied")]
+            self.constants = make_constants(self.system, self.layout, *offsets)  # the same for every shard
+            apply = bind(
+                apply_loads, batch.state, lo, hi, self.thrust, self.state, self.plant, self.record, self.constants
+            )
+            tension = batch.bind("sensordata")
+            read = bind(read_rows, batch.state, lo, hi, tension, self.state, self.record, self.diverged, self.constants)
+            shards.append(Shard(lo, hi, batch, apply, read))
         return shards
 
 

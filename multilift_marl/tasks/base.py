@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import ValidationError
 
+from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Section
 from multilift_marl.control.formation import Goal, Reference, Rig
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.world import World
-from multilift_marl.tasks import observations
 from multilift_marl.tasks.failures import find_failures, make_limits
+from multilift_marl.tasks.observations import observe_team
 from multilift_marl.tasks.terms import Errors, measure
 
 INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
 
 
+@kernel
+def check_team(lo, hi, state, goal, errors, dt, limits, cause, min_separation):
+    """Measure the errors of environments lo to hi, integrate them over `dt` [s], look for failures."""
+    measure(lo, hi, state, goal, errors, dt, INTEGRAL_LIMIT)
+    find_failures(lo, hi, state, errors, limits, cause, min_separation)
+
+
 class Task:
     """A cooperative transport task for E environments of N drones.
 
-    A subclass says how an episode starts (`start`), what the team is paid and when it does well (`score`), and what
+    A subclass says how an episode starts (`start`), what the team is paid and when it does well (`scorer`), and what
     counts as success at the end (`succeeded`). Goal, errors, failures and observations are kept here; time limit,
     seeding, divergence and clipping of actions belong to the core.
 
@@ -61,12 +70,12 @@ class Task:
         """Draw a start of one environment: write its goal and `world.state`, for a payload of true `mass` [kg]."""
         raise NotImplementedError
 
-    def score(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> None:
-        """Write `terms` and update `good_time` of environments lo to hi.
+    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+        """Return what, after each policy step, writes `terms` and updates `good_time` of environments lo to hi.
 
         Args:
             lo, hi: the environments.
-            action, previous: this action and the last one (E, N, A).
+            action, previous: this action and the last one (E, N, A), live arrays.
         """
         raise NotImplementedError
 
@@ -77,21 +86,35 @@ class Task:
     def begin(self, env: int) -> bool:
         """Reset the measurements of one environment to its drawn start; return whether that start is sound."""
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
-        self.good_time[env], self.min_separation[env] = 0.0, 1e9
+        self.good_time[env], self.min_separation[env], self.terms[env] = 0.0, 1e9, 0.0
         self.check(env, env + 1, 0.0)
         return self.cause[env] == 0
 
     def check(self, lo: int, hi: int, dt: float) -> None:
         """Measure errors of environments lo to hi, integrate them over `dt` [s], and look for failures."""
-        measure(lo, hi, self.world.state, self.goal, self.errors, dt, INTEGRAL_LIMIT)
-        find_failures(lo, hi, self.world.state, self.errors, self.limits, self.cause, self.min_separation)
+        check_team(*self._checked(lo, hi, dt))
 
     def observe(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> None:
         """Write observations (E, N, D) and global states (E, S) of environments lo to hi."""
-        observations.observe_team(
-            lo, hi, self.world.state, self.world.plant, self.goal, self.reference, self.errors, action,
-            self.rig, self._nominal, observation, critic,
-        )  # fmt: skip
+        observe_team(*self._observed(lo, hi, action, observation, critic))
+
+    def after_step(
+        self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray, observation: np.ndarray, critic: np.ndarray
+    ) -> list[Callable[[], None]]:
+        """Return what is called in turn for environments lo to hi after each policy step: check, score, observe."""
+        return [
+            bind(check_team, *self._checked(lo, hi, self.dt)),
+            self.scorer(lo, hi, action, previous),
+            bind(observe_team, *self._observed(lo, hi, action, observation, critic)),
+        ]
+
+    def _checked(self, lo: int, hi: int, dt: float) -> tuple:
+        state, errors = self.world.state, self.errors
+        return lo, hi, state, self.goal, errors, dt, self.limits, self.cause, self.min_separation
+
+    def _observed(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> tuple:
+        state, plant, goal, reference = self.world.state, self.world.plant, self.goal, self.reference
+        return lo, hi, state, plant, goal, reference, self.errors, action, self.rig, self._nominal, observation, critic
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import cos, pi, radians, sin, sqrt
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Float, Section
 from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import (
@@ -70,11 +71,11 @@ class Hover(Task):
         team = (world.system.cable_length, world.system.cable_stiffness, load, vehicle.mass, vehicle.thrust_coefficient)
         _start(env, rng, world.state, self.goal, self.rig, ranges, team)
 
-    def score(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> None:
-        """Pay for closeness, attitude and stillness; see `Task.score`."""
+    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+        """Pay for closeness, attitude and stillness; see `Task.scorer`."""
         success = (self.options.success_distance, radians(self.options.success_angle))
-        _score(
-            lo, hi, self.world.state, self.errors, action, previous, self.weights, success, self.dt,
+        return bind(
+            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights, success, self.dt,
             self.terms, self.good_time,
         )  # fmt: skip
 

@@ -1,0 +1,218 @@
+"""The PettingZoo door: one environment, one agent for each drone."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import pettingzoo
+from gymnasium.spaces import Box
+from pettingzoo import ParallelEnv
+
+from multilift_marl.config.schema import Config
+from multilift_marl.envs.core import MultiliftVec, resolve_config
+from multilift_marl.errors import nearest
+from multilift_marl.rendering import Renderer
+from multilift_marl.tasks import list_tasks
+
+RENDER_MODES = ("rgb_array",)
+
+
+class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
+    """A team of N drones as a PettingZoo environment; agents `drone_0` ... act at once and end together.
+
+    Observations are (D,) float32, actions (A,) in [-1, 1], rewards are the team's. Each agent's info holds `success`,
+    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one) and `reward_terms` {name: float}. A
+    copy, also by pickle, is a new environment of the same configuration, not yet reset.
+
+    Args:
+        config: what to build; it is stepped alone, whatever `env.num_envs` says.
+        render_mode: None, or "rgb_array" for `render`.
+
+    Attributes:
+        vec: the batched core underneath, of one environment.
+        state_space: of `state`, (S,) float32.
+
+    Raises:
+        ValueError: an unknown render mode.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "multilift_v0",
+        "render_modes": list(RENDER_MODES),
+        "is_parallelizable": True,
+    }
+
+    def __init__(self, config: Config, render_mode: str | None = None):
+        if render_mode not in (None, *RENDER_MODES):
+            raise ValueError(f"unknown render_mode '{render_mode}'{nearest(str(render_mode), RENDER_MODES)}")
+        config = resolve_config(config, num_envs=1, num_threads=1)
+        self.vec = vec = MultiliftVec(config)
+        self.metadata = {**type(self).metadata, "render_fps": config.env.policy_hz}
+        self.render_mode = render_mode
+        self.possible_agents = [f"drone_{n}" for n in range(vec.num_drones)]
+        self.agents: list[str] = []
+        names, unbounded = self.possible_agents, (-np.inf, np.inf)
+        self.observation_spaces = {name: Box(*unbounded, (vec.observation_size,), np.float32) for name in names}
+        self.action_spaces = {name: Box(-1.0, 1.0, (vec.action_size,), np.float32) for name in names}
+        self.state_space = Box(*unbounded, (vec.state_size,), np.float32)
+        self._joint = np.zeros((1, vec.num_drones, vec.action_size))
+        self._rows = list(zip(names, self._joint[0], strict=True))
+        self._renderer: Renderer | None = None
+        self._started = False
+
+    def reset(
+        self, seed: int | None = None, options: dict | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        """Start a new episode.
+
+        Args:
+            seed: start at episode 0 of this seed; None goes to the next episode.
+            options: ignored; PettingZoo's API test passes some of its own.
+
+        Returns:
+            Observation {agent: (D,) float32} and info of each agent.
+
+        Raises:
+            ValueError: a negative seed.
+        """
+        observation, info = self.vec.reset(seed)
+        self.agents, self._started = self.possible_agents.copy(), True
+        return dict(zip(self.agents, observation[0], strict=True)), self._infos(info)
+
+    def step(
+        self, actions: dict[str, np.ndarray]
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Advance by one policy step.
+
+        Args:
+            actions: {agent: (A,) floating point} of every agent; values beyond [-1, 1] are clipped.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos by agent.
+
+        Raises:
+            ValueError: an agent without an action, an action without an agent, or one of wrong shape or type or not
+                finite; the message names the drone.
+            RuntimeError: the episode has ended or none was started.
+        """
+        agents = self.agents
+        if not agents:
+            raise RuntimeError("the episode has ended or none was started: call reset() before step()")
+        if len(actions) != len(agents):
+            raise self._mismatch(actions)
+        shape = self._joint.shape[2:]
+        for name, row in self._rows:
+            if name not in actions:
+                raise self._mismatch(actions)
+            action = np.asarray(actions[name])
+            if action.shape != shape or action.dtype.kind != "f":
+                raise ValueError(
+                    f"action of {name} has shape {action.shape} and dtype {action.dtype}, expected {shape} "
+                    "floating point numbers in [-1, 1]"
+                )
+            row[:] = action
+        observation, reward, terminated, truncated, info = self.vec.step(self._joint)
+        over, out_of_time = bool(terminated[0]), bool(truncated[0])
+        if over or out_of_time:
+            self.agents = []
+        return (
+            dict(zip(agents, observation[0], strict=True)),
+            dict(zip(agents, reward[0].tolist(), strict=True)),
+            dict.fromkeys(agents, over),
+            dict.fromkeys(agents, out_of_time),
+            self._infos(info),
+        )
+
+    def state(self) -> np.ndarray:
+        """Return the global state (S,) float32, which holds what is hidden from the drones."""
+        return self.vec.state()[0]
+
+    def observation_space(self, agent: str) -> Box:
+        """Return the space of an agent's observations, the same object on every call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Box:
+        """Return the space of an agent's actions, the same object on every call."""
+        return self.action_spaces[agent]
+
+    def render(self) -> np.ndarray:
+        """Return a picture (H, W, 3) uint8 of the team and its target.
+
+        Raises:
+            RuntimeError: there is no `render_mode`, or no episode was ever started.
+            RenderingError: there is no OpenGL that draws off-screen.
+        """
+        if self.render_mode is None:
+            raise RuntimeError('render() needs an environment made with render_mode="rgb_array"')
+        if not self._started:
+            raise RuntimeError("there is nothing to draw yet: call reset() before render()")
+        if self._renderer is None:
+            self._renderer = Renderer(self.vec)
+        return self._renderer.frame()
+
+    def close(self) -> None:
+        """Free the renderer; the environment itself holds nothing that must be closed."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def __reduce__(self) -> tuple[type[MultiliftParallelEnv], tuple[Config, str | None]]:
+        return type(self), (self.vec.config, self.render_mode)
+
+    def _infos(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        """Return a dict for each agent; none is shared, so that wrappers may write into theirs."""
+        vec = self.vec
+        terms = dict(zip(vec.reward_terms, vec.task.terms[0].tolist(), strict=True))
+        success, failure, diverged = bool(info["success"][0]), bool(info["failure"][0]), bool(info["diverged"][0])
+        cause = vec.failure_causes[info["failure_cause"][0]]
+        return {
+            name: {
+                "success": success,
+                "failure": failure,
+                "diverged": diverged,
+                "failure_cause": cause,
+                "reward_terms": terms.copy(),
+            }
+            for name in self.possible_agents
+        }
+
+    def _mismatch(self, actions: dict[str, Any]) -> ValueError:
+        for name in self.possible_agents:
+            if name not in actions:
+                return ValueError(f"no action for {name}: give one for each of env.agents")
+        stranger = next(name for name in actions if name not in self.possible_agents)
+        return ValueError(f"action for unknown agent '{stranger}'{nearest(str(stranger), self.possible_agents)}")
+
+
+def parallel_env(
+    task: str | Config = "hover", *, num_drones: int | None = None, seed: int | None = None,
+    render_mode: str | None = None, **overrides: Any,
+) -> MultiliftParallelEnv:  # fmt: skip
+    """Return one environment of a task as a PettingZoo parallel environment.
+
+    Args:
+        task: a configuration's name, the path of one, or a Config.
+        num_drones: N; None for the configured value, likewise the next.
+        seed: of the first reset.
+        render_mode: None or "rgb_array".
+        **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
+
+    Raises:
+        ConfigError: an unknown key, a wrong value or an impossible system.
+        ValueError: an unknown render mode.
+    """
+    return MultiliftParallelEnv(resolve_config(task, num_drones=num_drones, seed=seed, **overrides), render_mode)
+
+
+def register() -> None:
+    """Enter every task in PettingZoo's registry, `pettingzoo.make("parallel", "multilift_marl/hover-v0")`.
+
+    Does nothing where PettingZoo has no registry (before 1.27), and nothing the second time.
+    """
+    if not hasattr(pettingzoo, "parallel_registry"):
+        return
+    for task in list_tasks():
+        name = f"multilift_marl/{task}-v0"
+        if name not in pettingzoo.parallel_registry:
+            pettingzoo.register("parallel", name, f"{__name__}:parallel_env", kwargs={"task": task})

@@ -1,0 +1,156 @@
+"""Plots of episodes and of a training, as PNG files. No pyplot: nothing global, no window, safe in any thread."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from multilift_marl.evaluation.rollout import Trace
+from multilift_marl.sim.scene import DRONE_COLOURS
+
+# Told apart by the colour-blind too (Okabe & Ito, Color Universal Design, 2008).
+POLICY_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+TARGET_COLOUR, PAYLOAD_COLOUR = "#009E73", "#222222"
+_LINES = ("-", "--", ":", "-.")  # of drones beyond the number of colours
+_DPI = 160
+
+
+def plot_errors(path: str | Path, traces: Mapping[str, Trace]) -> None:
+    """Plot the payload's distance from its target [m], logarithmic, and its attitude error [deg] over time [s].
+
+    Args:
+        path: of the PNG; its folder is made.
+        traces: {name of the policy: its trace}, a colour each.
+    """
+    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
+    position, attitude = figure.subplots(2, 1, sharex=True)
+    for (name, trace), colour in zip(traces.items(), cycle(POLICY_COLOURS), strict=False):
+        position.semilogy(trace.time, trace.distance, color=colour, label=name)
+        attitude.plot(trace.time, trace.angle, color=colour)
+    _label(position, None, "position error [m]")
+    _label(attitude, "time [s]", "attitude error [deg]")
+    attitude.set_ylim(bottom=0)
+    _legend(figure, position)
+    _save(figure, path)
+
+
+def plot_tensions(path: str | Path, trace: Trace, title: str = "") -> None:
+    """Plot the tension of each cable [N] over time [s], in the colours that the drones have in videos."""
+    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for n in range(trace.tension.shape[1]):
+        axes.plot(trace.time, trace.tension[:, n], **_drone_style(n), label=f"cable {n}")
+    _label(axes, "time [s]", "cable tension [N]", title)
+    axes.set_ylim(bottom=0)
+    _legend(figure, axes)
+    _save(figure, path)
+
+
+def plot_paths(path: str | Path, trace: Trace, title: str = "") -> None:
+    """Plot the paths of payload and drones [m] from above (x-y) and from the side (x-z), to one scale.
+
+    The team is drawn where the episode ends; its cables are lines to the payload's centre.
+    """
+    figure = Figure(figsize=(8.4, 4.4), layout="constrained")
+    for axes, up, name in zip(figure.subplots(1, 2), (1, 2), "yz", strict=True):
+        payload, target = trace.payload_position[:, [0, up]].T, trace.target_position[:, [0, up]].T
+        for n in range(trace.drone_position.shape[1]):
+            drone, style = trace.drone_position[:, n, [0, up]].T, _drone_style(n)
+            axes.plot(*drone, **style, linewidth=1.0, alpha=0.8)
+            axes.plot(*np.stack([payload[:, -1], drone[:, -1]], axis=1), color="0.45", linewidth=0.8, zorder=1)
+            axes.plot(*drone[:, -1], "o", color=style["color"], markersize=6, label=f"drone {n}")
+        if np.ptp(target, axis=1).max() > 0:
+            axes.plot(*target, color=TARGET_COLOUR, linestyle="--", linewidth=1.2, label="target's path")
+        axes.plot(*payload, color=PAYLOAD_COLOUR, linewidth=1.6, label="payload")
+        axes.plot(*payload[:, -1], "s", color=PAYLOAD_COLOUR, markersize=6)
+        axes.plot(*payload[:, 0], "o", color=PAYLOAD_COLOUR, markerfacecolor="white", markersize=7, label="start")
+        axes.plot(*target[:, -1], "*", color=TARGET_COLOUR, markerfacecolor="none", markersize=17, label="target")
+        _label(axes, "x [m]", f"{name} [m]", {1: "from above", 2: "from the side"}[up])
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.1)
+    figure.suptitle(title, fontsize=11)
+    _legend(figure, axes)
+    _save(figure, path)
+
+
+def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Plot success rate [%], payload error [cm] and return over the environment steps of a training.
+
+    Args:
+        path: of the PNG; its folder is made.
+        rows: lines of metrics.csv, numbers or their text; an empty or missing value is left out. Thin lines are
+            episodes flown with exploration, dots the evaluations of the deterministic policy.
+    """
+    rows = list(rows)
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    success, error, total = figure.subplots(3, 1, sharex=True)
+    panels = (
+        (success, "success", "eval/success_rate", 100, "success [%]"),
+        (error, None, "eval/payload_position_error_m", 100, "position error [cm]"),
+        (total, "return", "eval/return", 1, "return"),
+    )
+    for axes, explored, evaluated, factor, label in panels:
+        if explored is not None:
+            frames, values = _column(rows, explored)
+            axes.plot(frames, factor * values, color=POLICY_COLOURS[0], linewidth=0.9, alpha=0.6, label="exploring")
+        frames, values = _column(rows, evaluated)
+        axes.plot(frames, factor * values, "o-", color=POLICY_COLOURS[1], markersize=4, label="evaluation")
+        _label(axes, None, label)
+    success.set_ylim(-3, 103)
+    if len(_column(rows, "eval/payload_position_error_m")[0]):
+        error.set_yscale("log")
+        error.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        error.yaxis.set_major_formatter("{x:g}")
+        error.yaxis.set_minor_formatter(NullFormatter())
+    total.set_xlabel("environment steps")
+    total.xaxis.set_major_formatter(EngFormatter(sep=""))
+    _legend(figure, success)
+    _save(figure, path)
+
+
+def _drone_style(n: int) -> dict[str, Any]:
+    """Return the colour that drone n has in the scene, and a line of its own where colours repeat."""
+    return {
+        "color": DRONE_COLOURS[n % len(DRONE_COLOURS)][:3],
+        "linestyle": _LINES[n // len(DRONE_COLOURS) % len(_LINES)],
+    }
+
+
+def _column(rows: list[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return frames and values of the rows that hold a value of `name`."""
+    pairs = [(float(row["frames"]), float(row[name])) for row in rows if row.get(name) not in (None, "")]
+    frames, values = np.array(pairs).reshape(-1, 2).T
+    return frames, values
+
+
+def _label(axes: Axes, x: str | None, y: str, title: str = "") -> None:
+    axes.set_ylabel(y)
+    if x is not None:
+        axes.set_xlabel(x)
+    axes.set_title(title, fontsize=11)
+    axes.grid(True, color="0.9", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(x=0.02)
+    if axes.get_yscale() == "linear":
+        axes.yaxis.set_major_locator(MaxNLocator(6))
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """Put the legend of `axes` below all panels, at most seven entries a line."""
+    handles, labels = axes.get_legend_handles_labels()
+    if labels:
+        columns = -(-len(labels) // -(-len(labels) // 7))
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=_DPI, format="png")
