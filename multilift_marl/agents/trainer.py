@@ -33,7 +33,7 @@ class Trainer:
     """
 
     def __init__(self, config: Config, folder: Path, checkpoint: dict[str, Any] | None = None):
-        torch.set_num_threads(1)  # small networks: threads cost more than they give
+        torch.set_num_threads(1)
         torch.manual_seed(config.seed)
         self.config, self.folder = config, folder
         self.env = MultiliftEnv(config)
@@ -97,7 +97,9 @@ class Trainer:
             group["lr"] = rate
         batch = next(self._batches)
         sampling = time.perf_counter() - start
+        torch.set_num_threads(self.config.train.threads)  # pays in the update's large batches only
         values = update(self.learner, batch)
+        torch.set_num_threads(1)
         learning = values.pop("learning_seconds")
         values |= self._episodes(batch)
         self.iteration += 1

@@ -134,7 +134,7 @@ class TrainConfig(Section):
     residual: Literal["formation", "formation_integral"] = Field(
         "formation", description="script that an untrained policy flies and the learned one corrects"
     )
-    frames: Int = Field(6_000_000, ge=1, description="environment steps in all")
+    frames: Int = Field(5_000_000, ge=1, description="environment steps in all")
     horizon: Int = Field(32, ge=1, description="steps of each environment between updates")
     epochs: Int = Field(4, ge=1, description="passes over each batch")
     minibatches: Int = Field(8, ge=1, description="minibatches of each pass")
@@ -149,6 +149,7 @@ class TrainConfig(Section):
     target_kl: Float = Field(0.03, gt=0, description="[-] approximate KL that ends an update early")
     hidden: tuple[Int, ...] = Field((128, 128), description="[-] widths of the hidden layers")
     initial_std: Float = Field(0.3, gt=0, description="[-] of the action distribution at the start")
+    threads: Int = Field(2, ge=1, description="threads of the update; weights are bit-equal for the same number")
     checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
 
 
