@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from conftest import bold_actions, make, mask, same
@@ -287,6 +292,12 @@ def test_wrong_mask_is_refused(task, wrong):
 def test_negative_seed_is_refused(task):
     with pytest.raises(ValueError, match="seed must not be negative, but is -1"):
         make(task).reset(seed=-1)
+
+
+@pytest.mark.parametrize("seed", [1.5, "3", 2**70])
+def test_seed_that_is_no_whole_number_of_64_bits_is_refused(task, seed):
+    with pytest.raises(ValueError, match="seed must"):
+        make(task, num_envs=1).reset(seed=seed)
 
 
 def test_unknown_reset_option_is_refused(task):
@@ -597,16 +608,43 @@ def test_hover_pays_half_at_the_margin_and_a_tenth_at_three_margins(distance, sh
     assert hover_terms(move)["position"] == pytest.approx(share * hover_terms(lambda state: None)["position"])
 
 
+def test_hover_charges_the_mean_squared_change_of_action():
+    vec = make("hover")
+    vec.reset(seed=0)
+    last = zeros(vec)
+    for step in range(5):
+        action = np.random.default_rng(step).uniform(-1, 1, last.shape)
+        *_, info = vec.step(action)
+        expected = -0.05 * ((action - last) ** 2).mean(axis=(1, 2))
+        np.testing.assert_allclose(info["reward_terms"]["action_rate"], expected, rtol=1e-9)
+        last = action
+
+
 def test_hover_succeeds_within_5_cm_and_5_degrees_throughout_the_last_2_s():
     vec = make("hover", num_envs=48, **{"randomization.payload_force": 0.5})
     vec.reset(seed=0)
     good = []
-    for _ in range(vec.max_steps):
+    for step in range(vec.max_steps):
         *_, info = vec.step(zeros(vec))
+        assert step + 1 == vec.max_steps or not info["success"].any()
         good.append((vec.task.errors.distance <= 0.05) & (vec.task.errors.angle <= np.radians(5)))
     expected = np.all(good[-100:], axis=0)
     assert 0 < expected.sum() < 48
     assert same(info["success"], expected)
+
+
+def test_hover_remembers_how_long_it_has_been_good_when_saved_and_not_when_reset():
+    calm = {"randomization.payload_force": 0, "randomization.payload_mass": 0, "task_options.start_radius": 0.05}
+    first, second = (make("hover", **calm) for _ in range(2))
+    first.reset(seed=0)
+    for _ in range(first.max_steps - 20):
+        first.step(zeros(first))
+    second.load_state_dict(first.state_dict())
+    for _ in range(20):
+        expected, told = (vec.step(zeros(vec))[-1]["success"] for vec in (first, second))
+    assert expected.all() and told.all()
+    second.reset()
+    assert (second.task.good_time == 0).all()
 
 
 def test_error_integrals_are_sums_over_time_within_their_limit():
@@ -703,3 +741,29 @@ def test_the_integral_formation_succeeds_with_any_payload(num_drones, overrides)
     _, success, failure = fly_once(vec, make_scripted("formation_integral", vec).act)
     assert not failure.any()
     assert success.mean() >= 0.9
+
+
+# Compiled kernels
+
+HOVER = """
+from multilift_marl.config.system import GRAVITY
+from multilift_marl.sim.dynamics import hover_drone
+from multilift_marl.sim.state import SystemState
+state = SystemState.zeros(1, 1)
+hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, 1.0, 1.0)
+print((state.rotor_speed**2).sum() / GRAVITY)
+"""
+
+
+def test_no_compiled_kernel_outlives_a_constant_it_was_compiled_with(tmp_path):
+    package = tmp_path / "multilift_marl"
+    shutil.copytree(Path(ml.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+
+    def weights_lifted() -> float:
+        told = subprocess.run([sys.executable, "-c", HOVER], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return float(told.stdout)
+
+    assert weights_lifted() == pytest.approx(1)
+    constants = package / "config" / "system.py"
+    constants.write_text(constants.read_text(encoding="utf-8").replace("GRAVITY = 9.81", "GRAVITY = 3.71"))
+    assert weights_lifted() == pytest.approx(1)

@@ -440,6 +440,16 @@ def test_a_masked_reset_is_a_fresh_start():
     assert same(rows(fly(world, seed=1), [1, 3]), rows(fly(fresh, seed=1), [1, 3]))
 
 
+def test_a_reset_restores_the_nominal_plant():
+    world = World(make_system(2, **{"wind.velocity": [1, 0, 0]}), 3, 1)
+    disturb(world)
+    world.plant.wind[:] = [0, 5, 0]
+    world.reset(mask(3, 2))
+    assert world.plant.payload_mass[2] == world.system.payload_mass != world.plant.payload_mass[1]
+    assert world.plant.payload_force[:, 0].tolist() == pytest.approx([0, 0.3, 0])
+    assert world.plant.wind.tolist() == [[0, 5, 0], [0, 5, 0], [1, 0, 0]]
+
+
 @pytest.mark.parametrize("threads", [(1, 1), (1, 2), (2, 1)], ids=str)
 def test_a_saved_world_continues_bit_for_bit(threads):
     system = make_system(4)
@@ -478,6 +488,13 @@ def test_thrust_that_is_not_finite_is_refused(wrong):
 def test_thrust_of_wrong_shape_is_refused(shape):
     with pytest.raises(ValueError, match=r"thrust has shape .*, expected \(3, 2, 4\)"):
         World(make_system(2), 3, 1).step(np.ones(shape))
+
+
+@pytest.mark.parametrize("mass", [0.0, -1.0, np.nan, np.inf])
+def test_impossible_payload_mass_is_refused(mass):
+    world = World(make_system(2), 2, 1)
+    with pytest.raises(ValueError, match="mass"):
+        world.set_payload_mass(mask(2, 1), np.array([1.0, mass]))
 
 
 @pytest.mark.parametrize("force", [1e5, 1e30, np.nan])

@@ -97,7 +97,7 @@ class Trainer:
             group["lr"] = rate
         batch = next(self._batches)
         sampling = time.perf_counter() - start
-        torch.set_num_threads(self.config.train.threads)  # pays in the update's large batches only
+        torch.set_num_threads(self.config.train.threads)
         values = update(self.learner, batch)
         torch.set_num_threads(1)
         learning = values.pop("learning_seconds")

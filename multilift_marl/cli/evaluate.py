@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -107,38 +108,39 @@ def _draw(config: Config, makers: dict[str, Any], own: dict[str, Any], out: Path
     from multilift_marl.agents.logging import read_metrics
     from multilift_marl.evaluation import plots
 
-    frames, on_step, renderer = [], None, None
-    if own["video"]:
-        from multilift_marl import rendering
-
-        try:
-
-            def on_step(vec: Any) -> None:
-                nonlocal renderer
-                renderer = renderer or rendering.Renderer(vec)
-                if vec.steps[0] % 2 == 0:
-                    frames.append(renderer.frame())
-
-            trace = trace_episode(config, makers["policy"], 0, own["seed"], on_step)
-            rendering.write_video(out / "episode_0.mp4", frames, config.env.policy_hz / 2)
-            print(f"wrote {out / 'episode_0.mp4'}")
-        except RenderingError as error:
-            print(f"no video: {error}", file=sys.stderr)
-            trace = trace_episode(config, makers["policy"], 0, own["seed"])
-        finally:
-            if renderer is not None:
-                renderer.close()
-    else:
-        trace = trace_episode(config, makers["policy"], 0, own["seed"])
-    traces = {"policy": trace}
+    traces = {"policy": trace_episode(config, makers["policy"], 0, own["seed"])}
     if own["baseline"] != "none":
         traces[own["baseline"]] = trace_episode(config, makers[own["baseline"]], 0, own["seed"])
     plots.plot_errors(out / "errors.png", traces)
-    plots.plot_tensions(out / "tensions.png", trace, "policy, episode 0")
-    plots.plot_paths(out / "paths.png", trace, "policy, episode 0")
+    plots.plot_tensions(out / "tensions.png", traces["policy"], "policy, episode 0")
+    plots.plot_paths(out / "paths.png", traces["policy"], "policy, episode 0")
     if rows := read_metrics(folder):
         plots.plot_training(out / "training.png", rows)
     print(f"wrote plots in {out}")
+    if own["video"]:
+        try:
+            _film(config, makers["policy"], own["seed"], out / "episode_0.mp4")
+        except RenderingError as error:
+            print(f"no video: {error}", file=sys.stderr)
+
+
+def _film(config: Config, maker: Any, seed: int, path: Path) -> None:
+    """Film the first episode, every other policy step."""
+    from multilift_marl import rendering
+
+    tools: list[Any] = []  # made with the first frame, so that no empty file is left where there is no OpenGL
+    with ExitStack() as stack:
+
+        def shoot(vec: Any) -> None:
+            if not tools:
+                tools.append(stack.enter_context(rendering.Renderer(vec)))
+                tools.append(stack.enter_context(rendering.VideoWriter(path, config.env.policy_hz / 2)))
+            renderer, video = tools
+            if vec.steps[0] % 2 == 0:
+                video.append(renderer.frame())
+
+        trace_episode(config, maker, 0, seed, shoot)
+    print(f"wrote {path}")
 
 
 if __name__ == "__main__":
