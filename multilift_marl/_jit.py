@@ -15,6 +15,9 @@ kernel = njit(cache=True, nogil=True, error_model="numpy")
 many environments are computed together."""
 
 
+_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering.py", "__init__.py")
+
+
 def bind(function: Any, *arguments: Any) -> Callable[[], None]:
     """Return a call of a kernel with these very arguments, compiled now, without looking up their types at each call.
 
@@ -27,16 +30,15 @@ def bind(function: Any, *arguments: Any) -> Callable[[], None]:
 
 
 def _drop_stale_kernels() -> None:
-    """Delete compiled kernels when a source that has kernels has changed.
+    """Delete compiled kernels when any source that they may depend on has changed.
 
-    Numba looks only at the file of the kernel itself, not at the files of the functions that it calls.
+    Numba looks only at the file of the kernel itself, not at those of the functions and constants that it uses.
     """
     package = Path(__file__).parent
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
-        text = source.read_bytes()
-        if b"kernel" in text:
-            digest.update(text)
+        if source.relative_to(package).parts[0] not in _WITHOUT_KERNELS:
+            digest.update(source.read_bytes())
     stamp = package / "__pycache__" / "kernels.sha256"
     try:
         if stamp.is_file() and stamp.read_text() == digest.hexdigest():

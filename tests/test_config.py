@@ -212,7 +212,7 @@ def test_unknown_reward_term_names_the_nearest():
 
 def test_unknown_task_option_names_the_nearest():
     message = refuse_task(task_options__target_xx=1.0)
-    assert re.match(r"unknown key 'task_options\.target_xx' of task hover; did you mean 'target_xy'\?", message)
+    assert re.match(r"unknown key 'task_options\.target_xx'; did you mean 'target_xy'\?", message)
 
 
 def test_a_key_below_a_value_is_refused():

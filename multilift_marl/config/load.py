@@ -1,4 +1,4 @@
-"""Configurations from names, files and overrides; their errors in one sentence; their explanation for --help."""
+"""Configurations from names, files and overrides, and their explanation for --help."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
 
 from multilift_marl.config.schema import Config, Section
+from multilift_marl.config.validate import validate
 from multilift_marl.errors import ConfigError, nearest
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -42,18 +42,18 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
 
 def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, where: str = "") -> Config:
     """Return the validated configuration of nested `values` with dotted `overrides` applied."""
-    merged = _copy(values)
+    merged = _merge({}, values)
     for dotted, value in (overrides or {}).items():
-        node, *parents = merged, *dotted.split(".")[:-1]
-        for part in parents:
-            node = node.setdefault(part, {})
-            if not isinstance(node, dict):
+        *sections, key = dotted.split(".")
+        change, node = {key: value}, merged
+        for part in sections:
+            node = node.get(part, {})
+            if not isinstance(node, Mapping):
                 raise ConfigError(f"{dotted}: '{part}' is a value, not a section")
-        node[dotted.split(".")[-1]] = value
-    try:
-        return Config.model_validate(merged)
-    except ValidationError as error:
-        raise ConfigError(_sentence(error.errors()[0], where)) from None
+        for part in reversed(sections):
+            change = {part: change}
+        merged = _merge(merged, change)
+    return validate(Config, merged, where=where)
 
 
 def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:
@@ -115,39 +115,12 @@ def _read(name: str | Path) -> dict[str, Any]:
     return values
 
 
-def _copy(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: _copy(value) if isinstance(value, Mapping) else value for key, value in values.items()}
-
-
-def _sentence(error: Mapping[str, Any], where: str) -> str:
-    """Return one sentence for pydantic's first complaint."""
-    path = [
-        part
-        for part in error["loc"]
-        if isinstance(part, str) and not part.startswith(("function-", "tuple[", "constrained"))
-    ]
-    section: type[Section] = Config
-    for part in path[:-1]:
-        annotation = section.model_fields[part].annotation if part in section.model_fields else None
-        if isinstance(annotation, type) and issubclass(annotation, Section):
-            section = annotation
-    path = _known_prefix(path)
-    key = ".".join(path)
-    source = f" (in {where})" if where.endswith((".yaml", ".yml")) else ""
-    if error["type"] == "extra_forbidden":
-        return f"unknown key '{key}'{source}{nearest(path[-1], section.model_fields)}"
-    message = error["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    message = message.replace("should", "must").replace("Input must", "must")
-    return f"{key}{source} {message}, but is {error['input']!r}"
-
-
-def _known_prefix(path: list[str]) -> list[str]:
-    """Drop what pydantic appends to the name of a key to tell the members of a union apart."""
-    section, kept = Config, []
-    for part in path:
-        kept.append(part)
-        annotation = section.model_fields[part].annotation if part in section.model_fields else None
-        if not (isinstance(annotation, type) and issubclass(annotation, Section)):
-            break
-        section = annotation
-    return kept
+def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with `changes`, section by section."""
+    merged = dict(base)
+    for key, value in changes.items():
+        known = merged.get(key)
+        merged[key] = (
+            _merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
+        )
+    return merged

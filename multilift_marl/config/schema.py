@@ -147,7 +147,7 @@ class TrainConfig(Section):
     value_weight: Float = Field(1.0, ge=0, description="[-] weight of the critic's loss")
     max_grad_norm: Float = Field(1.0, gt=0, description="[-] gradient clipping")
     target_kl: Float = Field(0.03, gt=0, description="[-] approximate KL that ends an update early")
-    hidden: tuple[Int, ...] = Field((128, 128), description="[-] widths of the hidden layers")
+    hidden: tuple[Annotated[Int, Field(ge=1)], ...] = Field((128, 128), description="[-] widths of the hidden layers")
     initial_std: Float = Field(0.3, gt=0, description="[-] of the action distribution at the start")
     threads: Int = Field(1, ge=1, description="threads of the update; weights are bit-equal for the same number")
     checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
@@ -164,7 +164,7 @@ class Config(Section):
     """The whole configuration."""
 
     task: str = Field("hover", description="name of the task")
-    seed: Int = Field(0, ge=0, description="seed of everything random")
+    seed: Int = Field(0, ge=0, lt=2**63, description="seed of everything random")
     env: EnvConfig = EnvConfig()
     sim: SimConfig = SimConfig()
     vehicle: VehicleConfig = VehicleConfig()

@@ -42,6 +42,8 @@ class MultiliftVec:
     """
 
     def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
+        if first_env < 0:
+            raise ConfigError(f"first_env must not be negative, but is {first_env}")
         task = find_task(config.task)
         self.config, self.purpose, self.first_env = config, purpose, first_env
         system, settings = config.system, config.control
@@ -91,8 +93,8 @@ class MultiliftVec:
             raise ValueError(f"unknown reset option '{next(iter(options))}'; this task has none")
         mask = np.ones(self.num_envs, bool) if mask is None else self._checked_mask(mask)
         if seed is not None:
-            if seed < 0:
-                raise ValueError(f"seed must not be negative, but is {seed}")
+            if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or not 0 <= seed < 2**63:
+                raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, but is {seed!r}")
             self.seeds[mask], self.episodes[mask] = seed, -1
         self.episodes[mask] += 1
         drawn = np.flatnonzero(mask).tolist()

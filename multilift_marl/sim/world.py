@@ -54,6 +54,8 @@ class World:
     """
 
     def __init__(self, system: System, num_envs: int, num_threads: int = 0):
+        if num_envs < 1 or num_threads < 0:
+            raise ValueError(f"num_envs={num_envs} must be at least 1 and num_threads={num_threads} at least 0")
         _quiet_mujoco()
         self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
         self.model, self.layout = build_model(system)
@@ -139,7 +141,12 @@ class World:
         """Give the payload of the environments in `mask` (E,) a true `mass` (E,) [kg]; inertia scales with it.
 
         The constants that MuJoCo derives from masses follow, and so do the cables' constraint parameters.
+
+        Raises:
+            ValueError: a mass that is not positive and finite.
         """
+        if not (np.isfinite(mass[mask]) & (mass[mask] > 0)).all():
+            raise ValueError(f"payload masses must be positive and finite, but are {mass[mask]} kg")
         changed = mask & (mass != self.plant.payload_mass)
         if not changed.any():
             return

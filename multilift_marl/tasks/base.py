@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from pydantic import ValidationError
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Section
+from multilift_marl.config.validate import validate
 from multilift_marl.control.formation import Goal, Reference, Rig
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.world import World
@@ -54,7 +54,7 @@ class Task:
     def __init__(self, config: Config, world: World, reference: Reference):
         e, n, system = world.num_envs, world.num_drones, world.system
         self.world, self.reference = world, reference
-        self.options = self._options(config.task_options)
+        self.options = validate(self.Options, config.task_options, "task_options")
         self.weights = self._weights(config.reward)
         self.dt = 1.0 / config.env.policy_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
@@ -128,17 +128,6 @@ class Task:
         for key, array in saved.items():
             owner, _, name = key.rpartition(".")
             getattr(getattr(self, owner) if owner else self, name)[:] = array
-
-    def _options(self, values: dict[str, Any]) -> Section:
-        try:
-            return self.Options.model_validate(values)
-        except ValidationError as error:
-            first = error.errors()[0]
-            key = str(first["loc"][0])
-            if first["type"] == "extra_forbidden":
-                hint = nearest(key, self.Options.model_fields)
-                raise ConfigError(f"unknown key 'task_options.{key}' of task {self.name}{hint}") from None
-            raise ConfigError(f"task_options.{key}: {first['msg']}, but is {first['input']!r}") from None
 
     def _weights(self, values: dict[str, float]) -> np.ndarray:
         for term in values:

@@ -1,0 +1,65 @@
+"""Pydantic's validation with its complaints put into one sentence: the key, what it must be, what it is."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from multilift_marl.config.schema import Section
+from multilift_marl.errors import ConfigError, nearest
+
+S = TypeVar("S", bound=Section)
+
+
+def validate(model: type[S], values: Mapping[str, Any], prefix: str = "", where: str = "") -> S:
+    """Return `values` as a `model`.
+
+    Args:
+        model: the section's type.
+        values: its values, nested.
+        prefix: name of the section, for messages.
+        where: the file that the values come from, for messages.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type or a value out of range.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(_sentence(error.errors(), model, prefix, where)) from None
+
+
+def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) -> str:
+    """Return one sentence for the first key that pydantic complains about."""
+    section, path = _find_key(errors[0]["loc"], model)
+    about = [error for error in errors if _find_key(error["loc"], model)[1] == path]
+    error = max(about, key=lambda error: len(error["loc"]))  # the deepest: an element rather than its list
+    key = ".".join(([prefix] if prefix else []) + path)
+    source = f" (in {where})" if where.endswith((".yaml", ".yml")) else ""
+    kind, value = error["type"], error["input"]
+    if kind == "extra_forbidden":
+        return f"unknown key '{key}'{source}{nearest(path[-1], section.model_fields)}"
+    if kind in ("missing", "too_long"):
+        count = error["ctx"]["max_length"] if kind == "too_long" else 1 + max(e["loc"][-1] for e in about)
+        return f"{key}{source} must be a list of {count} numbers, but is {value!r}"
+    if kind in ("model_type", "dict_type", "model_attributes_type"):
+        return f"{key}{source} must be a section with keys of its own, but is {value!r}"
+    message = error["msg"].removeprefix("Value error, ").replace("Input should", "must").replace("should", "must")
+    return f"{key}{source} {message}, but is {value!r}"
+
+
+def _find_key(location: tuple[Any, ...], model: type[Section]) -> tuple[type[Section], list[str]]:
+    """Return the section and the path of the key in pydantic's location, which goes on into unions and lists."""
+    section, path = model, []
+    for part in map(str, location):
+        path.append(part)
+        annotation = section.model_fields[part].annotation if part in section.model_fields else None
+        if typing.get_origin(annotation) is dict and len(location) > len(path):
+            return section, [*path, str(location[len(path)])]
+        if not (isinstance(annotation, type) and issubclass(annotation, Section)):
+            break
+        section = annotation
+    return section, path
