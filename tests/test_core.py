@@ -290,7 +290,7 @@ def test_wrong_mask_is_refused(task, wrong):
 
 
 def test_negative_seed_is_refused(task):
-    with pytest.raises(ValueError, match="seed must be a whole number from 0 .* but is -1"):
+    with pytest.raises(ValueError, match=r"seed must be a whole number from 0 .* but is -1"):
         make(task).reset(seed=-1)
 
 
