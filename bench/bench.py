@@ -33,7 +33,7 @@ def bare(vec: MultiliftVec, threads: int) -> Runner:
     for _ in range(5):
         vec.step(np.zeros((vec.num_envs, vec.num_drones, vec.action_size), np.float32))
     start = np.concatenate([shard.batch.state for shard in vec.world.shards])
-    interval, ticks = vec.world.system.control_interval, vec._ticks
+    interval, ticks = vec.world.system.control_interval, vec.control_ticks
     batch.bind("sensordata")
 
     def run() -> int:

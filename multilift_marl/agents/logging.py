@@ -19,16 +19,16 @@ class RunLog:
 
     Args:
         folder: the run's folder.
-        iteration: rows after this iteration, left by a run that was stopped, are dropped.
+        iteration, frames: where the run goes on; what a stopped run has logged after that is dropped.
     """
 
-    def __init__(self, folder: Path, iteration: int = 0):
+    def __init__(self, folder: Path, iteration: int = 0, frames: int = 0):
         self._path = folder / "metrics.csv"
         self._rows = [row for row in read_metrics(folder) if int(row["iteration"]) <= iteration]
         self._columns = list(self._rows[0]) if self._rows else []
         if self._rows:
             self._rewrite()
-        self._writer = SummaryWriter(str(folder), purge_step=iteration + 1 if iteration else None)
+        self._writer = SummaryWriter(str(folder), purge_step=frames + 1 if iteration else None)
 
     def write(self, row: dict[str, float], values: dict[str, float]) -> None:
         """Write one iteration: `row` holds iteration and frames, `values` the numbers; TensorBoard's step is frames."""

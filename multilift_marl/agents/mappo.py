@@ -89,10 +89,10 @@ def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
     data["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
 
     # 2. Some epochs of minibatches, fewer if the policy moves too far.
-    size, diagnostics, stop = data.shape[0] // config.minibatches, [], False
+    diagnostics, stop = [], False
     for _ in range(config.epochs):
         order = torch.randperm(data.shape[0])
-        for chunk in order.split(size):
+        for chunk in order.chunk(config.minibatches):
             losses = learner.loss(data[chunk])
             total = losses["loss_objective"] + losses["loss_critic"]
             if config.entropy > 0:

@@ -19,8 +19,11 @@ from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import TRAINING_EVALUATION
 from multilift_marl.envs.torchrl_env import MultiliftEnv
+from multilift_marl.errors import CheckpointError, ConfigError
 from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
+
+_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best")
 
 
 class Trainer:
@@ -39,6 +42,11 @@ class Trainer:
         self.env = MultiliftEnv(config)
         self.learner = make_learner(config.train, self.env)
         self.frames_per_batch = config.env.num_envs * config.train.horizon
+        if config.train.minibatches > self.frames_per_batch:
+            raise ConfigError(
+                f"train.minibatches={config.train.minibatches} exceeds the {self.frames_per_batch} steps of a batch; "
+                "lower it or raise train.horizon or env.num_envs"
+            )
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
         self.best = (-1.0, -float("inf"))  # success, negative error
@@ -59,7 +67,7 @@ class Trainer:
             self.env.vec.stagger()
         else:
             torch.set_rng_state(checkpoint["rng"])
-        self.log = RunLog(folder, self.iteration)
+        self.log = RunLog(folder, self.iteration, self.frames)
 
     def run(self) -> bool:
         """Train to the end; return False if the user stopped it. Ctrl-C saves and stops, a second one stops at once."""
@@ -69,6 +77,7 @@ class Trainer:
         shown: dict[str, str] = {}
         try:
             while self.iteration < self.iterations and not self._stop:
+                start = time.perf_counter()
                 values = self.step()
                 if "return" in values:
                     shown["return"] = f"{values['return']:.0f}"
@@ -78,6 +87,7 @@ class Trainer:
                     shown["success"] = f"{values['eval/success_rate']:.0%}"
                     shown["error"] = f"{100 * values['eval/payload_position_error_m']:.1f} cm"
                 self.log.write({"iteration": self.iteration, "frames": self.frames}, values)
+                self.seconds += time.perf_counter() - start
                 if self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
                     self.save("last")
                 bar.set_postfix(shown)
@@ -103,7 +113,6 @@ class Trainer:
         learning = values.pop("learning_seconds")
         values |= self._episodes(batch)
         self.iteration += 1
-        self.seconds += time.perf_counter() - start
         return values | {
             "learning_rate": rate,
             "fps": self.frames_per_batch / (sampling + learning),
@@ -162,6 +171,17 @@ class Trainer:
         }
 
     def _restore(self, content: dict[str, Any]) -> None:
+        if missing := [key for key in _NEEDED if key not in content]:
+            raise CheckpointError(f"the checkpoint cannot be resumed, '{missing[0]}' is missing; give a training run's")
+        try:
+            self._load(content)
+        except (RuntimeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise CheckpointError(
+                f"the checkpoint does not fit this version or system ({reason}); train anew"
+            ) from error
+
+    def _load(self, content: dict[str, Any]) -> None:
         self.learner.loss.load_state_dict(content["loss"])
         self.learner.optimizer.load_state_dict(content["optimizer"])
         self.env.set_state(content["env"])
@@ -217,4 +237,6 @@ def resume_run(folder: Path, overrides: dict[str, Any]) -> Trainer:
     """
     content = load_checkpoint(folder / "checkpoints" / "last.pt")
     config = build_config(content["config"], overrides)
-    return Trainer(config, folder, content)
+    trainer = Trainer(config, folder, content)
+    (folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
+    return trainer

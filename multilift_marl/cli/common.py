@@ -8,6 +8,7 @@ from typing import Any
 
 from multilift_marl.config.load import explain, parse_overrides
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError
+from multilift_marl.tasks import TASKS
 
 
 def run_command(main: Callable[[dict[str, Any]], int], usage: str, arguments: Sequence[str] | None) -> int:
@@ -15,6 +16,9 @@ def run_command(main: Callable[[dict[str, Any]], int], usage: str, arguments: Se
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if any(argument in ("-h", "--help") for argument in arguments):
         print(f"{usage}\n\nConfiguration keys (default, meaning; - stands for none):\n{explain()}")
+        for name, task in TASKS.items():
+            print(f"\nTask {name}:\n{explain(task.Options, 'task_options.')}")
+            print("\n".join(f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in task.REWARD.items()))
         return 0
     try:
         return main(parse_overrides(arguments))

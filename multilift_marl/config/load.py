@@ -75,9 +75,9 @@ def dump_config(config: Config) -> str:
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
-def explain() -> str:
-    """Return every key with its default and meaning, for --help."""
-    return "\n".join(f"  {key:<32} {_plain(default):<14} {text}" for key, default, text in _leaves(Config, ""))
+def explain(section: type[Section] = Config, prefix: str = "") -> str:
+    """Return every key of a section with its default and meaning, for --help."""
+    return "\n".join(f"  {key:<32} {_plain(default):<14} {text}" for key, default, text in _leaves(section, prefix))
 
 
 def _plain(value: Any) -> str:

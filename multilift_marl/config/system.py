@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 GRAVITY = 9.81  # [m/s²]
 MIN_THRUST_TO_WEIGHT = 1.18
 MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the vehicle's span
+MAX_ANCHOR_DISTANCE = 0.1  # [m] of an anchor from the payload's surface
 REST_SEPARATION = 0.6  # [m] between falcons at rest, by which the standard rig is sized
 _FALCON_SPAN = PRESETS["falcon"].span
 
@@ -119,7 +120,7 @@ def resolve_system(config: Config) -> System:
             1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"
         ),
     )
-    _check_possible(system, length)
+    _check_possible(system, heaviest=1 + config.randomization.payload_mass)
     return system
 
 
@@ -136,13 +137,11 @@ def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.n
     payload = config.payload
     reach = length.min() * np.sin(np.deg2rad(config.cable.angle))
     ring = max(0.27 * scale, REST_SEPARATION * scale / (2 * np.sin(np.pi / n)) - reach) if n > 1 else 0.0
-    if payload.size is not None:
-        size = np.asarray(payload.size, float)
-    elif n == 4:
-        size = np.array([0.55, 0.45, 0.15]) * scale
-    else:
-        edge = 2 * max(ring, 0.15 * scale)
-        size = np.array([edge, edge, 0.15 * scale])
+    edge = 2 * max(ring, 0.15 * scale)
+    standard = np.array([0.55, 0.45, 0.15]) * scale if n == 4 else np.array([edge, edge, 0.15 * scale])
+    size = standard if payload.size is None else np.asarray(payload.size, float)
+    inset = 0.005 * scale  # the cables are tied to rings this far inside the rim and above the lid
+    lid, rim = size[2] / 2 + inset, size[:2] / 2 - inset
     if payload.anchors is not None:
         anchors = np.asarray(payload.anchors, float)
         if len(anchors) != n:
@@ -150,11 +149,15 @@ def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.n
     elif payload.shape == "point":
         anchors = np.zeros((n, 3))
     elif n == 4:
-        anchors = np.array([[0.27, 0.22, 0.08], [-0.27, 0.22, 0.08], [-0.27, -0.22, 0.08], [0.27, -0.22, 0.08]]) * scale
+        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+        anchors = np.concatenate([corners * rim, np.full((4, 1), lid)], axis=1)
     else:
-        azimuth = 2 * np.pi * np.arange(n) / n
-        anchors = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(n, 0.08 * scale)], axis=1)
+        azimuth, ring = 2 * np.pi * np.arange(n) / n, min(ring, size[:2].min() / 2)
+        anchors = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(n, lid)], axis=1)
     if payload.shape == "point":
+        for key in ("size", "inertia"):
+            if getattr(payload, key) is not None:
+                raise ConfigError(f"payload.{key} means nothing to a point; drop it or use payload.shape=box")
         size = np.full(3, 0.1 * scale)
         if np.any(anchors != 0):
             raise ConfigError(
@@ -212,22 +215,24 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
     return force
 
 
-def _check_possible(system: System, length: np.ndarray) -> None:
+def _check_possible(system: System, heaviest: float) -> None:
+    """Refuse what cannot fly, also with a payload `heaviest` times its nominal mass."""
     n, vehicle = system.num_drones, system.vehicle
     outside = np.linalg.norm(np.maximum(np.abs(system.anchors) - system.payload_size / 2, 0), axis=1)
-    if np.any(outside > length):
-        i = int(np.argmax(outside - length))
+    if np.any(outside > MAX_ANCHOR_DISTANCE):
+        i = int(np.argmax(outside))
         raise ConfigError(
             f"payload.anchors: anchor {i} is out of reach, {outside[i]:.2f} m outside the payload; move it onto the "
             "payload"
         )
     thrust = 4 * vehicle.rotor_thrust_max
-    if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
+    weight = system.weight + (heaviest - 1) * system.payload_mass * GRAVITY
+    if n * thrust < MIN_THRUST_TO_WEIGHT * weight:
         raise ConfigError(
             f"{n} × {vehicle.name} lift {n * thrust:.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of payload "
-            f"and drones, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
+            f"and drones, {weight:.1f} N at the heaviest; lower payload.mass ({system.payload_mass:g} kg) or add drones"
         )
-    hover = np.linalg.norm(system.formation_force + [0, 0, vehicle.mass * GRAVITY], axis=1)
+    hover = np.linalg.norm(heaviest * system.formation_force + [0, 0, vehicle.mass * GRAVITY], axis=1)
     if np.any(hover > thrust / 1.05):
         i = int(hover.argmax())
         raise ConfigError(

@@ -19,7 +19,7 @@ def allocation_matrix(vehicle: Vehicle) -> np.ndarray:
 
 @kernel
 def allocate(thrust, torque, inverse, low, high):
-    """Return the four rotor thrusts [N] that come nearest to a thrust and a torque.
+    """Return the four rotor thrusts [N] for a thrust and a torque.
 
     Thrust, roll and pitch go first: the yaw torque is scaled down until every rotor is within its limits, and only
     what even then lies outside is clipped.

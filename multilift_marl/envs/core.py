@@ -37,6 +37,8 @@ class MultiliftVec:
         observation_names, action_names: names of the D and A numbers.
         reward_terms: names of the reward terms.
         failure_causes: names of the values of `info["failure_cause"]`.
+        max_steps: policy steps of an episode.
+        control_ticks: control steps of a policy step.
         world: the physics; `world.state` is the true state.
         task: the task; `task.goal` and `task.errors` say where the payload should be.
     """
@@ -48,7 +50,7 @@ class MultiliftVec:
         self.config, self.purpose, self.first_env = config, purpose, first_env
         system, settings = config.system, config.control
         self.num_envs, self.num_drones = config.env.num_envs, system.num_drones
-        self._ticks = whole_ratio(config.sim.control_hz, config.env.policy_hz, "env.policy_hz", "sim.control_hz")
+        self.control_ticks = whole_ratio(config.sim.control_hz, config.env.policy_hz, "env.policy_hz", "sim.control_hz")
         self.max_steps = round(config.env.episode_seconds * config.env.policy_hz)
         if self.max_steps < 1:
             raise ConfigError(f"env.episode_seconds={config.env.episode_seconds} is shorter than one step; raise it")
@@ -107,8 +109,7 @@ class MultiliftVec:
         for e in drawn:
             start_reference(e, self.world.state, self.reference)
             self.task.observe(e, e + 1, self._action, self._observation, self._state)
-        none = np.zeros(self.num_envs, bool)
-        return self._observation.copy(), self._info(none, none)
+        return self.current()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all environments by one policy step.
@@ -137,6 +138,16 @@ class MultiliftVec:
         info = self._info(terminated, truncated)
         return self._observation.copy(), reward.astype(np.float32), terminated, truncated, info
 
+    def current(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return observation and info of the episodes in progress, as `reset` does, and change nothing."""
+        none = np.zeros(self.num_envs, bool)
+        return self._observation.copy(), self._info(none, none)
+
+    @property
+    def ended(self) -> np.ndarray:
+        """Environments (E,) bool that must be reset before the next step."""
+        return self._ended.copy()
+
     def stagger(self) -> None:
         """Shorten the episodes in progress to evenly spread lengths, so that time limits no longer coincide.
 
@@ -159,6 +170,12 @@ class MultiliftVec:
 
     def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
         """Continue bit for bit from what `state_dict` returned."""
+        for key, array in self.state_dict().items():
+            if key not in saved or np.shape(saved[key]) != array.shape:
+                raise ValueError(
+                    f"the saved state does not fit these environments: '{key}' has shape "
+                    f"{np.shape(saved.get(key))}, expected {array.shape}; use the configuration it was saved with"
+                )
         groups: dict[str, dict[str, np.ndarray]] = {"world": {}, "task": {}, "reference": {}}
         for key, array in saved.items():
             group, _, name = key.partition(".")
@@ -188,7 +205,7 @@ class MultiliftVec:
         """One policy step of one shard, on its own thread."""
         act, follow, after = self._calls[shard.lo]
         act()
-        for _ in range(self._ticks):
+        for _ in range(self.control_ticks):
             follow()
             self.world.advance(shard, self.world.system.control_interval)
         for call in after:

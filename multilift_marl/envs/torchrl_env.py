@@ -50,26 +50,29 @@ class MultiliftEnv(EnvBase):
         self.done_spec = Composite({key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=(e,))
         self._seed: int | None = None
         self._resumed = False
+        self._terminated = torch.zeros(e, 1, dtype=torch.bool)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         mask = tensordict.get("_reset", None) if tensordict is not None else None
         if mask is None and self._resumed:
             self._resumed = False  # the restored episodes go on
-            observation, info = self.vec._observation.copy(), self.vec._info(*(np.zeros(self.vec.num_envs, bool),) * 2)
+            observation, info = self.vec.current()
         else:
-            seed, self._seed = self._seed, None
+            seed, self._seed, self._resumed = self._seed, None, False
             observation, info = self.vec.reset(seed, None if mask is None else mask.reshape(-1).numpy())
         out = self._package(observation, info)
-        for key in ("done", "terminated", "truncated"):
-            out[key] = torch.zeros(self.vec.num_envs, 1, dtype=torch.bool)
+        ended = torch.from_numpy(self.vec.ended).unsqueeze(-1)  # of environments that this reset leaves alone
+        out["terminated"], out["truncated"] = ended & self._terminated, ended & ~self._terminated
+        out["done"] = ended
         return out
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["agents", "action"].detach().numpy()
         observation, reward, terminated, truncated, info = self.vec.step(action)
+        self._resumed = False
         out = self._package(observation, info)
         out["agents", "reward"] = torch.from_numpy(reward).unsqueeze(-1)
-        out["terminated"] = torch.from_numpy(terminated).unsqueeze(-1)
+        out["terminated"] = self._terminated = torch.from_numpy(terminated).unsqueeze(-1)
         out["truncated"] = torch.from_numpy(truncated).unsqueeze(-1)
         out["done"] = out["terminated"] | out["truncated"]
         return out
@@ -88,7 +91,7 @@ class MultiliftEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seed = seed
+        self._seed, self._resumed = seed, False
 
     def get_state(self) -> dict[str, torch.Tensor]:
         """Return everything that later steps depend on, as tensors."""

@@ -115,6 +115,8 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
             previous[over] = 0.0
     failed, steps = result["failure_cause"] > 0, np.maximum(final_steps, 1)
     limit = vec.max_steps * dt
+    if vec.num_drones == 1:
+        del result["min_separation_m"]
     return result | {
         "payload_position_error_m": np.where(failed, MAX_DISTANCE, final_distance / steps),
         "payload_attitude_error_deg": np.where(failed, 180.0, final_angle / steps),

@@ -1,9 +1,10 @@
 """Massless cables: a pull-only Kelvin-Voigt element on a MuJoCo tendon limit.
 
-A tendon limit with direct solref (-k', -d') and constant impedance d is a constraint whose unforced acceleration is
--(d' v + k' r), softened by the regulariser R = (1 - d)/d · tendon_invweight0. Its force is then
-f = (k' r + d' v) d / (R d) for small d, i.e. the Kelvin-Voigt law k r + c v with k' = k R d and d' = c R d, and
-as the force of a limit it never pushes. See MuJoCo's "Solver parameters" (computation, solver).
+With direct solref (-A, -B) and constant impedance I, a stretched limit's row wants the acceleration
+-(A r + B v)/I for stretch r and stretch rate v, softened by the regulariser R = (1 - I)/I · tendon_invweight0. For
+small I its force is (A r + B v)/(I R), the Kelvin-Voigt law k r + c v if A = k I R and B = c I R, and the force of a
+limit never pushes. See "Solver parameters" in MuJoCo's computation chapter. At rest the law is exact; in motion the
+softening acts like a little extra mass along the cable, about 1 % of what the cable couples.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From a system to a MuJoCo model. Only this file knows how bodies, cables and sensors lie in MuJoCo's arrays."""
+"""From a system to a MuJoCo model. The order of bodies in MuJoCo's arrays is decided here."""
 
 from __future__ import annotations
 
@@ -137,9 +137,8 @@ def _add_drone(spec: mujoco.MjSpec, system: System, i: int, visuals: bool) -> No
     body.mass, body.explicitinertial = vehicle.mass, True
     body.inertia, body.ipos = vehicle.inertia, [0, 0, 0]
     colour = DRONE_COLOURS[i % len(DRONE_COLOURS)]
-    half = 0.7 * vehicle.arm
     body.add_geom(
-        name=name, type=_GEOM.mjGEOM_BOX, size=[half, half, drone_half_height(system)],
+        name=name, type=_GEOM.mjGEOM_BOX, size=drone_half_size(vehicle),
         rgba=[*colour[:3], 0.0 if visuals else 1.0],
     )  # fmt: skip
     body.add_site(name=f"{name}/hook", pos=[0, 0, 0], size=[0.008, 0, 0], rgba=[0.2, 0.2, 0.2, 1])
@@ -164,9 +163,9 @@ def _add_rotorcraft(body: mujoco.MjsBody, vehicle: Vehicle, colour: tuple[float,
         body.add_geom(type=_GEOM.mjGEOM_CYLINDER, pos=tip, size=disc, rgba=tint, **plain)
 
 
-def drone_half_height(system: System) -> float:
-    """Return half the height of a drone's collision box [m]."""
-    return 0.3 * system.vehicle.arm
+def drone_half_size(vehicle: Vehicle) -> np.ndarray:
+    """Return the half edges (3,) of a drone's collision box [m]."""
+    return vehicle.arm * np.array([0.7, 0.7, 0.3])
 
 
 def _add_cable(spec: mujoco.MjSpec, system: System, i: int) -> None:

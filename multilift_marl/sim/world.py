@@ -14,7 +14,6 @@ from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
-from multilift_marl.math3d import mat_to_quat
 from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.dynamics import apply_loads, hover_drone, make_constants, read_rows, write_rows
 from multilift_marl.sim.scene import build_model
@@ -111,6 +110,7 @@ class World:
             raise ValueError("thrust holds NaN or infinite values; give each rotor's thrust in newtons")
         self.thrust[:] = thrust
         self.run(lambda shard: self.advance(shard, nstep))
+        self.check_warnings()
         return self.state
 
     def advance(self, shard: Shard, nstep: int) -> None:
@@ -223,12 +223,6 @@ class World:
             read = bind(read_rows, batch.state, lo, hi, tension, self.state, self.record, self.diverged, self.constants)
             shards.append(Shard(lo, hi, batch, apply, read))
         return shards
-
-
-def quaternions(rotation: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (..., 4), w first, of rotation matrices (..., 3, 3)."""
-    flat = rotation.reshape(-1, 9)
-    return np.array([mat_to_quat(tuple(m)) for m in flat]).reshape(*rotation.shape[:-2], 4)
 
 
 def _offset(batch: Batch, name: str) -> int:

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
+from multilift_marl.config.system import MIN_SEPARATION, System
 from multilift_marl.math3d import add, column, dot, mat, matrow, mul, norm, row, segment_distance, sub, unit, vec
-from multilift_marl.sim.scene import drone_half_height
+from multilift_marl.sim.scene import drone_half_size
 
 CAUSES = (
     "none",
@@ -20,10 +20,10 @@ CAUSES = (
     "cable_angle",  # over 90° from the drone's down axis or 135° from the payload's up axis
     "below_payload",  # a drone lower than the payload
     "tilt",  # a drone tilted over 80°
-    "out_of_range",  # payload over 3 m from its target
+    "out_of_range",  # payload over 3 m from its target, whatever the vehicle
     "diverged",  # the simulation has failed, not the team
 )
-DIVERGED = CAUSES.index("diverged")
+_GROUND, _COLLISION, _CROSSING, _CABLE, _BELOW, _TILT, _RANGE, DIVERGED = range(1, len(CAUSES))
 
 MAX_DISTANCE = 3.0  # [m]
 _CABLE_DISTANCE = 0.1  # [m] for the span of a falcon
@@ -55,14 +55,13 @@ def make_limits(system: System) -> Limits:
         for j in range(n):
             if i != j:
                 rest = segment_distance(tuple(anchors[i]), tuple(slots[i]), tuple(anchors[j]), tuple(slots[j]))
-                cables[i, j] = min(_CABLE_DISTANCE * system.min_separation / 0.35, 0.5 * rest)
-    half = 0.7 * system.vehicle.arm
+                cables[i, j] = min(_CABLE_DISTANCE * system.min_separation / MIN_SEPARATION, 0.5 * rest)
     return Limits(
         separation=system.min_separation,
         cables=cables,
         anchors=np.ascontiguousarray(anchors),
         payload_half=system.payload_size / 2,
-        drone_half=np.array([half, half, drone_half_height(system)]),
+        drone_half=drone_half_size(system.vehicle),
     )
 
 
@@ -79,31 +78,31 @@ def _cause(e, state, errors, limits, min_separation):
     up = column(attitude, 2)
     count = state.drone_position.shape[1]
     if not errors.distance[e] <= MAX_DISTANCE:
-        return 7
+        return _RANGE
     half = limits.payload_half
     if payload[2] - _extent(attitude, half) < _TOUCH:
-        return 1
+        return _GROUND
     for n in range(count):
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
         anchor = add(payload, mul(attitude, (limits.anchors[n, 0], limits.anchors[n, 1], limits.anchors[n, 2])))
         cable = unit(sub(drone, anchor))
         if drone[2] - _extent(frame, limits.drone_half) < _TOUCH:
-            return 1
+            return _GROUND
         if frame[8] < _MIN_UP:
-            return 6
+            return _TILT
         if drone[2] < payload[2]:
-            return 5
+            return _BELOW
         if dot(cable, column(frame, 2)) < 0.0 or dot(cable, up) < _MIN_CABLE_PAYLOAD:
-            return 4
+            return _CABLE
         for m in range(n):
             other = vec(state.drone_position, e, m)
             apart = norm(sub(drone, other))
             min_separation[e] = min(min_separation[e], apart)
             if apart < limits.separation:
-                return 2
+                return _COLLISION
             foot = add(payload, mul(attitude, (limits.anchors[m, 0], limits.anchors[m, 1], limits.anchors[m, 2])))
             if segment_distance(anchor, drone, foot, other) < limits.cables[n, m]:
-                return 3
+                return _CROSSING
     return 0
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Float, Section
-from multilift_marl.control.formation import place_formation
+from multilift_marl.config.schema import Config, Float, Section
+from multilift_marl.control.formation import Reference, place_formation
+from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import (
     add,
     axis_angle,
@@ -28,6 +29,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.sim.dynamics import hover_drone
+from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.terms import tolerance
 
@@ -59,6 +61,16 @@ class Hover(Task):
         "stillness": 0.1,
         "action_rate": -0.05,
     }
+
+    def __init__(self, config: Config, world: World, reference: Reference):
+        super().__init__(config, world, reference)
+        if self.options.success_seconds > config.env.episode_seconds:
+            raise ConfigError(
+                f"task_options.success_seconds={self.options.success_seconds:g} exceeds env.episode_seconds="
+                f"{config.env.episode_seconds:g}, so nothing could succeed; lower it"
+            )
+        if self.options.target_height[0] > self.options.target_height[1]:
+            raise ConfigError(f"task_options.target_height={self.options.target_height} must list the lower one first")
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, displacement, tilt and velocity; see `Task.start`."""
