@@ -5,7 +5,7 @@ Quaternions are (w, x, y, z). Tuples live in registers, so that a loop over dron
 
 from __future__ import annotations
 
-from math import acos, atan2, cos, sin, sqrt
+from math import atan2, cos, sin, sqrt
 
 from multilift_marl._jit import kernel
 
@@ -216,12 +216,6 @@ def rotation_vector(m):
     s = sqrt(x * x + y * y + z * z)
     k = 2.0 if s < 1e-12 else 2.0 * atan2(s, w) / s
     return (k * x, k * y, k * z)
-
-
-@kernel
-def angle_between(a, b):
-    """Return the angle between two unit vectors in [0, π]."""
-    return acos(clip(dot(a, b), -1.0, 1.0))
 
 
 @kernel

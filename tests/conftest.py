@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import sqrt
+
 import numpy as np
+import pytest
 
 import multilift_marl as ml
 from multilift_marl.config import System
+from multilift_marl.control.formation import place_formation
 from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
 from multilift_marl.sim import World
 
 TASKS = ml.list_tasks()
 NUM_DRONES = (1, 2, 3, 6)
 GRAVITY = 9.81
+TIMESTEPS = (5e-4, 1e-3, 2e-3, 4e-3)
+OFF_CENTRE = [[0.25, 0.2, 0.08], [-0.3, 0.2, 0.08], [-0.3, -0.2, 0.08], [0.25, -0.2, 0.08]]
+INFO = {"success", "failure", "diverged", "failure_cause", "reward_terms"}
+JARGON = ("Input ", "Value error", "Field required", "Tuple ", "instance of", "\n", ". ", "  ", "Errno")
+SMALL = {
+    "env.num_envs": 8, "env.num_threads": 1, "env.episode_seconds": 0.5, "train.horizon": 16, "train.frames": 1280,
+    "train.minibatches": 4, "train.checkpoint_every": 5, "eval.every": 4, "eval.episodes": 3,
+}  # fmt: skip
 
 
 def pytest_generate_tests(metafunc):
@@ -63,3 +77,96 @@ def same(first, second) -> bool:
         return len(first) == len(second) and all(same(a, b) for a, b in zip(first, second, strict=True))
     first, second = np.asarray(first), np.asarray(second)
     return first.dtype == second.dtype and first.shape == second.shape and first.tobytes() == second.tobytes()
+
+
+def floats(array) -> tuple[float, ...]:
+    """Return the numbers of an array, flattened, as kernels take them."""
+    return tuple(float(x) for x in np.ravel(array))
+
+
+def zeros(vec: MultiliftVec) -> np.ndarray:
+    """Return actions (E, N, A) of zero."""
+    return np.zeros((vec.num_envs, vec.num_drones, vec.action_size))
+
+
+def level(vec: MultiliftVec) -> None:
+    """Put the first environment's team at rest in its formation at the target."""
+    world, goal = vec.world, vec.task.goal
+    goal.position[0], goal.rotation[0] = [0, 0, 1.5], np.eye(3)
+    place_formation(0, goal, vec.task.rig)
+    world.reset(mask(vec.num_envs, 0))
+
+
+def without_drag(system: System, **vehicle) -> System:
+    """Return the system without any drag; other properties of the vehicle by name."""
+    return replace(system, vehicle=replace(system.vehicle, drag=(0.0, 0.0, 0.0), **vehicle), payload_drag_area=0.0)
+
+
+def free_world(num_envs: int = 1, drag: bool = False, vehicle: dict | None = None, **overrides) -> World:
+    """Return one upright drone 2 m above its payload on a slack cable of 20 m, both at rest, rotors at hover speed."""
+    system = make_system(1, **{"cable.length": 20.0, **overrides})
+    system = system if drag else without_drag(system, **(vehicle or {}))
+    world = World(system, num_envs, 1)
+    world.state.payload_position[:] = [0, 0, 100]
+    world.state.drone_position[:] = [0, 0, 102]
+    world.state.rotor_speed[:] = sqrt(system.vehicle.mass * GRAVITY / 4 / system.vehicle.thrust_coefficient)
+    load(world)
+    return world
+
+
+def load(world: World) -> None:
+    """Have the simulation take over a state that was written by hand."""
+    world.load(np.ones(world.num_envs, bool))
+
+
+def steady(world: World, thrust) -> np.ndarray:
+    """Let the rotors turn at the speeds of `thrust` (4,) [N] already, and return it for every drone (E, N, 4)."""
+    thrust = np.broadcast_to(np.asarray(thrust, float), (world.num_envs, world.num_drones, 4)).copy()
+    world.state.rotor_speed[:] = np.sqrt(thrust / world.system.vehicle.thrust_coefficient)
+    return thrust
+
+
+def weightless(world: World) -> np.ndarray:
+    """Return the thrust (E, N, 4) that holds a drone without a load."""
+    return steady(world, world.system.vehicle.mass * GRAVITY / 4)
+
+
+def refusal(build, *arguments, **keywords) -> str:
+    """Return the message of the ConfigError, checked to be one sentence in plain words."""
+    with pytest.raises(ConfigError) as caught:
+        build(*arguments, **keywords)
+    message = str(caught.value)
+    assert message == message.strip()
+    assert not [word for word in JARGON if word in message], message
+    return message
+
+
+def refuse_system(num_drones: int = 4, **overrides) -> str:
+    """Return the complaint about a system; overrides with __ for the dot."""
+    return refusal(make_system, num_drones, **{key.replace("__", "."): value for key, value in overrides.items()})
+
+
+def refuse_task(**overrides) -> str:
+    """Return the complaint about a hover task; overrides with __ for the dot."""
+    overrides = {key.replace("__", "."): value for key, value in overrides.items()}
+    return refusal(ml.make_vec, "hover", num_envs=1, num_threads=1, **overrides)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Return a writer of YAML files."""
+
+    def write(text: str, name: str = "mine.yaml"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def make_trainer(tmp_path, **overrides):
+    """Return the trainer of a new, small run; torch is imported here, since most tests do without it."""
+    from multilift_marl.agents.trainer import Trainer, new_run
+
+    config = ml.load_config("hover", SMALL | overrides)
+    return Trainer(config, new_run(config, "test", tmp_path))

@@ -76,6 +76,12 @@ def test_missing_extra_is_named(tmp_path):
     assert done.stderr == "error: torch is missing; pip install 'multilift_marl[train]'\n"
 
 
+@pytest.mark.parametrize("command", [["check"], ["format", "--check"]])
+def test_code_is_clean(command):
+    done = subprocess.run([sys.executable, "-m", "ruff", *command, "."], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
 def test_public_names():
     assert set(ml.__all__) == {
         "list_tasks", "load_config", "load_policy", "make_vec", "parallel_env", "sim", "torchrl_env"

@@ -216,7 +216,7 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
 
 
 def _check_possible(system: System, heaviest: float) -> None:
-    """Refuse what cannot fly, also with a payload `heaviest` times its nominal mass."""
+    """Refuse what cannot fly, hovering under a payload `heaviest` times its nominal mass included."""
     n, vehicle = system.num_drones, system.vehicle
     outside = np.linalg.norm(np.maximum(np.abs(system.anchors) - system.payload_size / 2, 0), axis=1)
     if np.any(outside > MAX_ANCHOR_DISTANCE):
@@ -226,18 +226,17 @@ def _check_possible(system: System, heaviest: float) -> None:
             "payload"
         )
     thrust = 4 * vehicle.rotor_thrust_max
-    weight = system.weight + (heaviest - 1) * system.payload_mass * GRAVITY
-    if n * thrust < MIN_THRUST_TO_WEIGHT * weight:
+    if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
         raise ConfigError(
             f"{n} × {vehicle.name} lift {n * thrust:.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of payload "
-            f"and drones, {weight:.1f} N at the heaviest; lower payload.mass ({system.payload_mass:g} kg) or add drones"
+            f"and drones, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
         )
     hover = np.linalg.norm(heaviest * system.formation_force + [0, 0, vehicle.mass * GRAVITY], axis=1)
-    if np.any(hover > thrust / 1.05):
+    if np.any(hover > thrust):
         i = int(hover.argmax())
         raise ConfigError(
-            f"drone {i} would need {hover[i]:.1f} N of its {thrust:.1f} N to hover; lower payload.mass, cable.angle "
-            "or move payload.anchors so that the load is shared"
+            f"drone {i} would need {hover[i]:.1f} N of its {thrust:.1f} N to hover under the heaviest payload; lower "
+            "payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
         )
     if n > 1:
         apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)

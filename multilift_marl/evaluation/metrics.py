@@ -18,7 +18,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     rate, square = successes / trials, _Z**2 / trials
     centre = (rate + square / 2) / (1 + square)
     half = _Z / (1 + square) * sqrt(rate * (1 - rate) / trials + square / (4 * trials))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    return max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half))
 
 
 def bootstrap(values: np.ndarray, seed: int = 0) -> tuple[float, float]:

@@ -1,0 +1,205 @@
+"""Configurations: which names, values, files and command lines are refused, and how it is said."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+from conftest import refusal, refuse_system, refuse_task
+
+import multilift_marl as ml
+from multilift_marl.config import load_config, parse_overrides
+
+
+def refuse_values(**overrides) -> str:
+    return refusal(load_config, "hover", {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    "key, nearest",
+    [
+        ("sed", "seed"),
+        ("randomisation", "randomization"),
+        ("env.num_dronez", "num_drones"),
+        ("sim.time_step", "timestep"),
+        ("payload.mas", "mass"),
+        ("cable.stifness", "stiffness"),
+        ("train.learningrate", "learning_rate"),
+        ("eval.episode", "episodes"),
+    ],
+)
+def test_unknown_key_names_the_nearest(key, nearest):
+    message = refuse_values(**{key: 1})
+    assert re.fullmatch(rf"unknown key '{re.escape(key)}'.*did you mean '{nearest}'\?", message)
+
+
+def test_unknown_key_like_no_other_lists_the_known_ones():
+    assert re.match(r"unknown key 'sim\.zzz'.*control_hz, timestep", refuse_values(sim__zzz=1))
+
+
+def test_unknown_key_in_a_file_names_the_file(write):
+    message = refusal(load_config, write("env:\n  num_dronez: 3\n"))
+    assert re.match(r"unknown key 'env\.num_dronez' .*mine\.yaml.*did you mean 'num_drones'\?", message)
+
+
+def test_unknown_configuration_names_the_nearest():
+    assert refusal(load_config, "hovr") == "no configuration named 'hovr'; did you mean 'hover'?"
+
+
+def test_unknown_task_names_the_nearest():
+    config = load_config("hover", {"task": "hoover"})
+    assert refusal(ml.make_vec, config) == "unknown task 'hoover'; did you mean 'hover'?"
+
+
+def test_unknown_vehicle_names_the_nearest():
+    message = refuse_system(vehicle__preset="falkon")
+    assert message == "unknown vehicle.preset 'falkon'; did you mean 'falcon'?"
+
+
+def test_unknown_reward_term_names_the_nearest():
+    message = refuse_task(reward__postion=1.0)
+    assert re.match(r"unknown key 'reward\.postion' of task hover; did you mean 'position'\?", message)
+
+
+def test_unknown_task_option_names_the_nearest():
+    message = refuse_task(task_options__target_xx=1.0)
+    assert re.match(r"unknown key 'task_options\.target_xx'; did you mean 'target_xy'\?", message)
+
+
+def test_a_key_below_a_value_is_refused():
+    assert re.search("task.*is a value, not a section", refuse_values(task__name="hover"))
+
+
+# Types and ranges
+
+
+@pytest.mark.parametrize(
+    "key, value, complaint",
+    [
+        ("env.num_drones", "four", "must be a whole number"),
+        ("env.num_drones", 2.5, "must be a whole number"),
+        ("env.num_drones", "2.5", "must be a whole number"),
+        ("env.num_drones", True, "must be a whole number"),
+        ("env.num_drones", math.nan, "must be a whole number"),
+        ("env.num_drones", 0, "must be greater than or equal to 1"),
+        ("env.num_drones", 65, "must be less than or equal to 64"),
+        ("env.num_envs", [4], "must be a"),
+        ("seed", -1, "must be greater than or equal to 0"),
+        ("payload.mass", "heavy", "must be a number"),
+        ("payload.mass", True, "must be a number"),
+        ("payload.mass", -1.4, "must be greater than 0"),
+        ("payload.mass", 0, "must be greater than 0"),
+        ("payload.mass", math.nan, "must be a finite number"),
+        ("payload.mass", "nan", "must be a finite number"),
+        ("payload.mass", math.inf, "must be a finite number"),
+        ("payload.shape", "sphere", "must be 'box' or 'point'"),
+        ("payload.inertia", [1.0, math.nan, 1.0], "must be a finite number"),
+        ("payload.size", [0.5, -0.4, 0.1], "must be greater than 0"),
+        ("cable.length", -1.0, "must be greater than 0"),
+        ("cable.angle", 80, "must be less than 80"),
+        ("sim.timestep", 0.1, "must be less than or equal to 0.02"),
+        ("randomization.payload_mass", 1.0, "must be less than 1"),
+        ("task", 3, "must be a"),
+        ("task_options", 3, "must be a"),
+    ],
+)
+def test_wrong_values_are_named_and_quoted(key, value, complaint):
+    message = refuse_values(**{key: value})
+    assert re.match(rf"{re.escape(key)} {complaint}.*, but is ", message), message
+
+
+@pytest.mark.parametrize("value", ["much", True, math.nan])
+def test_wrong_weight_names_its_reward_term(value):
+    assert "reward.position must be a" in refuse_values(reward__position=value)
+
+
+@pytest.mark.parametrize(
+    "value, complaint", [(-1, "must be greater than 0"), ("a", "must be a number"), (True, "must be a number")]
+)
+def test_wrong_value_in_a_list_for_the_drones_is_what_the_message_is_about(value, complaint):
+    message = refuse_values(cable__length=[1.0, 1.0, 1.0, value])
+    assert message.startswith("cable.length") and complaint in message, message
+
+
+@pytest.mark.parametrize(
+    "key, value",
+    [
+        ("wind.velocity", [1.0, 2.0]),
+        ("wind.velocity", [1.0, 2.0, 3.0, 4.0]),
+        ("payload.size", [0.5, 0.5]),
+        ("payload.anchors", [[0.1, 0.1]] * 4),
+        ("payload.anchors", [[0.1, 0.1, 0.1, 0.1]] * 4),
+    ],
+)
+def test_vector_of_wrong_length_says_how_many_numbers_are_expected(key, value):
+    message = refuse_values(**{key: value})
+    assert message.startswith(key) and re.search(r"\b(3|three)\b", message), message
+
+
+@pytest.mark.parametrize(
+    "option, value, complaint",
+    [
+        ("target_xy", -1, "must be greater than or equal to 0"),
+        ("target_xy", "far", "must be a number"),
+        ("target_xy", True, "must be a number"),
+        ("target_yaw", 181, "must be less than or equal to 180"),
+        ("start_tilt", math.nan, "must be a finite number"),
+    ],
+)
+def test_wrong_task_option_is_named_in_plain_words(option, value, complaint):
+    message = refuse_task(**{f"task_options.{option}": value})
+    assert f"task_options.{option}" in message and complaint in message, message
+
+
+@pytest.mark.parametrize("key", ["cable.length", "cable.stiffness", "cable.damping"])
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_list_of_wrong_length_names_both_numbers(key, count):
+    message = refuse_system(**{key: [1e3] * count})
+    assert re.match(rf"{key} lists {count} values for env\.num_drones=4: give", message)
+
+
+@pytest.mark.parametrize("count", [0, 3, 5])
+def test_anchors_must_be_as_many_as_drones(count):
+    message = refuse_system(payload__anchors=[[0.1, 0.1, 0.1]] * count)
+    assert re.match(rf"payload\.anchors lists {count} anchors for env\.num_drones=4: give", message)
+
+
+# Files and command lines
+
+
+@pytest.mark.parametrize("text", ["env: [1", "a: b: c", "env:\n\tnum_drones: 3"])
+def test_broken_yaml_names_the_file_and_the_line(write, text):
+    assert re.match(r"cannot read .*mine\.yaml as YAML: .*line \d+", refusal(load_config, write(text)))
+
+
+@pytest.mark.parametrize("text, found", [("- 1\n- 2", "list"), ("3", "int"), ("hover", "str")])
+def test_a_file_without_sections_is_refused(write, text, found):
+    message = refusal(load_config, write(text))
+    assert re.search(rf"mine\.yaml holds {found} where sections such as 'env:' are expected", message)
+
+
+def test_an_empty_section_is_named(write):
+    assert re.match(r"env\b.*mine\.yaml", refusal(load_config, write("env:\nseed: 3\n")))
+
+
+def test_a_key_that_is_no_word_is_named(write):
+    message = refusal(load_config, write("12: 3\n"))
+    assert "mine.yaml" in message and re.search(r"\b12\b", message)
+
+
+def test_missing_file_is_named(tmp_path):
+    message = refusal(load_config, tmp_path / "none.yaml")
+    assert re.match(r"no configuration file .*none\.yaml: give the path", message)
+
+
+@pytest.mark.parametrize("argument", ["seed", "=3"])
+def test_argument_without_key_or_value_is_refused(argument):
+    assert f"'{argument}' is not of the form key=value" in refusal(parse_overrides, [argument])
+
+
+def test_argument_that_is_no_yaml_is_refused():
+    assert re.match(r"the value of seed=\[1 is not valid YAML", refusal(parse_overrides, ["seed=[1"]))

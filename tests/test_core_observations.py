@@ -1,0 +1,77 @@
+"""The batched core: observations, the state and the terms of the reward."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import bold_actions, make
+
+import multilift_marl as ml
+
+
+@pytest.fixture(scope="module", params=ml.list_tasks())
+def ensemble(request):
+    """Return observations (K, D) and states (K, S) of many moments of many episodes of four drones, and the names."""
+    vec = make(request.param, num_envs=64, num_drones=4)
+    observation, _ = vec.reset(seed=0)
+    seen, states = [observation], [vec.state()]
+    for step in range(150):
+        observation, _, terminated, truncated, _ = vec.step(0.6 * bold_actions(vec, step, hold=10))
+        if step % 5 == 4:
+            seen.append(observation)
+            states.append(vec.state())
+        if (terminated | truncated).any():
+            vec.reset(mask=terminated | truncated)
+    return np.concatenate(seen).reshape(-1, vec.observation_size).astype(float), np.concatenate(states), vec
+
+
+def test_no_number_of_an_observation_is_constant(ensemble):
+    observation, _, vec = ensemble
+    spread = np.ptp(observation, axis=0)
+    assert [name for name, width in zip(vec.observation_names, spread, strict=True) if width < 1e-3] == []
+
+
+def test_no_number_of_an_observation_repeats_another(ensemble):
+    observation, _, vec = ensemble
+    correlation = np.abs(np.corrcoef(observation.T)) - np.eye(vec.observation_size)
+    twins = [(vec.observation_names[i], vec.observation_names[j]) for i, j in np.argwhere(correlation > 0.9999)]
+    assert twins == []
+
+
+def test_the_state_tells_what_is_hidden_from_the_drones(task):
+    vec = make(task, num_envs=64)
+    observation, _ = vec.reset(seed=0)
+    state, plant = vec.state(), vec.world.plant
+    excess = (plant.payload_mass / vec.world.system.payload_mass - 1)[:, None]
+    strength = np.linalg.norm(plant.payload_force, axis=1)[:, None]
+    assert np.abs(state - excess).max(axis=0).min() < 1e-6
+    assert np.abs(np.hypot(state[:, :-1], state[:, 1:]) - strength).max(axis=0).min() < 1e-6
+    assert np.abs(observation - excess[..., None]).max(axis=(0, 1)).min() > 0.1
+
+
+def test_reward_is_the_sum_of_its_named_terms_for_every_drone(task, num_drones):
+    vec, paid = make(task, num_drones=num_drones), set()
+    vec.reset(seed=0)
+    for step in range(20):
+        _, reward, *_, info = vec.step(0.5 * bold_actions(vec, step, hold=3))
+        total = sum(info["reward_terms"].values())
+        np.testing.assert_allclose(reward, np.broadcast_to(total[:, None], reward.shape), rtol=1e-6)
+        paid |= {name for name, values in info["reward_terms"].items() if values.any()}
+    assert paid == set(vec.reward_terms)
+
+
+def test_a_weight_scales_its_term_and_no_other(task):
+    def terms(**weights):
+        vec = make(task, **weights)
+        vec.reset(seed=0)
+        for step in range(3):
+            *_, info = vec.step(0.3 * bold_actions(vec, step, hold=1))
+        return info["reward_terms"]
+
+    plain = terms()
+    weights = make(task, num_envs=1).task.REWARD
+    for name, weight in weights.items():
+        heavier = terms(**{f"reward.{name}": 3 * weight})
+        for other in plain:
+            factor = 3 if other == name else 1
+            np.testing.assert_allclose(heavier[other], factor * plain[other], rtol=1e-12)

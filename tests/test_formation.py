@@ -1,0 +1,134 @@
+"""The formation, what actions make of it, and the scripts that fly it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import GRAVITY, make, make_system
+
+from multilift_marl.control.formation import Goal, Rig, place_formation
+from multilift_marl.control.scripted import INTEGRAL_GAIN, SCRIPTED, make_scripted
+from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import axis_angle, rot_z
+
+# The formation
+
+
+def placed(system, yaw=0.0, tilt=None, position=(0.3, -0.2, 1.5)) -> Goal:
+    goal = Goal.zeros(1, system.num_drones)
+    rotation = np.reshape(rot_z(yaw), (3, 3))
+    goal.position[0], goal.rotation[0] = position, rotation if tilt is None else tilt @ rotation
+    place_formation(0, goal, Rig(system.anchors, system.slots, system.slot_azimuth, system.formation_force))
+    return goal
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
+@pytest.mark.parametrize("num_drones", [2, 3, 4, 6])
+def test_pulls_balance_the_payloads_weight_and_moments(num_drones, yaw):
+    system = make_system(num_drones)
+    goal = placed(system, yaw)
+    anchors = system.anchors @ goal.rotation[0].T
+    np.testing.assert_allclose(goal.pull[0].sum(axis=0), [0, 0, system.payload_mass * GRAVITY], atol=1e-12)
+    np.testing.assert_allclose(np.cross(anchors, goal.pull[0]).sum(axis=0), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
+def test_slots_are_at_the_end_of_the_stretched_cables_along_the_pulls(num_drones, yaw):
+    system = make_system(num_drones)
+    goal = placed(system, yaw)
+    cables = goal.slots[0] - goal.position[0] - system.anchors @ goal.rotation[0].T
+    tension = np.linalg.norm(goal.pull[0], axis=-1, keepdims=True)
+    length = system.cable_length[:, None] + tension / system.cable_stiffness[:, None]
+    np.testing.assert_allclose(cables, length * goal.pull[0] / tension, atol=1e-12)
+
+
+def test_cables_keep_their_directions_over_a_tilted_target():
+    system, tilt = make_system(4), np.reshape(axis_angle((0.6, 0.8, 0.0), 0.5), (3, 3))
+    goal, level = placed(system), placed(system)
+    tilted = placed(system, tilt=tilt)
+    turn = np.reshape(rot_z(float(tilted.yaw[0])), (3, 3))
+    anchors = system.anchors @ tilted.rotation[0].T
+    cables = goal.slots[0] - goal.position[0] - system.anchors
+    np.testing.assert_allclose(tilted.slots[0] - tilted.position[0] - anchors, cables @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(tilted.pull[0], level.pull[0] @ turn.T, atol=1e-12)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
+def test_slot_frames_point_outward(num_drones, yaw):
+    goal = placed(make_system(num_drones), yaw)
+    outward = (goal.slots[0] - goal.position[0])[:, :2]
+    along = (outward * goal.slot_frame[0]).sum(axis=-1)
+    np.testing.assert_allclose(along, np.linalg.norm(outward, axis=-1), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(goal.slot_frame[0], axis=-1), 1.0)
+
+
+@pytest.fixture
+def commanded(num_drones):
+    """Return what a team's references are commanded for one action of every drone, relative to its slots."""
+
+    def commanded(action):
+        vec = make(num_envs=2, num_drones=num_drones)
+        vec.reset(seed=0)
+        vec.step(np.broadcast_to(np.asarray(action, float), (2, num_drones, 4)).copy())
+        goal, reference = vec.task.goal, vec.reference
+        return goal, reference.command - goal.slots, reference.command_yaw - goal.yaw[:, None]
+
+    return commanded
+
+
+def test_zero_action_commands_the_slots(commanded, num_drones):
+    _, offset, yaw = commanded([0, 0, 0, 0])
+    assert (offset == 0).all() and (yaw == 0).all()
+
+
+@pytest.mark.parametrize("share", [-1.0, 0.3, 1.0])
+def test_an_action_moves_the_slot_outward_sideways_and_up_and_turns_it(commanded, num_drones, share):
+    goal, offset, _ = commanded([share, 0, 0, 0])
+    outward = np.concatenate([goal.slot_frame, np.zeros((2, num_drones, 1))], axis=-1)
+    np.testing.assert_allclose(offset, 0.5 * share * outward, atol=1e-12)
+    _, offset, _ = commanded([0, share, 0, 0])
+    np.testing.assert_allclose(offset, 0.5 * share * np.cross([0, 0, 1], outward), atol=1e-12)
+    _, offset, _ = commanded([0, 0, share, 0])
+    np.testing.assert_allclose(offset, np.broadcast_to([0, 0, 0.5 * share], offset.shape), atol=1e-12)
+    _, offset, yaw = commanded([0, 0, 0, share])
+    np.testing.assert_allclose(offset, 0, atol=1e-12)
+    np.testing.assert_allclose(yaw, 0.5 * share, atol=1e-12)
+
+
+# Scripts
+
+
+def observed(vec, **values) -> np.ndarray:
+    """Return random observations (5, N, D) with some numbers, by name, set."""
+    observation = np.random.default_rng(0).normal(size=(5, vec.num_drones, vec.observation_size)).astype(np.float32)
+    for name, value in values.items():
+        observation[..., vec.observation_names.index(name)] = value
+    return observation
+
+
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_scripts_act_on_any_batch_within_the_limits(name):
+    vec = make(num_envs=1)
+    policy, observation = make_scripted(name, vec), 10 * observed(vec)
+    assert policy.act(observation).shape == (5, 4, 4)
+    assert policy.act(observation[0]).shape == (4, 4)
+    assert np.abs(policy.act(observation)).max() <= 1
+    np.testing.assert_array_equal(policy.act(observation)[3], policy.act(observation[3]))
+
+
+def test_the_formation_script_asks_for_the_slots():
+    vec = make(num_envs=1)
+    assert (make_scripted("formation", vec).act(observed(vec)) == 0).all()
+
+
+def test_the_integral_script_moves_the_slots_against_the_integral():
+    vec = make(num_envs=1, **{"control.max_offset": 0.4})
+    integral = {f"payload_error_integral_{axis}": value for axis, value in enumerate((0.1, -0.2, 5.0))}
+    action = make_scripted("formation_integral", vec).act(observed(vec, **integral))
+    expected = [-INTEGRAL_GAIN * 0.1 / 0.4, INTEGRAL_GAIN * 0.2 / 0.4, -1.0, 0.0]
+    np.testing.assert_allclose(action, np.broadcast_to(expected, action.shape), rtol=1e-6)
+
+
+def test_unknown_script_names_the_nearest():
+    with pytest.raises(ConfigError, match="unknown scripted policy 'formatoin'; did you mean 'formation'"):
+        make_scripted("formatoin", make(num_envs=1))

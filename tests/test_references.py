@@ -1,0 +1,136 @@
+"""The smoothed reference, and how well drones and teams follow it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+import pytest
+from conftest import floats, make, make_system
+
+from multilift_marl.config.schema import ControlConfig
+from multilift_marl.control.formation import Reference, smooth, start_reference, wrap
+from multilift_marl.control.geometric import fly, make_gains
+from multilift_marl.math3d import heading
+from multilift_marl.sim import World
+
+# The smoothed reference
+
+
+def follow(command, seconds, yaw=0.0, frequency=6.0, speed=1.0, dt=0.004) -> Reference:
+    """Return a reference's history, one step for each environment, after it started at rest at the origin."""
+    steps = round(seconds / dt)
+    one, history = Reference.zeros(1, 1), Reference.zeros(steps, 1)
+    one.command[:], one.command_yaw[:] = command, yaw
+    for step in range(steps):
+        smooth(0, 1, one, frequency, speed, dt)
+        for kept, now in zip(history, one, strict=True):
+            kept[step] = now[0]
+    return history
+
+
+def test_a_near_command_is_approached_like_a_critically_damped_third_order_step():
+    dt, w = 1e-4, 6.0
+    history = follow([0.2, -0.1, 0.1], 1.5, dt=dt)
+    t = dt * np.arange(1, len(history.position) + 1)[:, None]
+    share = 1 - np.exp(-w * t) * (1 + w * t + (w * t) ** 2 / 2)
+    np.testing.assert_allclose(history.position[:, 0], share * [0.2, -0.1, 0.1], atol=2e-4)
+    speed = w * np.exp(-w * t) * (w * t) ** 2 / 2
+    np.testing.assert_allclose(history.velocity[:, 0], speed * [0.2, -0.1, 0.1], atol=1e-3)
+
+
+@pytest.mark.parametrize("distance", [0.1, 0.6, 4.0])
+def test_no_command_is_overshot(distance):
+    history = follow([0, distance, 0], 10.0)
+    assert history.position[:, 0, 1].max() <= distance + 1e-6
+    assert history.position[-1, 0, 1] == pytest.approx(distance, abs=1e-6)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 2.0])
+def test_a_far_command_is_approached_at_the_speed_limit(speed):
+    history = follow([6.0, -6.0, 6.0], 5.0, speed=speed)
+    norm = np.linalg.norm(history.velocity[:, 0], axis=-1)
+    assert norm.max() <= 1.01 * speed
+    assert norm[round(2 / 0.004)] == pytest.approx(speed, rel=0.01)
+
+
+def test_velocity_acceleration_and_jerk_are_derivatives():
+    history = follow([2.0, 0.5, -0.3], 2.0, dt=1e-3)
+    for lower, higher in [("position", "velocity"), ("velocity", "acceleration"), ("acceleration", "jerk")]:
+        slope = np.diff(getattr(history, lower), axis=0) / 1e-3
+        np.testing.assert_allclose(slope, getattr(history, higher)[1:], atol=1e-9)
+
+
+def test_yaw_is_approached_like_a_critically_damped_second_order_step():
+    history = follow([0, 0, 0], 1.5, yaw=0.8, dt=1e-4)
+    wt = 6.0 * 1e-4 * np.arange(1, len(history.yaw) + 1)
+    np.testing.assert_allclose(history.yaw[:, 0], 0.8 * (1 - np.exp(-wt) * (1 + wt)), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "command, expected", [(2.5, 2.5), (4.0, 4.0 - 2 * pi), (-3.5, 2 * pi - 3.5), (7.0, 7.0 - 2 * pi)]
+)
+def test_yaw_takes_the_short_way(command, expected):
+    assert follow([0, 0, 0], 6.0, yaw=command).yaw[-1, 0] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "angle, expected", [(0.5, 0.5), (pi, pi), (-pi, pi), (3.5, 3.5 - 2 * pi), (-20.0, 6 * pi - 20)]
+)
+def test_wrap(angle, expected):
+    assert wrap(angle) == pytest.approx(expected)
+
+
+# Flight
+
+
+def test_a_free_drone_follows_its_reference_to_the_centimetre():
+    system = make_system(1, **{"cable.length": 20.0})
+    system = replace(system, vehicle=replace(system.vehicle, drag=(0.0, 0.0, 0.0)))
+    world, reference = World(system, 1, 1), Reference.zeros(1, 1)
+    world.state.payload_position[:] = [0, 0, 0.075]
+    world.state.drone_position[:] = [0, 0, 2.0]
+    world.load(np.ones(1, bool))
+    start_reference(0, world.state, reference)
+    reference.command[:], reference.command_yaw[:] = [1.5, -1.0, 3.0], 1.0
+    gains = make_gains(ControlConfig(), system)._replace(load_share=np.zeros(1))
+    thrust, errors = np.zeros((1, 1, 4)), []
+    for _ in range(1250):
+        smooth(0, 1, reference, 6.0, 1.0, 0.004)
+        fly(0, 1, world.state, reference, np.zeros((1, 1, 3)), thrust, gains)
+        world.step(thrust)
+        errors.append(np.linalg.norm(world.state.drone_position - reference.position))
+    assert (world.state.cable_tension == 0).all()
+    assert max(errors) < 0.02
+    np.testing.assert_allclose(world.state.drone_position[0, 0], [1.5, -1.0, 3.0], atol=1e-3)
+    assert heading(floats(world.state.drone_rotation[0, 0])) == pytest.approx(1.0, abs=1e-3)
+
+
+CALM = {"randomization.payload_mass": 0.0, "randomization.payload_force": 0.0}
+
+
+@pytest.mark.parametrize("num_drones", [2, 3, 4, 6])
+def test_a_team_moves_as_one_along_its_references(num_drones):
+    at_rest = {f"task_options.start_{name}": 0 for name in ("radius", "speed", "tilt")}
+    vec = make(num_envs=2, num_drones=num_drones, **CALM, **at_rest)
+    vec.reset(seed=0)
+    outward_x, outward_y = np.moveaxis(vec.task.goal.slot_frame, -1, 0)
+    aside = np.stack([0.5 * outward_x, -0.5 * outward_y, 0.2 + 0 * outward_x, 0 * outward_x], axis=-1)
+    for _ in range(250):
+        vec.step(aside)
+        errors = np.linalg.norm(vec.world.state.drone_position - vec.reference.position, axis=-1)
+        assert errors.max() < 0.05
+    assert errors.max() < 0.02
+    moved = vec.world.state.drone_position - vec.task.goal.slots
+    np.testing.assert_allclose(moved, np.broadcast_to([0.25, 0, 0.1], moved.shape), atol=0.02)
+
+
+@pytest.mark.parametrize("num_drones", [3, 4, 6])
+def test_the_formation_carries_a_known_payload_to_its_target(num_drones):
+    vec = make(num_envs=8, num_drones=num_drones, **CALM)
+    vec.reset(seed=0)
+    for _ in range(399):
+        vec.step(np.zeros((8, num_drones, 4)))
+    assert vec.task.errors.distance.max() < 2e-3
+    assert np.degrees(vec.task.errors.angle.max()) < 1.5

@@ -1,0 +1,103 @@
+"""Rotors against closed forms: speed, thrust, torque and energy."""
+
+from __future__ import annotations
+
+from math import cos, exp, pi, sqrt
+
+import numpy as np
+import pytest
+from conftest import GRAVITY, TIMESTEPS, free_world, hover_thrust, load, make_system, steady, weightless
+
+from multilift_marl.sim import World
+
+
+@pytest.mark.parametrize("timestep", TIMESTEPS)
+@pytest.mark.parametrize("start, thrust", [(1000.0, 3.0), (1500.0, 0.5)], ids=["faster", "slower"])
+def test_rotor_speed_follows_its_command_exponentially(start, thrust, timestep):
+    world = free_world(**{"sim.timestep": timestep})
+    vehicle, steps = world.system.vehicle, round(0.04 / timestep)
+    world.state.rotor_speed[:] = start
+    world.step(np.full((1, 1, 4), thrust), steps)
+    target = sqrt(thrust / vehicle.thrust_coefficient)
+    expected = start + (target - start) * (1 - exp(-steps * timestep / vehicle.rotor_time_constant))
+    np.testing.assert_allclose(world.state.rotor_speed, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("timestep", TIMESTEPS)
+def test_impulse_of_the_thrust_is_exact_while_rotors_change_speed(timestep):
+    world = free_world(**{"sim.timestep": timestep})
+    vehicle, t, start, thrust = world.system.vehicle, 0.04, 1000.0, 3.0
+    world.state.rotor_speed[:] = start
+    world.step(np.full((1, 1, 4), thrust), round(t / timestep))
+    target, tau = sqrt(thrust / vehicle.thrust_coefficient), vehicle.rotor_time_constant
+    gap = start - target
+    square = target**2 * t + 2 * target * gap * tau * (1 - exp(-t / tau)) + gap**2 * tau / 2 * (1 - exp(-2 * t / tau))
+    expected = 4 * vehicle.thrust_coefficient * square / vehicle.mass - GRAVITY * t
+    assert world.state.drone_velocity[0, 0, 2] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("command, limit", [(1e6, "max"), (5.001, "max"), (0.0, "min"), (-3.0, "min")])
+def test_rotors_keep_their_limits(command, limit):
+    world = free_world()
+    vehicle = world.system.vehicle
+    world.step(np.full((1, 1, 4), command), 250)
+    np.testing.assert_allclose(world.state.rotor_speed, getattr(vehicle, f"rotor_speed_{limit}"), rtol=1e-9)
+
+
+def test_rotor_speed_limit_is_that_of_the_largest_thrust():
+    vehicle = make_system(1).vehicle
+    assert vehicle.thrust_coefficient * vehicle.rotor_speed_max**2 == pytest.approx(vehicle.rotor_thrust_max)
+
+
+@pytest.mark.parametrize("rotor_speed", [500.0, 983.9, 1500.0])
+def test_thrust_is_b_times_speed_squared_along_body_z(rotor_speed):
+    world, tilt = free_world(), 0.4
+    vehicle = world.system.vehicle
+    world.state.drone_rotation[:] = [[cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, cos(tilt)]]
+    load(world)
+    world.step(steady(world, vehicle.thrust_coefficient * rotor_speed**2), 10)
+    thrust = 4 * vehicle.thrust_coefficient * rotor_speed**2
+    expected = 0.04 * (thrust / vehicle.mass * np.array([np.sin(tilt), 0, cos(tilt)]) - [0, 0, GRAVITY])
+    np.testing.assert_allclose(world.state.drone_velocity[0, 0], expected, atol=1e-12)
+
+
+def test_hover_speed_of_the_falcon_is_the_published_one():
+    vehicle = make_system(1).vehicle
+    assert sqrt(vehicle.mass * GRAVITY / 4 / vehicle.thrust_coefficient) == pytest.approx(983.9, abs=0.1)
+
+
+PLUS = (0.0, pi / 2, pi, 3 * pi / 2)
+
+
+@pytest.mark.parametrize(
+    "rotor, torque",
+    [(0, (0, -1, 1)), (1, (1, 0, -1)), (2, (0, 1, 1)), (3, (-1, 0, -1))],
+)
+def test_a_faster_rotor_turns_a_plus_quadrotor_as_equation_8_says(rotor, torque):
+    world = free_world(vehicle={"rotor_azimuth": PLUS})
+    vehicle, more = world.system.vehicle, 0.01
+    thrust = weightless(world)[0, 0]
+    thrust[rotor] += more
+    world.step(steady(world, thrust))
+    expected = more * np.array(torque) * [vehicle.arm, vehicle.arm, vehicle.torque_ratio] / vehicle.inertia
+    np.testing.assert_allclose(world.state.drone_body_rates[0, 0], 0.004 * expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("rotor, torque", [(0, (1, -1, 1)), (1, (1, 1, -1)), (2, (-1, 1, 1)), (3, (-1, -1, -1))])
+def test_a_faster_rotor_turns_an_x_quadrotor_about_its_diagonal(rotor, torque):
+    world = free_world()
+    vehicle, more = world.system.vehicle, 0.01
+    thrust = weightless(world)[0, 0]
+    thrust[rotor] += more
+    world.step(steady(world, thrust))
+    lever = vehicle.arm / sqrt(2)
+    expected = more * np.array(torque) * [lever, lever, vehicle.torque_ratio] / vehicle.inertia
+    np.testing.assert_allclose(world.state.drone_body_rates[0, 0], 0.004 * expected, rtol=1e-9, atol=1e-12)
+
+
+def test_energy_is_the_integral_of_rotor_torque_times_speed():
+    world = World(make_system(4), 1, 1)
+    vehicle, speed = world.system.vehicle, world.state.rotor_speed.copy()
+    world.step(hover_thrust(world), 100)
+    power = (vehicle.torque_ratio * vehicle.thrust_coefficient * speed**3).sum()
+    assert world.record.energy[0] == pytest.approx(0.4 * power, rel=1e-9)

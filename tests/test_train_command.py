@@ -1,0 +1,84 @@
+"""The training command: interrupts, help, and errors of one sentence."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import SMALL, make_trainer
+
+from multilift_marl.agents.checkpoint import load_checkpoint
+from multilift_marl.agents.logging import read_metrics
+from multilift_marl.cli.train import main as train
+from multilift_marl.config import load_config
+from multilift_marl.errors import ConfigError
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_interrupt_saves_and_resume_finishes(tmp_path):
+    arguments = [f"{key}={value}" for key, value in SMALL.items() if key != "train.frames"]
+    command = [sys.executable, str(ROOT / "train.py"), "config=hover", "train.frames=1e8", *arguments]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.time() + 120
+    while time.time() < deadline and not list(tmp_path.glob("runs/*/checkpoints/last.pt")):
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "python train.py resume=" in output
+    folder = next(tmp_path.glob("runs/*"))
+    done = load_checkpoint(folder / "checkpoints" / "last.pt")["iteration"]
+    assert len(read_metrics(folder)) == done
+    frames = (done + 2) * 8 * 16
+    again = subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), "resume=latest", f"train.frames={frames}"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert again.returncode == 0, again.stderr
+    assert "python evaluate.py run=" in again.stdout
+    assert len(read_metrics(folder)) == done + 2
+
+
+def test_help_explains_every_key(capsys):
+    assert train(["--help"]) == 0
+    text = capsys.readouterr().out
+    for key in ("train.frames", "payload.mass", "cable.stiffness", "randomization.payload_force", "resume"):
+        assert key in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["config=hovr"], "no configuration named 'hovr'; did you mean 'hover'?"),
+        (["train.frmes=10"], "unknown key 'train.frmes'; did you mean 'frames'?"),
+        (["train.frames=ten"], "train.frames must be a whole number, but is 'ten'"),
+        (["payload.mass=30"], "lower payload.mass"),
+        (["frames"], "'frames' is not of the form key=value"),
+        (["resume=nowhere"], "no run folder nowhere"),
+    ],
+)
+def test_command_line_errors_are_one_sentence(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert train(arguments) == 2
+    shown = capsys.readouterr().err
+    assert message in shown
+    assert shown.startswith("error: ") and shown.count("\n") == 1
+    assert not (tmp_path / "runs").exists()
+
+
+def test_resume_refuses_what_cannot_change(tmp_path, capsys):
+    trainer = make_trainer(tmp_path)
+    trainer.save("last")
+    assert train([f"resume={trainer.folder}", "env.num_drones=3"]) == 2
+    assert "'env.num_drones' cannot change when a run is resumed" in capsys.readouterr().err
+
+
+def test_impossible_system_makes_no_run_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError):
+        _ = load_config("hover", {"payload.mass": 50}).system
+    assert train(["payload.mass=50"]) == 2
+    assert not (tmp_path / "runs").exists()

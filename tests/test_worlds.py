@@ -1,0 +1,165 @@
+"""Worlds: the same for everyone whatever the threads and neighbours, what is refused, what diverges."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import hover_thrust, make_system, mask, same
+
+from multilift_marl.sim import World
+
+# Many at once
+
+
+def fly(world: World, steps: int = 60, seed: int = 0, first: int = 0) -> dict[str, np.ndarray]:
+    """Fly every environment by thrusts of its own and return all there is to know afterwards."""
+    for step in range(first, first + steps):
+        shares = [
+            np.random.default_rng((seed, e, step)).uniform(0.9, 1.1, (world.num_drones, 4))
+            for e in range(world.num_envs)
+        ]
+        world.step(hover_thrust(world) * shares)
+    return world.state_dict()
+
+
+def disturb(world: World) -> None:
+    everyone = np.arange(world.num_envs)
+    world.set_payload_mass(everyone > 0, world.system.payload_mass * (1 + 0.05 * everyone))
+    world.plant.payload_force[:, 0] = 0.3 * everyone
+
+
+def rows(saved: dict[str, np.ndarray], chosen) -> dict[str, np.ndarray]:
+    return {key: array[chosen] for key, array in saved.items()}
+
+
+@pytest.mark.parametrize("num_threads", [2, 3, 8])
+def test_the_number_of_threads_changes_no_bit(num_drones, num_threads):
+    system = make_system(num_drones)
+    one, many = World(system, 5, 1), World(system, 5, num_threads)
+    for world in (one, many):
+        disturb(world)
+    assert same(fly(one), fly(many))
+
+
+def test_an_environment_does_not_feel_its_neighbours():
+    system = make_system(4)
+    alone, crowd = World(system, 1, 1), World(system, 5, 2)
+    crowd.set_payload_mass(mask(5, 2, 3), np.full(5, 1.6))
+    crowd.plant.payload_force[4] = [0, 1, 0]
+    assert same(rows(fly(crowd), [0]), fly(alone))
+
+
+def test_a_masked_reset_leaves_the_other_rows_alone():
+    world = World(make_system(3), 5, 2)
+    disturb(world)
+    before = fly(world)
+    world.reset(mask(5, 1, 3))
+    after = world.state_dict()
+    assert same(rows(after, [0, 2, 4]), rows(before, [0, 2, 4]))
+    assert not same(rows(after, [1]), rows(before, [1]))
+
+
+def test_a_masked_reset_is_a_fresh_start():
+    system = make_system(3)
+    world, fresh = World(system, 5, 2), World(system, 5, 2)
+    disturb(world)
+    fly(world)
+    world.reset(mask(5, 1, 3))
+    assert same(rows(fly(world, seed=1), [1, 3]), rows(fly(fresh, seed=1), [1, 3]))
+
+
+def test_a_reset_restores_the_nominal_plant():
+    world = World(make_system(2, **{"wind.velocity": [1, 0, 0]}), 3, 1)
+    disturb(world)
+    world.plant.wind[:] = [0, 5, 0]
+    world.reset(mask(3, 2))
+    assert world.plant.payload_mass[2] == world.system.payload_mass != world.plant.payload_mass[1]
+    assert world.plant.payload_force[:, 0].tolist() == pytest.approx([0, 0.3, 0])
+    assert world.plant.wind.tolist() == [[0, 5, 0], [0, 5, 0], [1, 0, 0]]
+
+
+@pytest.mark.parametrize("threads", [(1, 1), (1, 2), (2, 1)], ids=str)
+def test_a_saved_world_continues_bit_for_bit(threads):
+    system = make_system(4)
+    world, other = World(system, 5, threads[0]), World(system, 5, threads[1])
+    disturb(world)
+    saved = fly(world)
+    expected = fly(world, first=60)
+    other.load_state_dict(saved)
+    assert same(fly(other, first=60), expected)
+
+
+def test_the_record_keeps_the_extremes_of_tension():
+    world = World(make_system(4), 1, 1)
+    rest = world.state.cable_tension[0, 0]
+    assert world.record.tension_min[0] == world.record.tension_max[0] == pytest.approx(rest)
+    seen = [rest]
+    for _ in range(50):
+        seen += world.step(1.2 * hover_thrust(world)).cable_tension[0].tolist()
+    assert (world.record.tension_min[0], world.record.tension_max[0]) == (min(seen), max(seen))
+    assert world.record.stretch_max[0] == pytest.approx(max(seen) / 1e5)
+
+
+# What is refused, and what goes wrong
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_thrust_that_is_not_finite_is_refused(wrong):
+    world = World(make_system(2), 3, 1)
+    thrust = hover_thrust(world)
+    thrust[1, 0, 2] = wrong
+    with pytest.raises(ValueError, match="thrust holds NaN or infinite values; give"):
+        world.step(thrust)
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (2, 2, 4), (3, 2, 3), (1, 2, 4)])
+def test_thrust_of_wrong_shape_is_refused(shape):
+    with pytest.raises(ValueError, match=r"thrust has shape .*, expected \(3, 2, 4\)"):
+        World(make_system(2), 3, 1).step(np.ones(shape))
+
+
+@pytest.mark.parametrize("mass", [0.0, -1.0, np.nan, np.inf])
+def test_impossible_payload_mass_is_refused(mass):
+    world = World(make_system(2), 2, 1)
+    with pytest.raises(ValueError, match="mass"):
+        world.set_payload_mass(mask(2, 1), np.array([1.0, mass]))
+
+
+@pytest.mark.parametrize("force", [1e5, 1e30, np.nan])
+def test_a_diverged_simulation_keeps_sound_numbers_and_spares_the_others(force):
+    system = make_system(4)
+    world, calm = World(system, 5, 2), World(system, 5, 2)
+    world.plant.payload_force[2] = force
+    saved, expected = fly(world), fly(calm)
+    others = [0, 1, 3, 4]
+    assert world.diverged.tolist() == [False, False, True, False, False]
+    assert same(rows(saved, others), rows(expected, others))
+    assert all(np.isfinite(saved[key]).all() for key in saved if key.startswith("state."))
+
+
+def test_reset_heals_a_diverged_simulation():
+    system = make_system(4)
+    world, fresh = World(system, 3, 1), World(system, 3, 1)
+    world.plant.payload_force[1] = np.nan
+    fly(world)
+    world.reset(mask(3, 1))
+    assert not world.diverged.any()
+    assert same(rows(fly(world, seed=1), [1]), rows(fly(fresh, seed=1), [1]))
+    world.check_warnings()
+    assert not world.diverged.any()
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_divergence_writes_no_file_and_nothing_to_the_screen(tmp_path, monkeypatch, capfd, caplog, num_threads):
+    monkeypatch.chdir(tmp_path)
+    caplog.set_level(logging.DEBUG, "multilift_marl.mujoco")
+    world = World(make_system(4), 4, num_threads)
+    world.plant.payload_force[[0, 3]] = np.nan
+    world.step(hover_thrust(world), 5)
+    assert world.diverged.tolist() == [True, False, False, True]
+    assert "simulation is unstable" in caplog.text
+    assert capfd.readouterr() == ("", "")
+    assert list(Path.cwd().iterdir()) == []
