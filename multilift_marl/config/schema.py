@@ -111,6 +111,7 @@ class ControlConfig(Section):
     position_damping: Float = Field(1.0, gt=0, description="[-] its damping ratio")
     attitude_frequency: Float = Field(20.0, gt=0, description="[rad/s] of roll and pitch; at most 0.7/motor lag")
     attitude_damping: Float = Field(0.8, gt=0, description="[-] its damping ratio")
+    drag_feedforward: bool = Field(False, description="feed the drones' nominal drag in still air forward")
     yaw_frequency: Float = Field(8.0, gt=0, description="[rad/s] natural frequency of yaw")
 
 

@@ -24,6 +24,7 @@ from multilift_marl.math3d import (
     scale,
     sub,
     thrust_frame,
+    tmul,
     transpose,
     unit,
     vec,
@@ -50,6 +51,8 @@ class Gains(NamedTuple):
     thrust_max: float
     load_share: np.ndarray
     """(N,) payload mass that each drone carries [kg]."""
+    drag: tuple[float, float, float]
+    """Linear drag along the body axes that is fed forward [kg/s]."""
 
 
 def make_gains(control: ControlConfig, system: System) -> Gains:
@@ -68,6 +71,7 @@ def make_gains(control: ControlConfig, system: System) -> Gains:
         thrust_min=vehicle.thrust_coefficient * vehicle.rotor_speed_min**2,
         thrust_max=vehicle.rotor_thrust_max,
         load_share=system.formation_force[:, 2] / GRAVITY,
+        drag=tuple(float(c) * control.drag_feedforward for c in vehicle.drag),
     )
 
 
@@ -145,12 +149,14 @@ def fly(lo, hi, state, reference, pull, thrust, g):
             moved = g.mass + g.load_share[n]
             force = sub(scale(moved, vec(reference.acceleration, e, n)), scale(g.mass, feedback))
             force = add(force, vec(pull, e, n))
+            attitude = mat(state.drone_rotation, e, n)
+            air = tmul(attitude, vec(reference.velocity, e, n))
+            force = add(force, mul(attitude, (g.drag[0] * air[0], g.drag[1] * air[1], g.drag[2] * air[2])))
             force = (force[0], force[1], max(force[2] + g.mass * GRAVITY, 0.1 * g.mass * GRAVITY))
             yaw, yaw_rate = reference.yaw[e, n], reference.yaw_rate[e, n]
             desired = thrust_frame(force, yaw)
             force_rate = scale(moved, vec(reference.jerk, e, n))
             desired_rate = desired_rates(desired, force, force_rate, yaw, yaw_rate)
-            attitude = mat(state.drone_rotation, e, n)
             torque = attitude_torque(attitude, vec(state.drone_body_rates, e, n), desired, desired_rate, g)
             total = max(dot(force, unit(column(attitude, 2))), 0.0)
             rotors = allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)

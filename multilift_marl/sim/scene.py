@@ -43,12 +43,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
     """
     spec = mujoco.MjSpec()
     spec.modelname = "multilift"
-    option = spec.option
-    option.timestep, option.gravity = system.timestep, [0, 0, -GRAVITY]
-    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    disable = mujoco.mjtDisableBit
-    option.disableflags |= disable.mjDSBL_REFSAFE | disable.mjDSBL_AUTORESET | disable.mjDSBL_ISLAND
+    set_options(spec, system.timestep)
     _add_world(spec, visuals)
     _add_payload(spec, system)
     for i in range(system.num_drones):
@@ -58,6 +53,15 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
         _add_light(spec.body("payload"))
         _add_target(spec, system)
     return spec
+
+
+def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
+    """Set integrator, Jacobian, gravity and flags, the same for every model of this package."""
+    option, disable = spec.option, mujoco.mjtDisableBit
+    option.timestep, option.gravity = timestep, [0, 0, -GRAVITY]
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.disableflags |= disable.mjDSBL_REFSAFE | disable.mjDSBL_AUTORESET | disable.mjDSBL_ISLAND
 
 
 def build_model(system: System, visuals: bool = False) -> tuple[mujoco.MjModel, Layout]:

@@ -1,0 +1,1 @@
+"""Experiments against theory: `python -m multilift_marl.validation`."""
