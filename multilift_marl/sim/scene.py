@@ -125,9 +125,18 @@ def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
         body.add_geom(name="payload", type=_GEOM.mjGEOM_SPHERE, size=[system.payload_size[0] / 2, 0, 0], rgba=colour)
     else:
         body.add_freejoint(name="payload")
-        body.add_geom(name="payload", type=_GEOM.mjGEOM_BOX, size=system.payload_size / 2, rgba=colour)
+        kind, size = _payload_form(system)
+        body.add_geom(name="payload", type=kind, size=size, pos=system.payload_center, rgba=colour)
     for i, anchor in enumerate(system.anchors):
         body.add_site(name=f"payload/anchor_{i}", pos=anchor, size=[0.012, 0, 0], rgba=[0.2, 0.2, 0.2, 1])
+
+
+def _payload_form(system: System, margin: float = 0.0) -> tuple[mujoco.mjtGeom, np.ndarray]:
+    """Return the type and size of the geom of a payload with extent, `margin` [m] larger on every side."""
+    half = system.payload_size / 2 + margin
+    if system.payload_shape == "cylinder":
+        return _GEOM.mjGEOM_CYLINDER, np.array([half[0], half[2], 0])
+    return _GEOM.mjGEOM_BOX, half
 
 
 def _add_drone(spec: mujoco.MjSpec, system: System, i: int, visuals: bool) -> None:
@@ -185,13 +194,26 @@ def _add_target(spec: mujoco.MjSpec, system: System) -> None:
     body = spec.worldbody.add_body(name="target", mocap=True, pos=[0, 0, -10])
     plain = {"contype": 0, "conaffinity": 0, "group": _VISUAL_GROUP}
     faint, firm = [0.0, 0.75, 0.35, 0.18], [0.0, 0.60, 0.25, 1]
-    half = system.payload_size / 2 + 0.04 * system.payload_size.min()
+    margin, center = 0.04 * system.payload_size.min(), system.payload_center
+    half = system.payload_size / 2 + margin
     if system.payload_shape == "point":
         body.add_geom(type=_GEOM.mjGEOM_SPHERE, size=[half[0], 0, 0], rgba=[*firm[:3], 0.5], **plain)
         return
-    body.add_geom(type=_GEOM.mjGEOM_BOX, size=half, rgba=faint, **plain)
+    kind, size = _payload_form(system, margin)
+    body.add_geom(type=kind, size=size, pos=center, rgba=faint, **plain)
     thick = [0.03 * system.payload_size.min(), 0, 0]
+    for a, b in _rims(half) if system.payload_shape == "cylinder" else _edges(half):
+        body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[*(center + a), *(center + b)], size=thick, rgba=firm, **plain)
+
+
+def _edges(half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the ends of the twelve edges of a box."""
     corners = half * np.array(list(product((-1, 1), repeat=3)))
-    for a, b in combinations(corners, 2):
-        if np.count_nonzero(a != b) == 1:
-            body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[*a, *b], size=thick, rgba=firm, **plain)
+    return [(a, b) for a, b in combinations(corners, 2) if np.count_nonzero(a != b) == 1]
+
+
+def _rims(half: np.ndarray, count: int = 24) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the ends of the sides of two polygons, the rims of an upright cylinder."""
+    angle = np.linspace(0, 2 * np.pi, count + 1)
+    rims = [half * np.stack([np.cos(angle), np.sin(angle), np.full(count + 1, side)], axis=1) for side in (-1.0, 1.0)]
+    return [(a, b) for rim in rims for a, b in zip(rim[:-1], rim[1:], strict=True)]
