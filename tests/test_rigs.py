@@ -196,3 +196,78 @@ def test_seeded_flights_of_a_cylinder_repeat():
         return [vec.step(np.full((2, 4, 4), 0.3))[0].copy() for _ in range(20)]
 
     assert same(flight(), flight())
+
+
+# Mesh
+
+WEDGE = "v 0 0 0\nv 0.6 0 0\nv 0 0.8 0\nv 0 0 0.3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+FLAT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+@pytest.fixture
+def wedge(write):
+    """Return overrides for a tetrahedron with three edges along the axes from its corner."""
+    anchors = [[0.0, -0.05, 0.1], [-0.28, -0.05, 0.1], [-0.28, -0.35, 0.1], [0.0, -0.35, 0.1]]
+    return {"payload.shape": "mesh", "payload.mesh": str(write(WEDGE, "wedge.obj")), "payload.anchors": anchors}
+
+
+def test_uniform_mesh_has_the_centre_and_inertia_of_its_volume(wedge):
+    system = make_system(4, **wedge, **{"payload.mass": 2.0})
+    edges = np.array([0.6, 0.8, 0.3])
+    np.testing.assert_allclose(system.payload_size, edges)
+    np.testing.assert_allclose(system.payload_center, edges / 4, atol=1e-7)  # its mass lies a quarter up each edge
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, system.payload_axes)
+    axes = rotation.reshape(3, 3)
+    second = 2.0 * (4 * np.diag(edges**2) - np.outer(edges, edges)) / 80
+    inertia = np.trace(second) * np.eye(3) - second
+    np.testing.assert_allclose(axes @ np.diag(system.payload_inertia) @ axes.T, inertia, atol=1e-6)
+
+
+def test_mesh_is_scaled_to_its_size_and_keeps_what_is_given(wedge):
+    given = {"payload.size": (0.6, 0.8, 0.2), "payload.inertia": (0.01, 0.011, 0.012)}
+    given["payload.center_of_mass"] = (-0.1, -0.2, 0.0)
+    system = make_system(4, **wedge, **given)
+    np.testing.assert_allclose(system.payload_size, [0.6, 0.8, 0.2])
+    np.testing.assert_allclose(system.payload_inertia, [0.01, 0.011, 0.012])
+    assert system.payload_axes.tolist() == [1, 0, 0, 0]
+    np.testing.assert_allclose(system.payload_center, [0.1, 0.2, 0.0])
+
+
+def test_mesh_stands_where_its_file_says_and_flies(wedge):
+    vec = make(num_envs=2, **wedge)
+    system = vec.world.system
+    model, _ = build_model(system, visuals=True)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    geom, mesh = model.geom("payload").id, model.geom("payload").dataid[0]
+    count = model.mesh_vertnum[mesh]
+    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][:count]
+    points = vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom] - data.body("payload").xpos
+    np.testing.assert_allclose(points.min(axis=0), system.payload_center - system.payload_size / 2, atol=1e-6)
+    np.testing.assert_allclose(points.max(axis=0), system.payload_center + system.payload_size / 2, atol=1e-6)
+    policy = make_scripted("formation", vec)
+    observation, _ = vec.reset(seed=0)
+    for _ in range(200):
+        observation, _, terminated, _, _ = vec.step(policy.act(observation).astype(float))
+        assert not terminated.any()
+
+
+@pytest.mark.parametrize(
+    "text, name, complaint",
+    [
+        (None, "none.obj", r"payload\.mesh=.* is no \.obj or \.stl file; give the path of one"),
+        (WEDGE, "wedge.txt", r"payload\.mesh=.* is no \.obj or \.stl file"),
+        (FLAT, "flat.obj", r"payload\.mesh=.* cannot be a body \(.*\); give a closed surface"),
+        ("nonsense", "bad.stl", r"payload\.mesh=.* cannot be a body \(.*\); give a closed surface"),
+    ],
+)
+def test_a_file_that_holds_no_body_is_refused(text, name, complaint, write, tmp_path):
+    path = tmp_path / name if text is None else write(text, name)
+    message = refuse_system(payload__shape="mesh", payload__mesh=str(path))
+    assert re.match(complaint, message), message
+
+
+def test_mesh_and_its_shape_belong_together():
+    assert re.match(r"payload\.shape=mesh needs payload\.mesh; give the path", refuse_system(payload__shape="mesh"))
+    assert re.match(r"payload\.mesh means nothing to a box; drop it or use", refuse_system(payload__mesh="a.obj"))

@@ -95,17 +95,21 @@ class VehicleConfig(Section):
 class PayloadConfig(Section):
     """The load. None stands for the standard rig: 0.35 kg a falcon, a box that carries the ring of anchors."""
 
-    shape: Literal["box", "cylinder", "point"] = Field(
-        "box", description="box, upright cylinder, or point: a mass without extent"
+    shape: Literal["box", "cylinder", "mesh", "point"] = Field(
+        "box", description="box, upright cylinder, mesh, or point: a mass without extent"
     )
+    mesh: str | None = Field(None, description="path of an .obj or .stl file, a closed surface, for shape mesh")
     mass: Float | None = Field(None, gt=0, description="[kg] None: 0.35 kg for each falcon, others by spare thrust")
     size: tuple[Positive, Positive, Positive] | None = Field(
-        None, description="[m] edges of the box, or diameter twice and height of the cylinder; None: fits"
+        None,
+        description="[m] edges of the box, or diameter twice and height of the cylinder; mesh: scaled to; None: fits",
     )
     inertia: tuple[Positive, Positive, Positive] | None = Field(
         None, description="[kg m²] principal moments about the centre of mass; None: of a uniform body"
     )
-    center_of_mass: Vector = Field((0.0, 0.0, 0.0), description="[m] of the centre of mass from the geometric centre")
+    center_of_mass: Vector | None = Field(
+        None, description="[m] of the centre of mass from the geometric centre; None: of a uniform body"
+    )
     anchors: tuple[Vector, ...] | None = Field(
         None, description="[m] attachment of each cable from the geometric centre; None: the standard rig's"
     )

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from multilift_marl.config.mesh import Mesh, read_mesh
 from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, resolve_vehicle
 from multilift_marl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from multilift_marl.config.schema import Config
+    from multilift_marl.config.schema import Config, PayloadConfig
 
 MIN_THRUST_TO_WEIGHT = 1.18
 MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the vehicle's span
@@ -27,11 +27,13 @@ class System:
 
     Attributes:
         vehicle: the quadrotor, the same for all drones.
-        payload_shape: "box", "cylinder" or "point".
+        payload_shape: "box", "cylinder", "mesh" or "point".
+        payload_mesh: of a "mesh", else None.
         payload_size: edges of the payload's bounding box (3,) [m].
         payload_center: its geometric centre from its centre of mass, in its frame (3,) [m].
         payload_mass: nominal mass [kg].
         payload_inertia: nominal principal moments about the centre of mass (3,) [kg m²].
+        payload_axes: quaternion of the principal axes in its frame (4,).
         payload_drag_area: C_d A [m²].
         anchors: attachment of each cable from the payload's centre of mass, in its frame (N, 3) [m].
         cable_length, cable_stiffness, cable_damping: (N,) [m], [N/m], [N s/m].
@@ -46,10 +48,12 @@ class System:
 
     vehicle: Vehicle
     payload_shape: str
+    payload_mesh: Mesh | None
     payload_size: np.ndarray
     payload_center: np.ndarray
     payload_mass: float
     payload_inertia: np.ndarray
+    payload_axes: np.ndarray
     payload_drag_area: float
     anchors: np.ndarray
     cable_length: np.ndarray
@@ -84,13 +88,21 @@ def resolve_system(config: Config) -> System:
     vehicle = resolve_vehicle(config.vehicle)
     scale = vehicle.span / _FALCON.span
     length = _per_drone(_standard_length(config, scale) if cable.length is None else cable.length, n, "cable.length")
-    anchors, size = _rig(config, n, length, scale)
-    center = np.zeros(3) - payload.center_of_mass
-    _check_body(payload.shape, size, payload.center_of_mass, anchors)
-    anchors = anchors + center
+    mesh = _mesh(payload)
+    anchors, size = _rig(config, n, length, scale, mesh)
+    uniform = np.zeros(3) if mesh is None else mesh.center_of_mass - mesh.middle
+    center_of_mass = uniform if payload.center_of_mass is None else np.array(payload.center_of_mass)
+    _check_body(payload.shape, size, center_of_mass, anchors)
+    anchors = anchors - center_of_mass
     standard = 0.35 * n * (vehicle.spare_lift / _FALCON.spare_lift)
     mass = payload.mass if payload.mass is not None else standard
-    inertia = np.asarray(payload.inertia or _uniform_inertia(payload.shape, mass, size), float)
+    axes = np.array([1.0, 0.0, 0.0, 0.0])
+    if payload.inertia is not None:
+        inertia = np.array(payload.inertia)
+    elif mesh is not None:
+        inertia, axes = mass * mesh.inertia, mesh.axes
+    else:
+        inertia = _uniform_inertia(payload.shape, mass, size)
     if 2 * inertia.max() > inertia.sum() * (1 + 1e-9):
         raise ConfigError(
             f"payload.inertia {inertia.tolist()} is impossible: no moment may exceed the sum of the other two"
@@ -103,10 +115,12 @@ def resolve_system(config: Config) -> System:
     system = System(
         vehicle=vehicle,
         payload_shape=payload.shape,
+        payload_mesh=mesh,
         payload_size=size,
-        payload_center=center,
+        payload_center=-center_of_mass,
         payload_mass=mass,
         payload_inertia=inertia,
+        payload_axes=axes,
         payload_drag_area=payload.drag_area,
         anchors=anchors,
         cable_length=length,
@@ -134,15 +148,26 @@ def _standard_length(config: Config, scale: float) -> float:
     return scale * max(1.0, REST_SEPARATION / (2 * np.sin(np.pi / n) * spread))
 
 
-def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+def _mesh(payload: PayloadConfig) -> Mesh | None:
+    if payload.shape == "mesh" and payload.mesh is not None:
+        return read_mesh(payload.mesh, payload.size)
+    if payload.shape == "mesh":
+        raise ConfigError("payload.shape=mesh needs payload.mesh; give the path of an .obj or .stl file")
+    if payload.mesh is not None:
+        raise ConfigError(f"payload.mesh means nothing to a {payload.shape}; drop it or use payload.shape=mesh")
+    return None
+
+
+def _rig(config: Config, n: int, length: np.ndarray, scale: float, mesh: Mesh | None) -> tuple[np.ndarray, np.ndarray]:
     """Return anchors (n, 3) from the geometric centre and edges (3,): the configured or the standard ones."""
     payload = config.payload
     reach = length.min() * np.sin(np.deg2rad(config.cable.angle))
     ring = max(0.27 * scale, REST_SEPARATION * scale / (2 * np.sin(np.pi / n)) - reach) if n > 1 else 0.0
     edge = 2 * max(ring, 0.15 * scale)
-    rectangle = n == 4 and payload.shape == "box"
+    rectangle = n == 4 and payload.shape != "cylinder"
     standard = np.array([0.55, 0.45, 0.15]) * scale if rectangle else np.array([edge, edge, 0.15 * scale])
     size = standard if payload.size is None else np.asarray(payload.size, float)
+    size = size if mesh is None else mesh.edges
     inset = 0.005 * scale  # the cables are tied to rings this far inside the rim and above the lid
     lid, rim = size[2] / 2 + inset, size[:2] / 2 - inset
     if payload.anchors is not None:
@@ -159,7 +184,7 @@ def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.n
         anchors = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(n, lid)], axis=1)
     if payload.shape == "point":
         for key in ("size", "inertia", "center_of_mass"):
-            if getattr(payload, key) not in (None, (0.0, 0.0, 0.0)):
+            if getattr(payload, key) is not None:
                 raise ConfigError(f"payload.{key} means nothing to a point; drop it or use payload.shape=box")
         size = np.full(3, 0.1 * scale)
         if np.any(anchors != 0):
@@ -177,16 +202,16 @@ def _uniform_inertia(shape: str, mass: float, size: np.ndarray) -> np.ndarray:
     return mass / 12 * np.array([size[1] ** 2 + size[2] ** 2, size[0] ** 2 + size[2] ** 2, size[0] ** 2 + size[1] ** 2])
 
 
-def _check_body(shape: str, size: np.ndarray, center_of_mass: Sequence[float], anchors: np.ndarray) -> None:
+def _check_body(shape: str, size: np.ndarray, center_of_mass: np.ndarray, anchors: np.ndarray) -> None:
     """Refuse bodies that cannot be, and anchors (N, 3) off the body, counted from its geometric centre."""
     if shape == "cylinder" and size[0] != size[1]:
         raise ConfigError(
             f"payload.size {size.tolist()} of a cylinder must give its diameter twice, then its height; "
             "make the first two equal"
         )
-    if _outside(shape, size, np.array([center_of_mass]))[0] > 1e-9:
+    if _outside(shape, size, center_of_mass[None])[0] > 1e-9:
         raise ConfigError(
-            f"payload.center_of_mass {list(center_of_mass)} lies outside the payload of size {size.tolist()}; "
+            f"payload.center_of_mass {center_of_mass.tolist()} lies outside the payload of size {size.tolist()}; "
             "count it from the geometric centre"
         )
     outside = _outside(shape, size, anchors)
