@@ -168,7 +168,7 @@ def test_attitude_torque_descends_the_error_function(gains, seed):
 @pytest.mark.parametrize("tau, expected", [(0.01, 20.0), (0.033, 20.0), (0.07, 10.0)])
 def test_attitude_is_no_faster_than_the_motors_allow(tau, expected):
     system = make_system(4)
-    system = replace(system, vehicle=replace(system.vehicle, rotor_time_constant=tau))
+    system = replace(system, vehicle=replace(system.vehicle, rotor_time_constant_up=tau, rotor_time_constant_down=tau))
     gains = make_gains(ControlConfig(attitude_frequency=20.0, attitude_damping=0.8), system)
     np.testing.assert_allclose(gains.k_R[:2], expected**2)
     np.testing.assert_allclose(gains.k_w[:2], 2 * 0.8 * expected)

@@ -96,7 +96,7 @@ def test_a_key_below_a_value_is_refused():
         ("payload.mass", math.nan, "must be a finite number"),
         ("payload.mass", "nan", "must be a finite number"),
         ("payload.mass", math.inf, "must be a finite number"),
-        ("payload.shape", "sphere", "must be 'box' or 'point'"),
+        ("payload.shape", "sphere", "must be 'box', 'cylinder', 'mesh' or 'point'"),
         ("payload.inertia", [1.0, math.nan, 1.0], "must be a finite number"),
         ("payload.size", [0.5, -0.4, 0.1], "must be greater than 0"),
         ("cable.length", -1.0, "must be greater than 0"),

@@ -23,8 +23,9 @@ def config_dir() -> Path:
 
 
 def list_configs() -> list[str]:
-    """Return the names of the shipped configurations."""
-    return sorted(path.stem for path in config_dir().glob("*.yaml"))
+    """Return the names of the shipped configurations, those in a folder with it: "hover", "rigs/falcon3"."""
+    folder = config_dir()
+    return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
 
 
 def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None = None) -> Config:

@@ -42,6 +42,7 @@ Int = Annotated[int, BeforeValidator(_integer)]
 Float = Annotated[float, BeforeValidator(_real)]
 Vector = tuple[Float, Float, Float]
 Positive = Annotated[Float, Field(gt=0)]
+NotNegative = Annotated[Float, Field(ge=0)]
 PerDrone = Positive | tuple[Positive, ...]
 
 
@@ -68,23 +69,49 @@ class SimConfig(Section):
     control_hz: Float = Field(250.0, gt=0, description="[Hz] rate of the drones' controllers")
 
 
-class VehicleConfig(Section):
-    """The quadrotor."""
+Four = tuple[Float, Float, Float, Float]
 
-    preset: str = Field("falcon", description="vehicle of config/vehicles.py")
+
+class VehicleConfig(Section):
+    """The quadrotor: a preset, and what differs from it (None: as the preset)."""
+
+    preset: str = Field("falcon", description="falcon, crazyflie, crazyflie_id, hummingbird or iris")
+    mass: Float | None = Field(None, gt=0, description="[kg] of the whole drone")
+    inertia: tuple[Positive, Positive, Positive] | None = Field(None, description="[kg m²] principal moments")
+    arm: Float | None = Field(None, gt=0, description="[m] from the centre of mass to a rotor axis")
+    rotor_azimuth: Four | None = Field(None, description="[deg] directions of the arms, counter-clockwise from body x")
+    rotor_spin: Four | None = Field(None, description="[-] 1 or -1, sign of each rotor's reaction torque about body z")
+    thrust_coefficient: Float | None = Field(None, gt=0, description="[N s²] b in thrust = b · speed²")
+    torque_ratio: Float | None = Field(None, gt=0, description="[m] reaction torque over thrust")
+    rotor_time_constant_up: Float | None = Field(None, gt=0, description="[s] lag of a rising rotor speed")
+    rotor_time_constant_down: Float | None = Field(None, gt=0, description="[s] lag of a falling rotor speed")
+    rotor_speed_min: Float | None = Field(None, ge=0, description="[rad/s] idle speed")
+    rotor_thrust_max: Float | None = Field(None, gt=0, description="[N] largest thrust of one rotor")
+    drag: tuple[NotNegative, NotNegative, NotNegative] | None = Field(
+        None, description="[kg/s] linear drag along the body axes"
+    )
 
 
 class PayloadConfig(Section):
-    """The load. None stands for the standard rig: 0.35 kg a drone, a box that carries the ring of anchors."""
+    """The load. None stands for the standard rig: 0.35 kg a falcon, a box that carries the ring of anchors."""
 
-    shape: Literal["box", "point"] = Field("box", description="box, or point: a mass without extent")
-    mass: Float | None = Field(None, gt=0, description="[kg] None: 0.35 kg for each drone")
-    size: tuple[Positive, Positive, Positive] | None = Field(None, description="[m] edges of the box; None: fits")
+    shape: Literal["box", "cylinder", "mesh", "point"] = Field(
+        "box", description="box, upright cylinder, mesh, or point: a mass without extent"
+    )
+    mesh: str | None = Field(None, description="path of an .obj or .stl file, a closed surface, for shape mesh")
+    mass: Float | None = Field(None, gt=0, description="[kg] None: 0.35 kg for each falcon, others by spare thrust")
+    size: tuple[Positive, Positive, Positive] | None = Field(
+        None,
+        description="[m] edges of the box, or diameter twice and height of the cylinder; mesh: scaled to; None: fits",
+    )
     inertia: tuple[Positive, Positive, Positive] | None = Field(
-        None, description="[kg m²] principal moments; None: of a uniform box"
+        None, description="[kg m²] principal moments about the centre of mass; None: of a uniform body"
+    )
+    center_of_mass: Vector | None = Field(
+        None, description="[m] of the centre of mass from the geometric centre; None: of a uniform body"
     )
     anchors: tuple[Vector, ...] | None = Field(
-        None, description="[m] attachment of each cable from the centre of mass; None: the standard rig's"
+        None, description="[m] attachment of each cable from the geometric centre; None: the standard rig's"
     )
     drag_area: Float = Field(0.09, ge=0, description="[m²] C_d A of the payload (cube C_d 1.05 on its smaller faces)")
 
@@ -107,7 +134,7 @@ class ControlConfig(Section):
     max_yaw: Float = Field(0.5, gt=0, description="[rad] yaw offset of a full action")
     reference_frequency: Float = Field(6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference")
     reference_speed: Float = Field(1.0, gt=0, description="[m/s] speed limit of the smoothed reference")
-    position_frequency: Float = Field(4.0, gt=0, description="[rad/s] natural frequency of the position loop")
+    position_frequency: Float = Field(4.0, gt=0, description="[rad/s] of the position loop; at most 1/5 of attitude's")
     position_damping: Float = Field(1.0, gt=0, description="[-] its damping ratio")
     attitude_frequency: Float = Field(20.0, gt=0, description="[rad/s] of roll and pitch; at most 0.7/motor lag")
     attitude_damping: Float = Field(0.8, gt=0, description="[-] its damping ratio")

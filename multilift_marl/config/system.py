@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from multilift_marl.config.vehicles import PRESETS, Vehicle
-from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.config.mesh import Mesh, read_mesh
+from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, resolve_vehicle
+from multilift_marl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from multilift_marl.config.schema import Config
+    from multilift_marl.config.schema import Config, PayloadConfig
 
-GRAVITY = 9.81  # [m/s²]
 MIN_THRUST_TO_WEIGHT = 1.18
 MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the vehicle's span
 MAX_ANCHOR_DISTANCE = 0.1  # [m] of an anchor from the payload's surface
 REST_SEPARATION = 0.6  # [m] between falcons at rest, by which the standard rig is sized
-_FALCON_SPAN = PRESETS["falcon"].span
+_FALCON = PRESETS["falcon"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +27,15 @@ class System:
 
     Attributes:
         vehicle: the quadrotor, the same for all drones.
-        payload_shape: "box" or "point".
-        payload_size: edges of the box (3,) [m].
+        payload_shape: "box", "cylinder", "mesh" or "point".
+        payload_mesh: of a "mesh", else None.
+        payload_size: edges of the payload's bounding box (3,) [m].
+        payload_center: its geometric centre from its centre of mass, in its frame (3,) [m].
         payload_mass: nominal mass [kg].
-        payload_inertia: nominal principal moments (3,) [kg m²].
+        payload_inertia: nominal principal moments about the centre of mass (3,) [kg m²].
+        payload_axes: quaternion of the principal axes in its frame (4,).
         payload_drag_area: C_d A [m²].
-        anchors: attachment of each cable in the payload frame (N, 3) [m].
+        anchors: attachment of each cable from the payload's centre of mass, in its frame (N, 3) [m].
         cable_length, cable_stiffness, cable_damping: (N,) [m], [N/m], [N s/m].
         formation_force: pull of each cable on the resting payload, in the payload frame (N, 3) [N].
         slots: resting drones in the payload frame, cables stretched by their tension (N, 3) [m].
@@ -45,9 +48,12 @@ class System:
 
     vehicle: Vehicle
     payload_shape: str
+    payload_mesh: Mesh | None
     payload_size: np.ndarray
+    payload_center: np.ndarray
     payload_mass: float
     payload_inertia: np.ndarray
+    payload_axes: np.ndarray
     payload_drag_area: float
     anchors: np.ndarray
     cable_length: np.ndarray
@@ -79,17 +85,24 @@ def resolve_system(config: Config) -> System:
         ConfigError: it cannot exist or cannot fly; the message says why and what to change.
     """
     n, payload, cable = config.env.num_drones, config.payload, config.cable
-    if config.vehicle.preset not in PRESETS:
-        raise ConfigError(f"unknown vehicle.preset '{config.vehicle.preset}'{nearest(config.vehicle.preset, PRESETS)}")
-    vehicle = PRESETS[config.vehicle.preset]
-    scale = vehicle.span / _FALCON_SPAN
+    vehicle = resolve_vehicle(config.vehicle)
+    scale = vehicle.span / _FALCON.span
     length = _per_drone(_standard_length(config, scale) if cable.length is None else cable.length, n, "cable.length")
-    anchors, size = _rig(config, n, length, scale)
-    mass = payload.mass if payload.mass is not None else 0.35 * n
-    inertia = payload.inertia or mass / 12 * np.array(
-        [size[1] ** 2 + size[2] ** 2, size[0] ** 2 + size[2] ** 2, size[0] ** 2 + size[1] ** 2]
-    )
-    inertia = np.asarray(inertia, float)
+    mesh = _mesh(payload)
+    anchors, size = _rig(config, n, length, scale, mesh)
+    uniform = np.zeros(3) if mesh is None else mesh.center_of_mass - mesh.middle
+    center_of_mass = uniform if payload.center_of_mass is None else np.array(payload.center_of_mass)
+    _check_body(payload.shape, size, center_of_mass, anchors)
+    anchors = anchors - center_of_mass
+    standard = 0.35 * n * (vehicle.spare_lift / _FALCON.spare_lift)
+    mass = payload.mass if payload.mass is not None else standard
+    axes = np.array([1.0, 0.0, 0.0, 0.0])
+    if payload.inertia is not None:
+        inertia = np.array(payload.inertia)
+    elif mesh is not None:
+        inertia, axes = mass * mesh.inertia, mesh.axes
+    else:
+        inertia = _uniform_inertia(payload.shape, mass, size)
     if 2 * inertia.max() > inertia.sum() * (1 + 1e-9):
         raise ConfigError(
             f"payload.inertia {inertia.tolist()} is impossible: no moment may exceed the sum of the other two"
@@ -102,9 +115,12 @@ def resolve_system(config: Config) -> System:
     system = System(
         vehicle=vehicle,
         payload_shape=payload.shape,
+        payload_mesh=mesh,
         payload_size=size,
+        payload_center=-center_of_mass,
         payload_mass=mass,
         payload_inertia=inertia,
+        payload_axes=axes,
         payload_drag_area=payload.drag_area,
         anchors=anchors,
         cable_length=length,
@@ -127,19 +143,31 @@ def resolve_system(config: Config) -> System:
 def _standard_length(config: Config, scale: float) -> float:
     """Return 1 m for a falcon's span, or more where a ring of drones about one point would be too narrow."""
     n, spread = config.env.num_drones, np.sin(np.deg2rad(config.cable.angle))
-    if config.payload.shape == "box" or n == 1 or spread == 0:
+    if config.payload.shape != "point" or n == 1 or spread == 0:
         return scale
     return scale * max(1.0, REST_SEPARATION / (2 * np.sin(np.pi / n) * spread))
 
 
-def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return anchors (n, 3) and the box's edges (3,): the configured or the standard ones of n drones."""
+def _mesh(payload: PayloadConfig) -> Mesh | None:
+    if payload.shape == "mesh" and payload.mesh is not None:
+        return read_mesh(payload.mesh, payload.size)
+    if payload.shape == "mesh":
+        raise ConfigError("payload.shape=mesh needs payload.mesh; give the path of an .obj or .stl file")
+    if payload.mesh is not None:
+        raise ConfigError(f"payload.mesh means nothing to a {payload.shape}; drop it or use payload.shape=mesh")
+    return None
+
+
+def _rig(config: Config, n: int, length: np.ndarray, scale: float, mesh: Mesh | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return anchors (n, 3) from the geometric centre and edges (3,): the configured or the standard ones."""
     payload = config.payload
     reach = length.min() * np.sin(np.deg2rad(config.cable.angle))
     ring = max(0.27 * scale, REST_SEPARATION * scale / (2 * np.sin(np.pi / n)) - reach) if n > 1 else 0.0
     edge = 2 * max(ring, 0.15 * scale)
-    standard = np.array([0.55, 0.45, 0.15]) * scale if n == 4 else np.array([edge, edge, 0.15 * scale])
+    rectangle = n == 4 and payload.shape != "cylinder"
+    standard = np.array([0.55, 0.45, 0.15]) * scale if rectangle else np.array([edge, edge, 0.15 * scale])
     size = standard if payload.size is None else np.asarray(payload.size, float)
+    size = size if mesh is None else mesh.edges
     inset = 0.005 * scale  # the cables are tied to rings this far inside the rim and above the lid
     lid, rim = size[2] / 2 + inset, size[:2] / 2 - inset
     if payload.anchors is not None:
@@ -148,14 +176,14 @@ def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.n
             raise ConfigError(f"payload.anchors lists {len(anchors)} anchors for env.num_drones={n}: give one for each")
     elif payload.shape == "point":
         anchors = np.zeros((n, 3))
-    elif n == 4:
+    elif rectangle:
         corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         anchors = np.concatenate([corners * rim, np.full((4, 1), lid)], axis=1)
     else:
         azimuth, ring = 2 * np.pi * np.arange(n) / n, min(ring, size[:2].min() / 2)
         anchors = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(n, lid)], axis=1)
     if payload.shape == "point":
-        for key in ("size", "inertia"):
+        for key in ("size", "inertia", "center_of_mass"):
             if getattr(payload, key) is not None:
                 raise ConfigError(f"payload.{key} means nothing to a point; drop it or use payload.shape=box")
         size = np.full(3, 0.1 * scale)
@@ -164,6 +192,44 @@ def _rig(config: Config, n: int, length: np.ndarray, scale: float) -> tuple[np.n
                 "payload.anchors of a point payload must all be [0, 0, 0]; use payload.shape=box for others"
             )
     return anchors, size
+
+
+def _uniform_inertia(shape: str, mass: float, size: np.ndarray) -> np.ndarray:
+    """Return the principal moments (3,) of a uniform body [kg m²]."""
+    if shape == "cylinder":
+        across = size[0] ** 2 / 16 + size[2] ** 2 / 12
+        return mass * np.array([across, across, size[0] ** 2 / 8])
+    return mass / 12 * np.array([size[1] ** 2 + size[2] ** 2, size[0] ** 2 + size[2] ** 2, size[0] ** 2 + size[1] ** 2])
+
+
+def _check_body(shape: str, size: np.ndarray, center_of_mass: np.ndarray, anchors: np.ndarray) -> None:
+    """Refuse bodies that cannot be, and anchors (N, 3) off the body, counted from its geometric centre."""
+    if shape == "cylinder" and size[0] != size[1]:
+        raise ConfigError(
+            f"payload.size {size.tolist()} of a cylinder must give its diameter twice, then its height; "
+            "make the first two equal"
+        )
+    if _outside(shape, size, center_of_mass[None])[0] > 1e-9:
+        raise ConfigError(
+            f"payload.center_of_mass {center_of_mass.tolist()} lies outside the payload of size {size.tolist()}; "
+            "count it from the geometric centre"
+        )
+    outside = _outside(shape, size, anchors)
+    if np.any(outside > MAX_ANCHOR_DISTANCE):
+        i = int(np.argmax(outside))
+        raise ConfigError(
+            f"payload.anchors: anchor {i} is out of reach, {outside[i]:.2f} m outside the payload; move it onto the "
+            "payload"
+        )
+
+
+def _outside(shape: str, size: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return how far (N,) points (N, 3), counted from the geometric centre, lie outside the body [m]."""
+    over = np.maximum(np.abs(points) - size / 2, 0)
+    if shape == "cylinder":
+        over[:, 0] = np.maximum(np.hypot(points[:, 0], points[:, 1]) - size[0] / 2, 0)
+        over[:, 1] = 0
+    return np.linalg.norm(over, axis=1)
 
 
 def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bool) -> np.ndarray:
@@ -218,13 +284,6 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
 def _check_possible(system: System, heaviest: float) -> None:
     """Refuse what cannot fly, hovering under a payload `heaviest` times its nominal mass included."""
     n, vehicle = system.num_drones, system.vehicle
-    outside = np.linalg.norm(np.maximum(np.abs(system.anchors) - system.payload_size / 2, 0), axis=1)
-    if np.any(outside > MAX_ANCHOR_DISTANCE):
-        i = int(np.argmax(outside))
-        raise ConfigError(
-            f"payload.anchors: anchor {i} is out of reach, {outside[i]:.2f} m outside the payload; move it onto the "
-            "payload"
-        )
     thrust = 4 * vehicle.rotor_thrust_max
     if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
         raise ConfigError(

@@ -1,10 +1,19 @@
-"""Quadrotor presets: the numbers of real vehicles, each with its source."""
+"""Quadrotors: presets with the numbers of real vehicles, each with its source, and one's own by configuration."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+from multilift_marl.errors import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from multilift_marl.config.schema import VehicleConfig
+
+
+GRAVITY = 9.81  # [m/s²]
 
 
 @dataclass(frozen=True)
@@ -20,7 +29,8 @@ class Vehicle:
         rotor_spin: sign of each rotor's reaction torque about body z.
         thrust_coefficient: b in f = b ω² [N s²] (report eq 5).
         torque_ratio: κ = d/b, reaction torque per newton of thrust [m] (report eq 7).
-        rotor_time_constant: first-order lag of rotor speed [s].
+        rotor_time_constant_up: first-order lag of rotor speed while it rises [s].
+        rotor_time_constant_down: the same while it falls [s].
         rotor_speed_min: idle speed [rad/s].
         rotor_thrust_max: largest thrust of one rotor [N].
         drag: linear drag along the body axes [kg/s].
@@ -32,7 +42,8 @@ class Vehicle:
     arm: float
     thrust_coefficient: float
     torque_ratio: float
-    rotor_time_constant: float
+    rotor_time_constant_up: float
+    rotor_time_constant_down: float
     rotor_speed_min: float
     rotor_thrust_max: float
     drag: tuple[float, float, float]
@@ -46,9 +57,19 @@ class Vehicle:
         return self.arm * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
 
     @property
+    def rotor_time_constant(self) -> float:
+        """The slower of the two lags [s], by which controllers are tuned."""
+        return max(self.rotor_time_constant_up, self.rotor_time_constant_down)
+
+    @property
     def span(self) -> float:
         """Diagonal distance between rotor axes [m]."""
         return 2 * self.arm
+
+    @property
+    def spare_lift(self) -> float:
+        """Largest thrust less the drone's own weight [N]."""
+        return 4 * self.rotor_thrust_max - self.mass * GRAVITY
 
     @property
     def rotor_speed_max(self) -> float:
@@ -60,17 +81,156 @@ class Vehicle:
 # motor_model.py: 0.6 kg body and four rotors of 4.2 g, 20 N in all (5 N a rotor; its speed limit of 2800 rad/s lies
 # beyond that). Drag per unit mass: Faessler et al., RA-L 3(2), 2018, table of identified coefficients.
 _FALCON_MASS = 0.6 + 4 * 0.0042
+_FALCON = Vehicle(
+    name="falcon",
+    mass=_FALCON_MASS,
+    inertia=(1.64e-3, 1.84e-3, 3.0e-3),
+    arm=0.106,
+    thrust_coefficient=1.562522e-6,
+    torque_ratio=3.4375e-8 / 1.562522e-6,
+    rotor_time_constant_up=0.033,
+    rotor_time_constant_down=0.033,
+    rotor_speed_min=150.0,
+    rotor_thrust_max=5.0,
+    drag=(0.54 * _FALCON_MASS, 0.39 * _FALCON_MASS, 0.0),
+)
+
+# Mass, inertia, arm, torque ratio, no drag: IMRCLab/col-trans, sim/config/initialize.yaml. Its inertia is that of
+# Förster, "System identification of the Crazyflie 2.0", ETH Zurich 2015, which is also where the thrust coefficient
+# comes from (as quoted by gsilano/CrazyS, rotors_description/urdf/crazyflie2.xacro). Thrust limit: CrazyMARL (arXiv
+# 2509.14126). Motor lag: viktorlorentz/crazyMARL, crazymarl/configs/multi_quad_config.py, motor_tau 0.15 with "time
+# constant is T/4" beside it. Idle speed: stated by none of them, assumed zero.
+_CRAZYFLIE = Vehicle(
+    name="crazyflie",
+    mass=0.034,
+    inertia=(16.571710e-6, 16.655602e-6, 29.261652e-6),
+    arm=0.046,
+    thrust_coefficient=1.28192e-8,
+    torque_ratio=0.006,
+    rotor_time_constant_up=0.15 / 4,
+    rotor_time_constant_down=0.15 / 4,
+    rotor_speed_min=0.0,
+    rotor_thrust_max=0.14,
+    drag=(0.0, 0.0, 0.0),
+)
+
+# Identified from flights of a Crazyflie 2.x with L250 propellers: learnsyslab/drone-models,
+# drone_models/data/params.toml, section cf2x_L250 (read in the copy Synetic-Labs/drone-models): mass, J, L (per axis),
+# thrust2torque, rotor_dyn_coef_simple 6.8867 s⁻¹ for either direction, thrust_min, thrust_max, drag_matrix. Its thrust
+# 2.45829e-10 r² - 5.3822e-7 r newtons at r rev/min has a linear part that b ω² has not: b is chosen such that both
+# agree at hover, 1986 rad/s.
+_CRAZYFLIE_ID_THRUST = 1.982941e-8
+_CRAZYFLIE_ID = Vehicle(
+    name="crazyflie_id",
+    mass=0.0319,
+    inertia=(16.8e-6, 16.8e-6, 29.8e-6),
+    arm=0.03253 * 2**0.5,
+    thrust_coefficient=_CRAZYFLIE_ID_THRUST,
+    torque_ratio=0.007350862856566459,
+    rotor_time_constant_up=1 / 6.886705423469015,
+    rotor_time_constant_down=1 / 6.886705423469015,
+    rotor_speed_min=(0.012817578393224994 / _CRAZYFLIE_ID_THRUST) ** 0.5,
+    rotor_thrust_max=0.12,
+    drag=(0.01471782, 0.01471782, 0.01277641),
+)
+
+
+def _rotor_drag(mass: float, thrust_coefficient: float, coefficient: float) -> tuple[float, float, float]:
+    """Return RotorS' drag of four rotors, coefficient · ω · v across the rotor's axis, at hover speed [kg/s]."""
+    hover = np.sqrt(mass * GRAVITY / 4 / thrust_coefficient)
+    return (float(4 * hover * coefficient), float(4 * hover * coefficient), 0.0)
+
+
+# ethz-asl/rotors_simulator, rotors_description/urdf/hummingbird.xacro: body and rotors, + layout, the front rotor turns
+# clockwise (its reaction torque is counter-clockwise). Inertia as its controller takes it for all of 0.716 kg. No idle
+# speed. Drag of the rotors linear in their speed, taken at hover; the rolling moment (1e-6) is not modelled.
+_HUMMINGBIRD_MASS = 0.68 + 4 * 0.009
+_HUMMINGBIRD = Vehicle(
+    name="hummingbird",
+    mass=_HUMMINGBIRD_MASS,
+    inertia=(0.007, 0.007, 0.012),
+    arm=0.17,
+    thrust_coefficient=8.54858e-6,
+    torque_ratio=0.016,
+    rotor_time_constant_up=0.0125,
+    rotor_time_constant_down=0.025,
+    rotor_speed_min=0.0,
+    rotor_thrust_max=8.54858e-6 * 838.0**2,
+    drag=_rotor_drag(_HUMMINGBIRD_MASS, 8.54858e-6, 8.06428e-5),
+    rotor_azimuth=(0.0, float(np.pi / 2), float(np.pi), float(3 * np.pi / 2)),
+)
+
+# PX4/PX4-SITL_gazebo-classic, models/iris/iris.sdf.jinja: body 1.5 kg, rotors 5 g each, IMU 15 g, GPS 10 g. Its front
+# rotors stand at (0.13, ± 0.22) m, its back ones at (-0.13, ± 0.20) m; symmetric here, at 0.21 m, so that equal thrusts
+# balance. Pegasus' iris has the same b and speed limit (PegasusSimulator, .../thrusters/quadratic_thrust_curve.py), no
+# lag and another torque ratio. No idle speed. Drag as above.
+_IRIS_MASS = 1.5 + 4 * 0.005 + 0.015 + 0.01
+_IRIS_FRONT = float(np.arctan2(0.21, 0.13))
+_IRIS = Vehicle(
+    name="iris",
+    mass=_IRIS_MASS,
+    inertia=(0.029125, 0.029125, 0.055225),
+    arm=float(np.hypot(0.13, 0.21)),
+    thrust_coefficient=5.84e-6,
+    torque_ratio=0.06,
+    rotor_time_constant_up=0.0125,
+    rotor_time_constant_down=0.025,
+    rotor_speed_min=0.0,
+    rotor_thrust_max=5.84e-6 * 1100.0**2,
+    drag=_rotor_drag(_IRIS_MASS, 5.84e-6, 1.75e-4),
+    rotor_azimuth=(_IRIS_FRONT, float(np.pi) - _IRIS_FRONT, float(np.pi) + _IRIS_FRONT, float(2 * np.pi) - _IRIS_FRONT),
+)
+
 PRESETS: dict[str, Vehicle] = {
-    "falcon": Vehicle(
-        name="falcon",
-        mass=_FALCON_MASS,
-        inertia=(1.64e-3, 1.84e-3, 3.0e-3),
-        arm=0.106,
-        thrust_coefficient=1.562522e-6,
-        torque_ratio=3.4375e-8 / 1.562522e-6,
-        rotor_time_constant=0.033,
-        rotor_speed_min=150.0,
-        rotor_thrust_max=5.0,
-        drag=(0.54 * _FALCON_MASS, 0.39 * _FALCON_MASS, 0.0),
-    ),
+    vehicle.name: vehicle for vehicle in (_FALCON, _CRAZYFLIE, _CRAZYFLIE_ID, _HUMMINGBIRD, _IRIS)
 }
+
+
+def resolve_vehicle(config: VehicleConfig) -> Vehicle:
+    """Return the preset with the configured fields in place of its own.
+
+    Raises:
+        ConfigError: an unknown preset, or a vehicle that cannot be or cannot hover.
+    """
+    if config.preset not in PRESETS:
+        raise ConfigError(f"unknown vehicle.preset '{config.preset}'{nearest(config.preset, PRESETS)}")
+    changes = config.model_dump(exclude={"preset"}, exclude_none=True)
+    if "rotor_azimuth" in changes:
+        changes["rotor_azimuth"] = tuple(float(angle) for angle in np.deg2rad(changes["rotor_azimuth"]))
+    vehicle = replace(PRESETS[config.preset], **changes)
+    _check_vehicle(vehicle)
+    return vehicle
+
+
+def _check_vehicle(vehicle: Vehicle) -> None:
+    inertia, spin, position = np.array(vehicle.inertia), np.array(vehicle.rotor_spin), vehicle.rotor_positions
+    if 2 * inertia.max() > inertia.sum() * (1 + 1e-9):
+        raise ConfigError(
+            f"vehicle.inertia {inertia.tolist()} is impossible: no moment may exceed the sum of the other two"
+        )
+    if vehicle.rotor_speed_min >= vehicle.rotor_speed_max:
+        raise ConfigError(
+            f"vehicle.rotor_speed_min={vehicle.rotor_speed_min:g} rad/s must be less than the "
+            f"{vehicle.rotor_speed_max:g} rad/s that vehicle.rotor_thrust_max={vehicle.rotor_thrust_max:g} N takes"
+        )
+    if not np.all(np.abs(spin) == 1) or spin.sum() != 0:
+        raise ConfigError(
+            f"vehicle.rotor_spin {spin.tolist()} must hold 1 for two rotors and -1 for the other two, or yaw is out of "
+            "control"
+        )
+    if np.abs(position.sum(axis=0)).max() > 1e-6 * vehicle.arm:
+        raise ConfigError(
+            f"vehicle.rotor_azimuth {np.rad2deg(vehicle.rotor_azimuth).round(3).tolist()} does not balance: equal "
+            "thrusts must give no torque, so place the rotors in opposite pairs"
+        )
+    unit = np.stack([np.ones(4), position[:, 0] / vehicle.arm, position[:, 1] / vehicle.arm, spin])
+    if np.linalg.svd(unit, compute_uv=False).min() < 0.05:
+        raise ConfigError(
+            f"vehicle.rotor_azimuth {np.rad2deg(vehicle.rotor_azimuth).round(3).tolist()} with vehicle.rotor_spin "
+            f"{spin.tolist()} cannot turn the drone about each axis: let opposite rotors turn alike"
+        )
+    if vehicle.spare_lift <= 0:
+        raise ConfigError(
+            f"a {vehicle.name} of vehicle.mass={vehicle.mass:g} kg cannot lift itself with "
+            f"{4 * vehicle.rotor_thrust_max:g} N; raise vehicle.rotor_thrust_max"
+        )

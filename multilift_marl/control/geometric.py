@@ -30,6 +30,8 @@ from multilift_marl.math3d import (
     vec,
 )
 
+POSITION_RATIO = 5.0  # attitude's natural frequency over position's, at least
+
 
 class Gains(NamedTuple):
     """Nominal parameters and gains; the plant may differ."""
@@ -56,15 +58,19 @@ class Gains(NamedTuple):
 
 
 def make_gains(control: ControlConfig, system: System) -> Gains:
-    """Return gains for natural frequencies and damping ratios, attitude as fast as the motors allow (0.7/τ)."""
+    """Return gains for natural frequencies and damping ratios.
+
+    Attitude is no faster than the motors allow (0.7/τ of the slower lag), position no faster than attitude allows.
+    """
     vehicle = system.vehicle
     tilt = min(control.attitude_frequency, 0.7 / vehicle.rotor_time_constant)
+    position = min(control.position_frequency, tilt / POSITION_RATIO)
     frequency = np.array([tilt, tilt, min(control.yaw_frequency, tilt)])
     return Gains(
         mass=vehicle.mass,
         inertia=tuple(float(moment) for moment in vehicle.inertia),
-        k_p=control.position_frequency**2,
-        k_v=2 * control.position_damping * control.position_frequency,
+        k_p=position**2,
+        k_v=2 * control.position_damping * position,
         k_R=tuple(frequency**2),
         k_w=tuple(2 * control.attitude_damping * frequency),
         allocation=np.ascontiguousarray(np.linalg.inv(allocation_matrix(vehicle))),

@@ -54,12 +54,10 @@ class Constants(NamedTuple):
     torque_ratio: float
     speed_min: float
     speed_max: float
-    decay: float
-    """exp(-timestep/τ) of the rotor speed."""
-    mean_first: float
-    """Mean of exp(-t/τ) over a step."""
-    mean_second: float
-    """Mean of exp(-2t/τ) over a step."""
+    rising: tuple[float, float, float]
+    """Of a rotor whose speed rises: exp(-timestep/τ), and the means of exp(-t/τ) and exp(-2t/τ) over a step."""
+    falling: tuple[float, float, float]
+    """The same of one whose speed falls."""
     drag: np.ndarray
     """(3,) linear drag of a drone along its axes [kg/s]."""
     anchors: np.ndarray
@@ -76,7 +74,7 @@ class Constants(NamedTuple):
 
 def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: int) -> Constants:
     """Return the constants of `system`."""
-    vehicle, h = system.vehicle, system.timestep / system.vehicle.rotor_time_constant
+    vehicle = system.vehicle
     return Constants(
         timestep=system.timestep,
         payload_drag=0.5 * AIR_DENSITY * system.payload_drag_area,
@@ -86,9 +84,8 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         torque_ratio=vehicle.torque_ratio,
         speed_min=vehicle.rotor_speed_min,
         speed_max=vehicle.rotor_speed_max,
-        decay=exp(-h),
-        mean_first=(1 - exp(-h)) / h,
-        mean_second=(1 - exp(-2 * h)) / (2 * h),
+        rising=_lag(system.timestep / vehicle.rotor_time_constant_up),
+        falling=_lag(system.timestep / vehicle.rotor_time_constant_down),
         drag=np.asarray(vehicle.drag, float),
         anchors=np.ascontiguousarray(system.anchors),
         cable_length=system.cable_length,
@@ -101,13 +98,18 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
     )
 
 
+def _lag(h: float) -> tuple[float, float, float]:
+    return exp(-h), (1 - exp(-h)) / h, (1 - exp(-2 * h)) / (2 * h)
+
+
 @kernel
 def apply_loads(rows, lo, hi, thrust, state, plant, record, c):
     """Advance the rotors by one physics step and write the loads of that step into `batch.state`.
 
-    The rotor speed follows its command with a first-order lag. The thrust applied is the exact mean of b ω² over the
-    step, so the impulse is exact. Reaction torque is κ f (report eqs 5-8), drag of a drone is linear in its velocity
-    through the air along its body axes (Faessler 2018), drag of the payload quadratic.
+    The rotor speed follows its command with a first-order lag, one for rising and one for falling. The thrust applied
+    is the exact mean of b ω² over the step, so the impulse is exact. Reaction torque is κ f (report eqs 5-8), drag of
+    a drone is linear in its velocity through the air along its body axes (Faessler 2018), drag of the payload
+    quadratic.
 
     Args:
         rows: `batch.state` of environments lo to hi.
@@ -126,8 +128,9 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c):
                 target = sqrt(max(thrust[e, n, k], 0.0) / c.thrust_coefficient)
                 target = clip(target, c.speed_min, c.speed_max)
                 gap = before - target
-                after = target + gap * c.decay
-                square = target * target + 2.0 * target * gap * c.mean_first + gap * gap * c.mean_second
+                decay, mean_first, mean_second = c.falling if gap > 0.0 else c.rising
+                after = target + gap * decay
+                square = target * target + 2.0 * target * gap * mean_first + gap * gap * mean_second
                 f = c.thrust_coefficient * square
                 state.rotor_speed[e, n, k] = after
                 total += f

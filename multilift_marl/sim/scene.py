@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from itertools import combinations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
+from multilift_marl.config.mesh import add_mesh
 from multilift_marl.config.system import GRAVITY, System
 from multilift_marl.config.vehicles import Vehicle
 from multilift_marl.sim.cables import IMPEDANCE, limit_solref
@@ -121,7 +122,7 @@ def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
     point = system.payload_shape == "point"  # its slide joints count from the body's place, so that must be the origin
     body = spec.worldbody.add_body(name="payload", pos=[0, 0, 0 if point else 1.5])
     body.mass, body.explicitinertial = system.payload_mass, True
-    body.inertia, body.ipos = system.payload_inertia, [0, 0, 0]
+    body.inertia, body.ipos, body.iquat = system.payload_inertia, [0, 0, 0], system.payload_axes
     colour = [0.86, 0.66, 0.35, 1]
     if point:
         for name, axis in zip("xyz", np.eye(3), strict=True):
@@ -129,9 +130,24 @@ def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
         body.add_geom(name="payload", type=_GEOM.mjGEOM_SPHERE, size=[system.payload_size[0] / 2, 0, 0], rgba=colour)
     else:
         body.add_freejoint(name="payload")
-        body.add_geom(name="payload", type=_GEOM.mjGEOM_BOX, size=system.payload_size / 2, rgba=colour)
+        if system.payload_mesh is not None:
+            add_mesh(spec, "payload", system.payload_mesh.path, system.payload_mesh.scale)
+        body.add_geom(name="payload", **_payload_form(system), rgba=colour)
     for i, anchor in enumerate(system.anchors):
         body.add_site(name=f"payload/anchor_{i}", pos=anchor, size=[0.012, 0, 0], rgba=[0.2, 0.2, 0.2, 1])
+
+
+def _payload_form(system: System, margin: float = 0.0) -> dict[str, Any]:
+    """Return type, size and place of the geom of a payload with extent, `margin` [m] larger on every side.
+
+    A mesh has no margin; it collides as its convex hull.
+    """
+    half, pos, mesh = system.payload_size / 2 + margin, system.payload_center, system.payload_mesh
+    if mesh is not None:
+        return {"type": _GEOM.mjGEOM_MESH, "meshname": "payload", "pos": pos - mesh.middle}
+    if system.payload_shape == "cylinder":
+        return {"type": _GEOM.mjGEOM_CYLINDER, "size": [half[0], half[2], 0], "pos": pos}
+    return {"type": _GEOM.mjGEOM_BOX, "size": half, "pos": pos}
 
 
 def _add_drone(spec: mujoco.MjSpec, system: System, i: int, visuals: bool) -> None:
@@ -189,13 +205,25 @@ def _add_target(spec: mujoco.MjSpec, system: System) -> None:
     body = spec.worldbody.add_body(name="target", mocap=True, pos=[0, 0, -10])
     plain = {"contype": 0, "conaffinity": 0, "group": _VISUAL_GROUP}
     faint, firm = [0.0, 0.75, 0.35, 0.18], [0.0, 0.60, 0.25, 1]
-    half = system.payload_size / 2 + 0.04 * system.payload_size.min()
+    margin, center = 0.04 * system.payload_size.min(), system.payload_center
+    half = system.payload_size / 2 + margin
     if system.payload_shape == "point":
         body.add_geom(type=_GEOM.mjGEOM_SPHERE, size=[half[0], 0, 0], rgba=[*firm[:3], 0.5], **plain)
         return
-    body.add_geom(type=_GEOM.mjGEOM_BOX, size=half, rgba=faint, **plain)
+    body.add_geom(**_payload_form(system, margin), rgba=faint, **plain)
     thick = [0.03 * system.payload_size.min(), 0, 0]
+    for a, b in _rims(half) if system.payload_shape == "cylinder" else _edges(half):
+        body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[*(center + a), *(center + b)], size=thick, rgba=firm, **plain)
+
+
+def _edges(half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the ends of the twelve edges of a box."""
     corners = half * np.array(list(product((-1, 1), repeat=3)))
-    for a, b in combinations(corners, 2):
-        if np.count_nonzero(a != b) == 1:
-            body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[*a, *b], size=thick, rgba=firm, **plain)
+    return [(a, b) for a, b in combinations(corners, 2) if np.count_nonzero(a != b) == 1]
+
+
+def _rims(half: np.ndarray, count: int = 24) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the ends of the sides of two polygons, the rims of an upright cylinder."""
+    angle = np.linspace(0, 2 * np.pi, count + 1)
+    rims = [half * np.stack([np.cos(angle), np.sin(angle), np.full(count + 1, side)], axis=1) for side in (-1.0, 1.0)]
+    return [(a, b) for rim in rims for a, b in zip(rim[:-1], rim[1:], strict=True)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, radians
+from math import cos, radians, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +43,10 @@ class Limits(NamedTuple):
     """(N, 3) [m]."""
     payload_half: np.ndarray
     """(3,) half edges of the payload [m]."""
+    payload_center: tuple[float, float, float]
+    """Its geometric centre from its centre of mass, in its frame [m]."""
+    payload_round: bool
+    """Whether it is a cylinder."""
     drone_half: np.ndarray
     """(3,) half edges of a drone [m]."""
 
@@ -61,6 +65,8 @@ def make_limits(system: System) -> Limits:
         cables=cables,
         anchors=np.ascontiguousarray(anchors),
         payload_half=system.payload_size / 2,
+        payload_center=tuple(float(x) for x in system.payload_center),
+        payload_round=system.payload_shape == "cylinder",
         drone_half=drone_half_size(system.vehicle),
     )
 
@@ -79,8 +85,9 @@ def _cause(e, state, errors, limits, min_separation):
     count = state.drone_position.shape[1]
     if not errors.distance[e] <= MAX_DISTANCE:
         return _RANGE
-    half = limits.payload_half
-    if payload[2] - _extent(attitude, half) < _TOUCH:
+    half, center = limits.payload_half, add(payload, mul(attitude, limits.payload_center))
+    below = _round_extent(attitude, half) if limits.payload_round else _extent(attitude, half)
+    if center[2] - below < _TOUCH:
         return _GROUND
     for n in range(count):
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
@@ -104,6 +111,12 @@ def _cause(e, state, errors, limits, min_separation):
             if segment_distance(anchor, drone, foot, other) < limits.cables[n, m]:
                 return _CROSSING
     return 0
+
+
+@kernel
+def _round_extent(attitude, half):
+    """Return how far an upright cylinder reaches below its centre [m]."""
+    return sqrt(max(1.0 - attitude[8] * attitude[8], 0.0)) * half[0] + abs(attitude[8]) * half[2]
 
 
 @kernel
