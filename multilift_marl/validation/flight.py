@@ -14,17 +14,22 @@ from multilift_marl.validation.experiment import Curve, Plot, Result, Row
 RADIUS = 5.0  # [m]
 _HOVER, _RAMP = 2.0, 6.0  # [s] at rest, and from rest to the full angular velocity
 _DIFFERENCE = 0.01  # [s] between samples of the path that are differentiated
-_LIMITS = {0.2: 0.005, 0.4: 0.015}  # [m] mean position error of the drones
+_LIMITS = {  # mean position error of the drones [m] by rig and angular velocity [rad/s]
+    ("report4", 0.2): 0.005,
+    ("report4", 0.4): 0.010,
+    ("falcon4", 0.2): 0.005,
+    ("falcon4", 0.4): 0.015,
+}
 
 
 def circle(fast: bool) -> Result:
-    """`falcon4` on the circle at 0.2 and 0.4 rad/s, 1 and 2 m/s, beside plain feed-forward of the load's weight."""
+    """Two rigs on the circle at 0.2 and 0.4 rad/s, 1 and 2 m/s, beside plain feed-forward of the load's weight."""
     result = Result()
-    above = Plot("circle_path", "payload and drones on the circle, 0.4 rad/s", "x [m]", "y [m]", equal=True)
+    above = Plot("circle_path", "falcon4 on the circle, 0.4 rad/s", "x [m]", "y [m]", equal=True)
     plot = Plot("circle_error", "mean position error of the drones", "time [s]", "error [mm]")
-    for rate, limit in _LIMITS.items():
-        flight = fly_circle(rate, laps=0.5 if fast else 1.0)
-        name = f"circle, {rate:g} rad/s"
+    for (rig, rate), limit in _LIMITS.items():
+        flight = fly_circle(rig, rate, laps=0.5 if fast else 1.0)
+        name = f"circle, {rig}, {rate:g} rad/s"
         steady = flight["time"] > _HOVER + _RAMP + 2.0
         error = flight["drone_error"][steady]
         result.rows.append(Row(name, "mean position error of the drones [m]", 0.0, error.mean(), error.mean(), limit))
@@ -32,26 +37,27 @@ def circle(fast: bool) -> Result:
         result.rows.append(Row(name, "mean yaw error [deg]", 0.0, yaw.mean(), yaw.mean(), 0.1))
         result.rows.append(Row(name, "largest yaw error [deg]", 0.0, yaw.max(), yaw.max(), 0.3))
         payload = flight["payload_error"][steady].mean()
-        plain = fly_circle(rate, laps=0.5 if fast else 1.0, plain=True)["payload_error"][steady].mean()
+        plain = fly_circle(rig, rate, laps=0.5 if fast else 1.0, plain=True)["payload_error"][steady].mean()
         quantity = "mean payload error [m]; limit: half of that with the weight alone fed forward"
         result.rows.append(Row(name, quantity, 0.0, payload, payload, 0.5 * plain))
         whole = np.abs(flight["drone_error"]).max()
         result.rows.append(Row(name, "largest position error, all phases [m]", 0.0, whole, whole, 0.1))
-        plot.curves.append(Curve(f"{rate:g} rad/s", flight["time"], 1e3 * flight["drone_error"].mean(axis=1)))
+        plot.curves.append(Curve(f"{rig}, {rate:g} rad/s", flight["time"], 1e3 * flight["drone_error"].mean(axis=1)))
     for label, path in (("payload", flight["payload"]), ("drone 0", flight["drones"][:, 0])):
         above.curves.append(Curve(label, path[:, 0], path[:, 1]))
     result.plots += [plot, above]
     return result
 
 
-def fly_circle(rate: float, laps: float, plain: bool = False) -> dict[str, np.ndarray]:
-    """Hover, gather speed and fly `laps` of the circle with a team of `falcon4`.
+def fly_circle(rig: str, rate: float, laps: float, plain: bool = False) -> dict[str, np.ndarray]:
+    """Hover, gather speed and fly `laps` of the circle with the team of a rig.
 
     The load is to follow the circle, level. What its cables must pull at every moment follows from its acceleration,
     where the drones must be follows from the directions of these pulls (the load is flat in the sense of Fliess;
     Sreenath and Kumar, RSS 2013), and both are fed forward.
 
     Args:
+        rig: name of a configuration in configs/rigs.
         rate: angular velocity [rad/s].
         laps: at the full rate.
         plain: feed the load's weight alone forward, with the formation as it is at rest.
@@ -60,7 +66,7 @@ def fly_circle(rate: float, laps: float, plain: bool = False) -> dict[str, np.nd
         Over T control steps: time (T,) [s], payload (T, 3), drones (T, N, 3) [m], drone_error (T, N) [m] from the
         references, payload_error (T,) [m] from the circle, yaw_error (T, N) [deg].
     """
-    config = load_config("hover", {"control.drag_feedforward": True})
+    config = load_config(f"rigs/{rig}", {"control.drag_feedforward": True})
     system, dt = config.system, 1 / config.sim.control_hz
     world = World(system, 1, 1)
     gains = make_gains(config.control, system)._replace(load_share=np.zeros(system.num_drones))
