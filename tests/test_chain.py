@@ -218,6 +218,18 @@ def test_stiff_chains_are_stable_and_cause_no_warnings(timestep):
     assert world.state.cable_tension.max() < 20
 
 
+@pytest.mark.parametrize("direction", [[1, 0, 0], [0, 1, 0], [0, -1, 0.001], [0, 0, -1], [0, 0, 1]], ids=str)
+def test_a_cable_may_point_anywhere(direction):
+    world = make_world(1, drag=False, payload__shape="point", sim__timestep=1e-3)
+    world.state.payload_position[:] = [0, 0, 20]
+    world.state.drone_position[:] = world.state.payload_position + 1.00001 * np.array(direction)
+    world.state.drone_velocity[:] = world.state.payload_velocity[:] = [0.5, 0.2, -0.3]
+    load(world)
+    world.step(hover_thrust(world), 100)
+    assert calm(world)
+    assert chords(world)[0, 0] < 1.001
+
+
 @pytest.mark.parametrize("density", [1e-4, 1e-3, 0.1])
 @pytest.mark.parametrize("segments", [2, 10, 30])
 def test_ropes_of_any_weight_stay_calm(density, segments):

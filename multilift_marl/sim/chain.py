@@ -1,14 +1,14 @@
 """Chains: cables of masses, springs and dampers (report eqs 14-16) in MuJoCo's generalised coordinates.
 
 Payload, links and drones are one tree without loops: the payload is the root, every cable a branch of n links, and the
-drone the leaf on a ball joint. A link is two hinges and a slide along it, whose spring nk and damper nc are the
+drone the leaf on a ball joint. A link is a ball joint and a slide along it, whose spring nk and damper nc are the
 joint's, so that the integrator treats them implicitly. Its mass, density times length, is at its upper end, the last
 one's at the drone. docs/cables.md compares this with other forms.
 """
 
 from __future__ import annotations
 
-from math import asin, atan2, cos, isfinite, sin
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from multilift_marl.math3d import (
     column,
     cross,
     dot,
+    from_columns,
     mat,
     mat_to_quat,
     matmul,
@@ -33,6 +34,7 @@ from multilift_marl.math3d import (
     sub,
     tmul,
     transpose,
+    unit,
     vec,
 )
 from multilift_marl.sim.dynamics import (
@@ -56,7 +58,7 @@ class Chain(NamedTuple):
 
     segments: int
     frames: np.ndarray
-    """(N, 3, 3) frame of the first link in the payload's, hinges at zero."""
+    """(N, 3, 3) frame of the first link in the payload's, in the resting formation."""
     length: np.ndarray
     """(N,) of a segment [m]; likewise the next ones."""
     stiffness: np.ndarray
@@ -113,8 +115,8 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
 @kernel
 def _tension(n, line, c, chain):
     """Return the tension of cable n in its segment next to the drone [N]; 0 where that is pushed together."""
-    at = c.qpos + c.payload_nq + n * (3 * chain.segments + 4) + 3 * chain.segments - 1
-    v = c.qvel + c.payload_nv + n * (3 * chain.segments + 3) + 3 * chain.segments - 1
+    at = c.qpos + c.payload_nq + n * (5 * chain.segments + 4) + 5 * chain.segments - 1
+    v = c.qvel + c.payload_nv + n * (4 * chain.segments + 3) + 4 * chain.segments - 1
     return max(0.0, chain.stiffness[n] * line[at] + chain.damping[n] * line[v])
 
 
@@ -134,7 +136,7 @@ def _sound(line, told, c, chain):
         for j in range(7):
             if not isfinite(told[_SENSORS * n + j]):
                 return False
-    for j in range(c.payload_nq + count * (3 * chain.segments + 4)):
+    for j in range(c.payload_nq + count * (5 * chain.segments + 4)):
         if not isfinite(line[c.qpos + j]):
             return False
     return True
@@ -169,10 +171,10 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
             for j in range(n):
                 direction, stretch = row(links, j), links[j, 3]
                 frame, rate = _put_link(
-                    line, at + 3 * j, v + 3 * j, frame, rate, direction, chain.length[i], stretch,
+                    line, at + 5 * j, v + 4 * j, frame, rate, direction, chain.length[i], stretch,
                     scale(1.0 / n, opening),
                 )  # fmt: skip
-            at, v = at + 3 * n, v + 3 * n
+            at, v = at + 5 * n, v + 4 * n
             drone = mat(state.drone_rotation, e, i)
             q = mat_to_quat(matmul(transpose(frame), drone))
             line[at], line[at + 1], line[at + 2], line[at + 3] = q
@@ -183,7 +185,7 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
 
 @kernel
 def _put_link(line, at, v, frame, rate, direction, length, stretch, opening):
-    """Write angles, stretch and their rates of one link; return its frame and angular velocity, world frame.
+    """Write turn, stretch and their rates of one link; return its frame and angular velocity, world frame.
 
     Args:
         line: row of `batch.state`, written.
@@ -193,14 +195,31 @@ def _put_link(line, at, v, frame, rate, direction, length, stretch, opening):
         length, stretch: [m].
         opening: velocity of its upper end relative to its lower one [m/s].
     """
-    local = tmul(frame, direction)
-    b = asin(min(max(local[0], -1.0), 1.0))
-    a = atan2(-local[1], local[2])
-    ca, sa, cb, sb = cos(a), sin(a), cos(b), sin(b)
-    turned = matmul(frame, (cb, 0.0, sb, sa * sb, ca, -sa * cb, -ca * sb, sa, ca * cb))  # hinge x, then y
-    missing = sub(scale(1.0 / (length + stretch), cross(direction, opening)), rate)
-    guard = cb if cb > 1e-3 else 1e-3
-    rate_a, rate_b = dot(missing, column(turned, 0)) / guard, dot(missing, column(turned, 1))
-    line[at], line[at + 1], line[at + 2] = a, b, stretch
-    line[v], line[v + 1], line[v + 2] = rate_a, rate_b, dot(direction, opening)
-    return turned, add(rate, add(scale(rate_a, column(frame, 0)), scale(rate_b, column(turned, 1))))
+    turned = matmul(_shortest_turn(column(frame, 2), direction), frame)
+    across = scale(1.0 / (length + stretch), cross(direction, opening))
+    turning = add(across, scale(dot(rate, direction), direction))  # the link does not spin on the one below
+    q = mat_to_quat(matmul(transpose(frame), turned))
+    line[at], line[at + 1], line[at + 2], line[at + 3] = q
+    line[at + 4] = stretch
+    put(line[v : v + 3], tmul(turned, sub(turning, rate)))
+    line[v + 3] = dot(direction, opening)
+    return turned, turning
+
+
+@kernel
+def _shortest_turn(start, end):
+    """Return the rotation about start x end that takes one unit vector to the other, 1 + [s]x + [s]x²/(1 + c)."""
+    if 1.0 + dot(start, end) < 1e-9:  # a half turn about any axis across
+        x, y, z = unit(cross(start, (0.0, 1.0, 0.0) if abs(start[0]) > 0.5 else (1.0, 0.0, 0.0)))
+        return from_columns(
+            (2.0 * x * x - 1.0, 2.0 * x * y, 2.0 * x * z),
+            (2.0 * x * y, 2.0 * y * y - 1.0, 2.0 * y * z),
+            (2.0 * x * z, 2.0 * y * z, 2.0 * z * z - 1.0),
+        )
+    x, y, z = cross(start, end)
+    k = 1.0 / (1.0 + dot(start, end))
+    return (
+        1.0 - k * (y * y + z * z), k * x * y - z, k * x * z + y,
+        k * x * y + z, 1.0 - k * (x * x + z * z), k * y * z - x,
+        k * x * z - y, k * y * z + x, 1.0 - k * (x * x + y * y),
+    )  # fmt: skip

@@ -25,7 +25,7 @@ class Layout(NamedTuple):
     """Where the bodies stand in MuJoCo's arrays: the payload first, then the drones, each a free joint.
 
     A point payload has three slide joints in place of its free joint. With chains, each drone in turn is the leaf of a
-    branch of the payload: for each link two hinges and a slide, then the drone's ball joint.
+    branch of the payload: for each link a ball joint and a slide, then the drone's ball joint.
     """
 
     payload_nq: int
@@ -206,8 +206,7 @@ def _add_chain(payload: mujoco.MjsBody, system: System, i: int, visuals: bool) -
         link = parent.add_body(name=f"cable_{i}/link_{j}", pos=place, quat=quat)
         link.mass, link.explicitinertial, link.ipos = mass, True, [0, 0, length]
         link.inertia = [LINK_INERTIA * mass * length**2] * 3
-        for axis in ([1, 0, 0], [0, 1, 0]):
-            link.add_joint(type=joint.mjJNT_HINGE, axis=axis, **(bending if j else {}))  # the anchor is a free pivot
+        link.add_joint(type=joint.mjJNT_BALL, **(bending if j else {}))  # the anchor is a free pivot
         link.add_joint(
             name=f"cable_{i}/stretch_{j}", type=joint.mjJNT_SLIDE, axis=[0, 0, 1],
             stiffness=[n * system.cable_stiffness[i], 0, 0], damping=[n * system.cable_damping[i], 0, 0],
