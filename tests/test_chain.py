@@ -326,6 +326,18 @@ def test_a_saved_team_continues_bit_for_bit(num_threads):
     assert same(fly(other, 10, first=10), expected)
 
 
+def test_a_mass_changed_in_flight_counts_from_the_next_step():
+    world, other = make_world(3, 2), make_world(3, 2)
+    thrust = hover_thrust(world)
+    world.step(thrust, 10)
+    world.set_payload_mass(mask(2, 1), np.full(2, 1.3))
+    other.load_state_dict(world.state_dict())
+    for each in (world, other):
+        each.step(thrust, 10)
+    assert same(world.state_dict(), other.state_dict())
+    assert not same(world.state.payload_position[0], world.state.payload_position[1])
+
+
 def test_a_masked_reset_is_a_fresh_start_and_leaves_the_others_alone():
     vec, fresh, longer = make(num_envs=3, **CHAIN), make(num_envs=3, **CHAIN), make(num_envs=3, **CHAIN)
     for each in (vec, fresh, longer):
