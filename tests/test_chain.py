@@ -248,12 +248,12 @@ def test_a_light_chain_of_stiff_segments_moves_as_a_massless_cable():
         world = World(make_system(3, **{"sim.timestep": 1e-3, **overrides}), 1, 1)
         world.plant.payload_force[:] = [0.3, 0.1, 0]
         thrust, path = hover_thrust(world), []
-        for _ in range(50):
+        for _ in range(100):
             path.append(world.step(thrust, 10).payload_position[0].copy())
         paths.append(np.array(path))
     moved = np.linalg.norm(paths[0][-1] - paths[0][0])
-    assert moved > 0.02
-    assert np.abs(paths[1] - paths[0]).max() < 0.01 * moved
+    assert moved > 0.05
+    assert np.abs(paths[1] - paths[0]).max() < 1e-3 * moved
 
 
 def test_a_bent_chain_pushes_its_ends_apart():
