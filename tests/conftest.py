@@ -57,7 +57,7 @@ def mask(num_envs: int, *chosen: int) -> np.ndarray:
 def hover_thrust(world: World) -> np.ndarray:
     """Return rotor thrusts (E, N, 4) that hold drones and nominal cable pulls in equilibrium."""
     system = world.system
-    force = np.linalg.norm(system.formation_force + [0, 0, system.vehicle.mass * GRAVITY], axis=1)
+    force = np.linalg.norm(system.drone_pull + [0, 0, system.vehicle.mass * GRAVITY], axis=1)
     return np.broadcast_to(force[:, None] / 4, (world.num_envs, world.num_drones, 4)).copy()
 
 

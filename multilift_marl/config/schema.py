@@ -119,10 +119,18 @@ class PayloadConfig(Section):
 class CableConfig(Section):
     """The cables; lists hold one value for each drone."""
 
-    model: Literal["massless"] = Field("massless", description="massless: pull-only Kelvin-Voigt element")
+    model: Literal["massless", "chain"] = Field(
+        "massless", description="massless: pull-only Kelvin-Voigt element; chain: masses, springs and dampers"
+    )
     length: PerDrone | None = Field(None, description="[m] natural length; None: 1 m, more if a point load needs it")
     stiffness: PerDrone = Field(1e5, description="[N/m] of the whole cable")
     damping: PerDrone = Field(1e3, description="[N s/m] of the whole cable")
+    segments: Int = Field(10, ge=2, le=100, description="links of a chain")
+    density: Positive = Field(0.01, description="[kg/m] of a chain")
+    bending_stiffness: Float = Field(0.0, ge=0, description="[N m/rad] between the links of a chain")
+    bending_damping: Float | None = Field(
+        None, ge=0, description="[N m s/rad] between the links of a chain; None: as little as is stable"
+    )
     angle: Float = Field(30.0, ge=0, lt=80, description="[deg] cables from the vertical in the resting formation")
 
 

@@ -36,9 +36,13 @@ class System:
         payload_axes: quaternion of the principal axes in its frame (4,).
         payload_drag_area: C_d A [m²].
         anchors: attachment of each cable from the payload's centre of mass, in its frame (N, 3) [m].
+        cable_model: "massless" or "chain".
         cable_length, cable_stiffness, cable_damping: (N,) [m], [N/m], [N s/m].
+        cable_segments: links of each cable; 1 if massless.
+        cable_mass: (N,) [kg]; 0 if massless.
+        bending_stiffness, bending_damping: between the links of a chain (N,) [N m/rad], [N m s/rad].
         formation_force: pull of each cable on the resting payload, in the payload frame (N, 3) [N].
-        slots: resting drones in the payload frame, cables stretched by their tension (N, 3) [m].
+        slots: resting drones in the payload frame, cables stretched and sagging as they hang (N, 3) [m].
         slot_azimuth: direction of each slot from the payload, in its horizontal plane (N,) [rad].
         min_separation: distance between drones that counts as a collision [m].
         wind: mean wind (3,) [m/s].
@@ -56,9 +60,14 @@ class System:
     payload_axes: np.ndarray
     payload_drag_area: float
     anchors: np.ndarray
+    cable_model: str
     cable_length: np.ndarray
     cable_stiffness: np.ndarray
     cable_damping: np.ndarray
+    cable_segments: int
+    cable_mass: np.ndarray
+    bending_stiffness: np.ndarray
+    bending_damping: np.ndarray
     formation_force: np.ndarray
     slots: np.ndarray
     slot_azimuth: np.ndarray
@@ -74,8 +83,23 @@ class System:
 
     @property
     def weight(self) -> float:
-        """Weight of payload and drones [N]."""
-        return GRAVITY * (self.payload_mass + self.num_drones * self.vehicle.mass)
+        """Weight of payload, drones and cables [N]."""
+        return GRAVITY * (self.payload_mass + self.num_drones * self.vehicle.mass + self.cable_mass.sum())
+
+    @property
+    def drone_pull(self) -> np.ndarray:
+        """Pull of each resting drone on its cable, which is the payload's share and the cable's weight (N, 3) [N]."""
+        return self.formation_force + GRAVITY * self.cable_mass[:, None] * [0, 0, 1]
+
+    @property
+    def resting_tension(self) -> np.ndarray:
+        """Tension of each resting cable where it is measured, in its segment next to the drone (N,) [N]."""
+        return np.linalg.norm(self.segment_forces[:, -1], axis=1)
+
+    @property
+    def segment_forces(self) -> np.ndarray:
+        """Pull of each segment of the resting cables, from the payload up, payload frame (N, segments, 3) [N]."""
+        return _segment_forces(self.formation_force, self.cable_mass, self.cable_segments)
 
 
 def resolve_system(config: Config) -> System:
@@ -109,8 +133,16 @@ def resolve_system(config: Config) -> System:
         )
     stiffness = _per_drone(cable.stiffness, n, "cable.stiffness")
     force = formation_forces(anchors, mass * GRAVITY, np.deg2rad(cable.angle), payload.shape == "point")
-    tension = np.linalg.norm(force, axis=1)
-    slots = anchors + force / tension[:, None] * (length + tension / stiffness)[:, None]
+    chain = cable.model == "chain"
+    segments = cable.segments if chain else 1
+    rope = cable.density * length if chain else np.zeros(n)
+    forces = _segment_forces(force, rope, segments)
+    tension = np.linalg.norm(forces, axis=2)
+    reach = (length / segments)[:, None] + tension / (segments * stiffness)[:, None]
+    slots = anchors + (forces / tension[..., None] * reach[..., None]).sum(axis=1)
+    bending = cable.bending_damping
+    if bending is None:
+        bending = _steady_bending(tension[:, -1], rope, length, segments, config.sim.timestep) if chain else 0.0
     centred = np.hypot(slots[:, 0], slots[:, 1]) < 1e-9
     system = System(
         vehicle=vehicle,
@@ -123,9 +155,14 @@ def resolve_system(config: Config) -> System:
         payload_axes=axes,
         payload_drag_area=payload.drag_area,
         anchors=anchors,
+        cable_model=cable.model,
         cable_length=length,
         cable_stiffness=stiffness,
         cable_damping=_per_drone(cable.damping, n, "cable.damping"),
+        cable_segments=segments,
+        cable_mass=rope,
+        bending_stiffness=np.full(n, cable.bending_stiffness),
+        bending_damping=np.broadcast_to(bending, n).astype(float),
         formation_force=force,
         slots=slots,
         slot_azimuth=np.where(centred, 0.0, np.arctan2(slots[:, 1], slots[:, 0])),
@@ -138,6 +175,27 @@ def resolve_system(config: Config) -> System:
     )
     _check_possible(system, heaviest=1 + config.randomization.payload_mass)
     return system
+
+
+def _segment_forces(force: np.ndarray, mass: np.ndarray, segments: int) -> np.ndarray:
+    """Return the pulls (N, segments, 3) [N] of cables of `mass` (N,) [kg] that pull the payload by `force` (N, 3) [N].
+
+    The mass of each segment is at its upper end, so each carries one segment's weight more than that below it.
+    """
+    carried = GRAVITY * mass[:, None] / segments * np.arange(segments)
+    return force[:, None] + carried[..., None] * [0, 0, 1]
+
+
+def _steady_bending(tension: np.ndarray, mass: np.ndarray, length: np.ndarray, n: int, h: float) -> np.ndarray:
+    """Return the bending damping (N,) [N m s/rad] that keeps the sideways motion of a chain's nodes stable.
+
+    Tension T acts on it explicitly: mode λ = 2 - 2 cos(jπ/n) of nodes m on links l moves stably in steps h if
+    m + h d λ²/l² ≥ h² T λ/4l. T l h is enough unless the nodes are light; twice the tension at rest is allowed for.
+    """
+    modes = 2 - 2 * np.cos(np.pi * np.arange(1, n) / n)
+    tension, node, link = tension[:, None], mass[:, None] / n, length[:, None] / n
+    least = 2 * tension * link * h / (4 * modes) - node * link**2 / (h * modes**2)
+    return np.maximum(tension[:, 0] * link[:, 0] * h, least.max(axis=1))
 
 
 def _standard_length(config: Config, scale: float) -> float:
@@ -286,11 +344,13 @@ def _check_possible(system: System, heaviest: float) -> None:
     n, vehicle = system.num_drones, system.vehicle
     thrust = 4 * vehicle.rotor_thrust_max
     if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
+        lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"
         raise ConfigError(
-            f"{n} × {vehicle.name} lift {n * thrust:.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of payload "
-            f"and drones, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
+            f"{n} × {vehicle.name} lift {n * thrust:.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of "
+            f"{lifted}, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
         )
-    hover = np.linalg.norm(heaviest * system.formation_force + [0, 0, vehicle.mass * GRAVITY], axis=1)
+    rope = system.drone_pull - system.formation_force
+    hover = np.linalg.norm(heaviest * system.formation_force + rope + [0, 0, vehicle.mass * GRAVITY], axis=1)
     if np.any(hover > thrust):
         i = int(hover.argmax())
         raise ConfigError(

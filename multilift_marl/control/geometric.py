@@ -52,7 +52,7 @@ class Gains(NamedTuple):
     """Of one rotor [N]."""
     thrust_max: float
     load_share: np.ndarray
-    """(N,) payload mass that each drone carries [kg]."""
+    """(N,) mass of payload and cable that each drone carries [kg]."""
     drag: tuple[float, float, float]
     """Linear drag along the body axes that is fed forward [kg/s]."""
 
@@ -76,7 +76,7 @@ def make_gains(control: ControlConfig, system: System) -> Gains:
         allocation=np.ascontiguousarray(np.linalg.inv(allocation_matrix(vehicle))),
         thrust_min=vehicle.thrust_coefficient * vehicle.rotor_speed_min**2,
         thrust_max=vehicle.rotor_thrust_max,
-        load_share=system.formation_force[:, 2] / GRAVITY,
+        load_share=system.drone_pull[:, 2] / GRAVITY,
         drag=tuple(float(c) * control.drag_feedforward for c in vehicle.drag),
     )
 

@@ -11,6 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from multilift_marl._jit import kernel
+from multilift_marl.math3d import add, norm, scale
+
 IMPEDANCE = 0.01
 
 
@@ -29,3 +32,23 @@ def limit_solref(stiffness: np.ndarray, damping: np.ndarray, tendon_invweight0: 
     """
     regulariser = (1 - IMPEDANCE) / IMPEDANCE * tendon_invweight0
     return -np.stack([stiffness * regulariser * IMPEDANCE, damping * regulariser * IMPEDANCE], axis=-1)
+
+
+@kernel
+def cable_end(direction, tension, length, stiffness, segments, weight):
+    """Return the drone's end of a hanging cable at rest, from its anchor [m].
+
+    Args:
+        direction, tension: unit vector and magnitude [N] of the force in its middle.
+        length, stiffness: of the whole cable [m], [N/m].
+        segments: of a chain, each with its mass at its upper end.
+        weight: of the whole cable [N]; 0 if massless.
+    """
+    if weight == 0.0:
+        return scale(length + tension / stiffness, direction)
+    end = (0.0, 0.0, 0.0)
+    for j in range(segments):
+        force = add(scale(tension, direction), (0.0, 0.0, weight * (j / segments - 0.5)))
+        size = norm(force)
+        end = add(end, scale((length / size + 1.0 / stiffness) / segments, force))
+    return end

@@ -1,7 +1,7 @@
 """What acts on the bodies between two physics steps: rotors with lag, drag, wind and the hidden force.
 
 Loads enter MuJoCo as generalised forces of the free joints, (force in the world frame, torque in the body frame),
-which needs no Jacobian.
+which needs no Jacobian. Drones on chains have no free joint: theirs are Cartesian, both in the world frame.
 """
 
 from __future__ import annotations
@@ -68,12 +68,21 @@ class Constants(NamedTuple):
     """Offset of qpos in a row of `batch.state`; likewise the next ones."""
     qvel: int
     force: int
+    drone_loads: np.ndarray
+    """(N,) offsets of the drones' forces and torques."""
+    world_torque: bool
+    """Whether those torques are in the world frame in place of the body frame."""
     payload_nq: int
     payload_nv: int
 
 
-def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: int) -> Constants:
-    """Return the constants of `system`."""
+def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: int, cartesian: int) -> Constants:
+    """Return the constants of `system`; the offsets are of qpos, qvel, qfrc_applied and xfrc_applied."""
+    chain = system.cable_model == "chain"
+    loads = [
+        cartesian + 6 * body if chain else force + layout.payload_nv + 6 * n
+        for n, body in enumerate(layout.drone_bodies)
+    ]
     vehicle = system.vehicle
     return Constants(
         timestep=system.timestep,
@@ -93,6 +102,8 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         qpos=qpos,
         qvel=qvel,
         force=force,
+        drone_loads=np.array(loads),
+        world_torque=chain,
         payload_nq=layout.payload_nq,
         payload_nv=layout.payload_nv,
     )
@@ -141,9 +152,12 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c):
             attitude = mat(state.drone_rotation, e, n)
             air = tmul(attitude, sub(vec(state.drone_velocity, e, n), wind))
             body = (-c.drag[0] * air[0], -c.drag[1] * air[1], total - c.drag[2] * air[2])
-            at = c.force + c.payload_nv + 6 * n
+            torque = (mx, my, mz)
+            if c.world_torque:
+                torque = mul(attitude, torque)
+            at = c.drone_loads[n]
             put(line[at : at + 3], mul(attitude, body))
-            put(line[at + 3 : at + 6], (mx, my, mz))
+            put(line[at + 3 : at + 6], torque)
             record.energy[e] += c.timestep * power
         air = sub(row(state.payload_velocity, e), wind)
         drag = scale(-c.payload_drag * norm(air), air)
@@ -169,16 +183,8 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
         if diverged[e] or not _sound(line, tension[e - lo], c):
             diverged[e] = True
             continue
-        at, v = c.qpos, c.qvel
-        for j in range(3):
-            state.payload_position[e, j] = line[at + j]
-            state.payload_velocity[e, j] = line[v + j]
-        if c.payload_nv == 6:
-            putmat(state.payload_rotation[e], quat_to_mat(line[at + 3], line[at + 4], line[at + 5], line[at + 6]))
-            for j in range(3):
-                state.payload_body_rates[e, j] = line[v + 3 + j]
-        at += c.payload_nq
-        v += c.payload_nv
+        read_payload(e, line, state, c)
+        at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
         slack = False
         for n in range(tension.shape[1]):
             for j in range(3):
@@ -189,13 +195,32 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
             at += 7
             v += 6
             pull = tension[e - lo, n]
-            state.cable_tension[e, n] = pull
-            record.tension_min[e] = min(record.tension_min[e], pull)
-            record.tension_max[e] = max(record.tension_max[e], pull)
-            record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[n] * c.cable_length[n]))
+            keep_tension(e, n, pull, state, record, c)
             slack = slack or pull <= 0.0
         if slack:
             record.slack_time[e] += c.timestep
+
+
+@kernel
+def read_payload(e, line, state, c):
+    """Read the payload's state out of a row of `batch.state`."""
+    at, v = c.qpos, c.qvel
+    for j in range(3):
+        state.payload_position[e, j] = line[at + j]
+        state.payload_velocity[e, j] = line[v + j]
+    if c.payload_nv == 6:
+        putmat(state.payload_rotation[e], quat_to_mat(line[at + 3], line[at + 4], line[at + 5], line[at + 6]))
+        for j in range(3):
+            state.payload_body_rates[e, j] = line[v + 3 + j]
+
+
+@kernel
+def keep_tension(e, n, pull, state, record, c):
+    """Note the tension [N] of cable n in state and record."""
+    state.cable_tension[e, n] = pull
+    record.tension_min[e] = min(record.tension_min[e], pull)
+    record.tension_max[e] = max(record.tension_max[e], pull)
+    record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[n] * c.cable_length[n]))
 
 
 @kernel
@@ -235,15 +260,10 @@ def write_rows(rows, lo, hi, mask, state, record, c):
         if not mask[e]:
             continue
         line = rows[e - lo]
-        at, v = c.qpos, c.qvel
-        put(line[at : at + 3], row(state.payload_position, e))
-        put(line[v : v + 3], row(state.payload_velocity, e))
+        clear_record(e, record)
+        write_payload(e, line, state, c)
         attitude = matrow(state.payload_rotation, e)
-        if c.payload_nv == 6:
-            line[at + 3], line[at + 4], line[at + 5], line[at + 6] = mat_to_quat(attitude)
-            put(line[v + 3 : v + 6], row(state.payload_body_rates, e))
-        at += c.payload_nq
-        v += c.payload_nv
+        at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
         for n in range(state.drone_position.shape[1]):
             position = vec(state.drone_position, e, n)
             put(line[at : at + 3], position)
@@ -256,11 +276,23 @@ def write_rows(rows, lo, hi, mask, state, record, c):
             anchor = (c.anchors[n, 0], c.anchors[n, 1], c.anchors[n, 2])
             cable = sub(position, add(row(state.payload_position, e), mul(attitude, anchor)))
             pull = c.cable_stiffness[n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[n])
-            state.cable_tension[e, n] = pull
-        record.energy[e], record.slack_time[e] = 0.0, 0.0
-        record.tension_min[e], record.tension_max[e], record.stretch_max[e] = 1e9, 0.0, 0.0
-        for n in range(state.cable_tension.shape[1]):
-            pull = state.cable_tension[e, n]
-            record.tension_min[e] = min(record.tension_min[e], pull)
-            record.tension_max[e] = max(record.tension_max[e], pull)
-            record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[n] * c.cable_length[n]))
+            keep_tension(e, n, pull, state, record, c)
+
+
+@kernel
+def write_payload(e, line, state, c):
+    """Write the payload's state into a row of `batch.state`."""
+    at, v = c.qpos, c.qvel
+    put(line[at : at + 3], row(state.payload_position, e))
+    put(line[v : v + 3], row(state.payload_velocity, e))
+    if c.payload_nv == 6:
+        q = mat_to_quat(matrow(state.payload_rotation, e))
+        line[at + 3], line[at + 4], line[at + 5], line[at + 6] = q
+        put(line[v + 3 : v + 6], row(state.payload_body_rates, e))
+
+
+@kernel
+def clear_record(e, record):
+    """Let the record of environment e start anew."""
+    record.energy[e], record.slack_time[e] = 0.0, 0.0
+    record.tension_min[e], record.tension_max[e], record.stretch_max[e] = 1e9, 0.0, 0.0

@@ -15,6 +15,7 @@ from multilift_marl.sim.cables import IMPEDANCE, limit_solref
 
 _GEOM, _OBJECT = mujoco.mjtGeom, mujoco.mjtObj
 _VISUAL_GROUP = 2
+LINK_INERTIA = 0.01  # of a link about its node, over mass x length²: spin about its own axis must not be free
 DRONE_COLOURS = (  # told apart by the colour-blind too (Okabe & Ito 2008), none of them green like the target
     (0.00, 0.45, 0.70, 1), (0.84, 0.37, 0.00, 1), (0.80, 0.47, 0.65, 1),
     (0.34, 0.71, 0.91, 1), (0.90, 0.62, 0.00, 1), (0.35, 0.35, 0.38, 1),
@@ -24,7 +25,8 @@ DRONE_COLOURS = (  # told apart by the colour-blind too (Okabe & Ito 2008), none
 class Layout(NamedTuple):
     """Where the bodies stand in MuJoCo's arrays: the payload first, then the drones, each a free joint.
 
-    A point payload has three slide joints in place of its free joint.
+    A point payload has three slide joints in place of its free joint. With chains, each drone in turn is the leaf of a
+    branch of the payload: for each link a ball joint and a slide, then the drone's ball joint.
     """
 
     payload_nq: int
@@ -33,6 +35,8 @@ class Layout(NamedTuple):
     """Velocities of the payload: 6, or 3 for a point."""
     payload_body: int
     """Index of the payload among bodies."""
+    drone_bodies: tuple[int, ...]
+    """Indices of the drones among bodies."""
 
 
 def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
@@ -45,11 +49,23 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "multilift"
     set_options(spec, system.timestep)
+    chain = system.cable_model == "chain"
+    if chain:
+        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     _add_world(spec, visuals)
     _add_payload(spec, system)
     for i in range(system.num_drones):
-        _add_drone(spec, system, i, visuals)
-        _add_cable(spec, system, i)
+        if chain:
+            link = _add_chain(spec.body("payload"), system, i, visuals)
+            body = link.add_body(name=f"drone_{i}", pos=[0, 0, system.cable_length[i] / system.cable_segments])
+            body.add_joint(name=f"drone_{i}", type=mujoco.mjtJoint.mjJNT_BALL)
+            _add_drone(body, system, i, visuals)
+            _add_drone_sensors(spec, i)
+        else:
+            body = spec.worldbody.add_body(name=f"drone_{i}", pos=system.slots[i] + [0, 0, 1.5])
+            body.add_freejoint(name=f"drone_{i}")
+            _add_drone(body, system, i, visuals)
+            _add_cable(spec, system, i)
     if visuals:
         _add_light(spec.body("payload"))
         _add_target(spec, system)
@@ -68,9 +84,11 @@ def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
 def build_model(system: System, visuals: bool = False) -> tuple[mujoco.MjModel, Layout]:
     """Return the compiled model and where its parts stand."""
     model = build_spec(system, visuals).compile()
-    model.tendon_solref_lim[:] = limit_solref(system.cable_stiffness, system.cable_damping, model.tendon_invweight0)
+    if system.cable_model == "massless":
+        model.tendon_solref_lim[:] = limit_solref(system.cable_stiffness, system.cable_damping, model.tendon_invweight0)
     point = system.payload_shape == "point"
-    return model, Layout(3 if point else 7, 3 if point else 6, model.body("payload").id)
+    drones = tuple(model.body(f"drone_{i}").id for i in range(system.num_drones))
+    return model, Layout(3 if point else 7, 3 if point else 6, model.body("payload").id, drones)
 
 
 def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
@@ -150,10 +168,8 @@ def _payload_form(system: System, margin: float = 0.0) -> dict[str, Any]:
     return {"type": _GEOM.mjGEOM_BOX, "size": half, "pos": pos}
 
 
-def _add_drone(spec: mujoco.MjSpec, system: System, i: int, visuals: bool) -> None:
+def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> None:
     vehicle, name = system.vehicle, f"drone_{i}"
-    body = spec.worldbody.add_body(name=name, pos=system.slots[i] + [0, 0, 1.5])
-    body.add_freejoint(name=name)
     body.mass, body.explicitinertial = vehicle.mass, True
     body.inertia, body.ipos = vehicle.inertia, [0, 0, 0]
     colour = DRONE_COLOURS[i % len(DRONE_COLOURS)]
@@ -198,6 +214,49 @@ def _add_cable(spec: mujoco.MjSpec, system: System, i: int) -> None:
         name=f"cable_{i}/tension", type=mujoco.mjtSensor.mjSENS_TENDONLIMITFRC,
         objtype=_OBJECT.mjOBJ_TENDON, objname=f"cable_{i}",
     )  # fmt: skip
+
+
+def _add_chain(payload: mujoco.MjsBody, system: System, i: int, visuals: bool) -> mujoco.MjsBody:
+    """Hang the links of cable i on the payload, one on the other, and return the last; see sim/chain.py."""
+    n, length = system.cable_segments, system.cable_length[i] / system.cable_segments
+    mass = system.cable_mass[i] / n
+    bending = {"stiffness": [system.bending_stiffness[i], 0, 0], "damping": [system.bending_damping[i], 0, 0]}
+    parent, place, quat = payload, system.anchors[i], np.zeros(4)
+    mujoco.mju_mat2Quat(quat, link_frame(system.formation_force[i]).ravel())
+    joint = mujoco.mjtJoint
+    for j in range(n):
+        link = parent.add_body(name=f"cable_{i}/link_{j}", pos=place, quat=quat)
+        link.mass, link.explicitinertial, link.ipos = mass, True, [0, 0, length]
+        link.inertia = [LINK_INERTIA * mass * length**2] * 3
+        link.add_joint(type=joint.mjJNT_BALL, **(bending if j else {}))  # the anchor is a free pivot
+        link.add_joint(
+            name=f"cable_{i}/stretch_{j}", type=joint.mjJNT_SLIDE, axis=[0, 0, 1],
+            stiffness=[n * system.cable_stiffness[i], 0, 0], damping=[n * system.cable_damping[i], 0, 0],
+        )  # fmt: skip
+        if visuals:
+            link.add_geom(
+                type=_GEOM.mjGEOM_CAPSULE, fromto=[0, 0, 0, 0, 0, length], size=[0.006, 0, 0],
+                rgba=[0.08, 0.08, 0.1, 1], contype=0, conaffinity=0, group=_VISUAL_GROUP, mass=0,
+            )  # fmt: skip
+        parent, place, quat = link, [0, 0, length], [1, 0, 0, 0]
+    return parent
+
+
+def link_frame(direction: np.ndarray) -> np.ndarray:
+    """Return a rotation (3, 3) that turns z into `direction` (3,), which must not be horizontal along y."""
+    z = np.asarray(direction, float) / np.linalg.norm(direction)
+    x = np.cross([0, 1, 0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _add_drone_sensors(spec: mujoco.MjSpec, i: int) -> None:
+    """Measure what a free joint would tell: position, attitude, velocity (world frame) and body rates."""
+    sensor, drone = mujoco.mjtSensor, {"objtype": _OBJECT.mjOBJ_XBODY, "objname": f"drone_{i}"}
+    spec.add_sensor(type=sensor.mjSENS_FRAMEPOS, **drone)
+    spec.add_sensor(type=sensor.mjSENS_FRAMEQUAT, **drone)
+    spec.add_sensor(type=sensor.mjSENS_FRAMELINVEL, **drone)
+    spec.add_sensor(type=sensor.mjSENS_GYRO, objtype=_OBJECT.mjOBJ_SITE, objname=f"drone_{i}/hook")
 
 
 def _add_target(spec: mujoco.MjSpec, system: System) -> None:

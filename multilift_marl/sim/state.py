@@ -29,7 +29,7 @@ class SystemState(NamedTuple):
     rotor_speed: np.ndarray
     """(E, N, 4) [rad/s]."""
     cable_tension: np.ndarray
-    """(E, N) in the last physics step [N]; exactly 0 when slack."""
+    """(E, N) [N]. Massless: in the last physics step, exactly 0 when slack. Chain: now, next to the drone."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> SystemState:
@@ -65,7 +65,7 @@ class Record(NamedTuple):
     tension_max: np.ndarray
     """(E,) largest cable tension [N]."""
     slack_time: np.ndarray
-    """(E,) time with any cable slack [s]."""
+    """(E,) time with any cable slack, or a chain that pulls its drone by no more than its weight [s]."""
     stretch_max: np.ndarray
     """(E,) largest tension over stiffness, relative to the cable's length [-]."""
 

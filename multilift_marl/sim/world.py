@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from mujoco.batch import Batch, SimulationError
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
 from multilift_marl.sim.cables import limit_solref
+from multilift_marl.sim.chain import make_chain, read_chains, write_chains
 from multilift_marl.sim.dynamics import apply_loads, hover_drone, make_constants, read_rows, write_rows
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.state import Plant, Record, SystemState
@@ -30,10 +32,12 @@ class Shard:
     lo: int
     hi: int
     batch: Batch
+    step: Callable[[], None]
+    """Advances `batch` by one physics step."""
     apply: Callable[[], None]
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
     read: Callable[[], None]
-    """`read_rows` of these environments."""
+    """`read_rows` or `read_chains` of these environments."""
 
 
 class World:
@@ -82,7 +86,7 @@ class World:
         state.drone_velocity[mask] = state.drone_body_rates[mask] = 0
         vehicle = system.vehicle
         for e in np.flatnonzero(mask):
-            for n, pull in enumerate(system.formation_force):
+            for n, pull in enumerate(system.drone_pull):
                 hover_drone(e, n, state, tuple(pull), 0.0, vehicle.mass, vehicle.thrust_coefficient)
         self.set_payload_mass(mask, np.full(self.num_envs, system.payload_mass))
         self.plant.payload_force[mask] = 0
@@ -98,7 +102,7 @@ class World:
             nstep: physics steps.
 
         Returns:
-            The live state. Tensions are those of the last step, all else is current.
+            The live state. Tensions of massless cables are those of the last step, all else is current.
 
         Raises:
             ValueError: wrong shape, or a thrust that is not finite.
@@ -118,7 +122,7 @@ class World:
         for _ in range(nstep):
             shard.apply()
             try:
-                shard.batch.step()
+                shard.step()
             except SimulationError as error:
                 self.diverged[shard.lo + np.asarray(error.ids, int)] = True
             shard.read()
@@ -161,6 +165,9 @@ class World:
             shard.batch.expand("body_inertia")[local, body] = (
                 system.payload_inertia * (new / system.payload_mass)[:, None]
             )
+            if system.cable_model == "chain":
+                shard.batch.set_const(local)
+                continue
             solref = shard.batch.expand("tendon_solref_lim")
             shard.batch.set_const(local)
             inverse_weight = shard.batch.expanded("tendon_invweight0")[local]
@@ -172,7 +179,7 @@ class World:
             local = mask[shard.lo : shard.hi]
             if local.any():
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
-                write_rows(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.record, self.constants)
+                self._write(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.record, *self.constants)
         self.diverged[mask] = False
 
     def check_warnings(self) -> None:
@@ -211,17 +218,20 @@ class World:
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int)
+        chain = self.system.cable_model == "chain"
+        read, self._write = (read_chains, write_chains) if chain else (read_rows, write_rows)
         shards = []
         for lo, hi in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-            batch = Batch(self.model, hi - lo, nthread=1)
-            offsets = [_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied")]
-            self.constants = make_constants(self.system, self.layout, *offsets)  # the same for every shard
-            apply = bind(
-                apply_loads, batch.state, lo, hi, self.thrust, self.state, self.plant, self.record, self.constants
-            )
-            tension = batch.bind("sensordata")
-            read = bind(read_rows, batch.state, lo, hi, tension, self.state, self.record, self.diverged, self.constants)
-            shards.append(Shard(lo, hi, batch, apply, read))
+            batch = Batch(self.model, hi - lo, nthread=1, persistent=chain)
+            # drones on chains are read from sensors; persistent batches compute those of the new state anyway
+            step = functools.partial(batch.step, stage=mujoco.mjtStage.mjSTAGE_VEL) if chain else batch.step
+            offsets = [_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied", "xfrc_applied")]
+            constants = make_constants(self.system, self.layout, *offsets)  # the same for every shard
+            self.constants = (constants, make_chain(self.system)) if chain else (constants,)
+            span, told = (batch.state, lo, hi), batch.bind("sensordata")
+            apply = bind(apply_loads, *span, self.thrust, self.state, self.plant, self.record, constants)
+            follow = bind(read, *span, told, self.state, self.record, self.diverged, *self.constants)
+            shards.append(Shard(lo, hi, batch, step, apply, follow))
         return shards
 
 

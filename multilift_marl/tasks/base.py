@@ -58,9 +58,9 @@ class Task:
         self.weights = self._weights(config.reward)
         self.dt = 1.0 / config.env.policy_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
-        self.rig = Rig(system.anchors, system.slots, system.slot_azimuth, system.formation_force)
+        self.rig = Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull)
         self.limits = make_limits(system)
-        tension = np.linalg.norm(system.formation_force, axis=1)
+        tension = system.resting_tension
         self._nominal = np.append(np.stack([system.cable_length, tension], axis=1), [[system.payload_mass, 0]], axis=0)
         self.cause, self.good_time = np.zeros(e, np.int64), np.zeros(e)
         self.min_separation = np.zeros(e)

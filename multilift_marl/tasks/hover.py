@@ -11,6 +11,7 @@ from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section
+from multilift_marl.config.system import GRAVITY
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import (
@@ -28,6 +29,7 @@ from multilift_marl.math3d import (
     sub,
     vec,
 )
+from multilift_marl.sim.cables import cable_end
 from multilift_marl.sim.dynamics import hover_drone
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
@@ -76,8 +78,9 @@ class Hover(Task):
             option.start_radius, radians(option.start_tilt), option.start_speed,
         )  # fmt: skip
         load = mass / world.system.payload_mass
-        team = (world.system.cable_length, world.system.cable_stiffness, load, vehicle.mass, vehicle.thrust_coefficient)
-        _start(env, rng, world.state, self.goal, self.rig, ranges, team)
+        cables = (world.system.cable_length, world.system.cable_stiffness, world.system.cable_mass * GRAVITY)
+        team = (world.system.cable_segments, load, vehicle.mass, vehicle.thrust_coefficient)
+        _start(env, rng, world.state, self.goal, self.rig, ranges, cables, team)
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
@@ -114,8 +117,9 @@ def in_ball(rng, radius):
 
 
 @kernel
-def _start(e, rng, state, goal, rig, ranges, team):
-    cable_length, cable_stiffness, load, drone_mass, thrust_coefficient = team
+def _start(e, rng, state, goal, rig, ranges, cables, team):
+    cable_length, cable_stiffness, cable_weight = cables
+    segments, load, drone_mass, thrust_coefficient = team
     x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
     put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))
     putmat(goal.rotation[e], rot_z(rng.uniform(-ranges.yaw, ranges.yaw)))
@@ -136,13 +140,14 @@ def _start(e, rng, state, goal, rig, ranges, team):
         anchor = add(payload, mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
         cable = sub(add(vec(goal.slots, e, n), moved), anchor)
         direction = scale(1.0 / norm(cable), cable)
-        tension = load * norm(vec(goal.pull, e, n))
-        put(state.drone_position[e, n], add(anchor, scale(cable_length[n] + tension / cable_stiffness[n], direction)))
+        half = (0.0, 0.0, 0.5 * cable_weight[n])
+        tension = load * norm(sub(vec(goal.pull, e, n), half))  # in the middle, whose direction is the cable's
+        end = cable_end(direction, tension, cable_length[n], cable_stiffness[n], segments, cable_weight[n])
+        put(state.drone_position[e, n], add(anchor, end))
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
-        hover_drone(
-            e, n, state, scale(tension, direction), heading(matrow(goal.rotation, e)), drone_mass, thrust_coefficient
-        )
+        pull = add(scale(tension, direction), half)
+        hover_drone(e, n, state, pull, heading(matrow(goal.rotation, e)), drone_mass, thrust_coefficient)
 
 
 @kernel

@@ -1,0 +1,415 @@
+"""Cables of masses, springs and dampers: closed forms at rest and along the cable, stability, exact replay."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import GRAVITY, hover_thrust, load, make, make_system, mask, refusal, same, steady, without_drag, zeros
+
+from multilift_marl.sim import World
+from multilift_marl.sim.hanging import hang
+from multilift_marl.sim.scene import build_model
+
+CHAIN = {"cable.model": "chain"}
+FORMATION = ("payload_position", "payload_rotation", "drone_position", "drone_rotation", "cable_tension")
+
+
+def make_world(num_drones: int = 1, num_envs: int = 1, num_threads: int = 1, drag: bool = True, **overrides) -> World:
+    """Return a world of teams on chains; overrides with __ for the dot."""
+    overrides = {key.replace("__", "."): value for key, value in overrides.items()}
+    system = make_system(num_drones, **{**CHAIN, **overrides})
+    return World(system if drag else without_drag(system), num_envs, num_threads)
+
+
+def chords(world: World) -> np.ndarray:
+    """Return the distance of anchor and drone of each cable (E, N) [m]."""
+    state, system = world.state, world.system
+    anchors = state.payload_position[:, None] + np.einsum("eij,nj->eni", state.payload_rotation, system.anchors)
+    return np.linalg.norm(state.drone_position - anchors, axis=-1)
+
+
+def momentum(world: World) -> np.ndarray:
+    """Return the momentum of all bodies of the first environment [kg m/s]."""
+    data = world.shards[0].batch.get_data(0)
+    model = world.shards[0].batch.get_model(0)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    return model.body_subtreemass[0] * data.subtree_linvel[0]
+
+
+def expm(a: np.ndarray) -> np.ndarray:
+    """Return the matrix exponential by Taylor's series of a/2^20 and repeated squaring."""
+    term = total = np.eye(len(a))
+    for order in range(1, 9):
+        term = term @ a / 2**20 / order
+        total = total + term
+    return np.linalg.matrix_power(total, 2**20)
+
+
+def calm(world: World) -> bool:
+    """Return whether nothing has diverged and MuJoCo has not warned of anything."""
+    return not world.diverged.any() and not any(shard.batch.warning[:, :, 1].any() for shard in world.shards)
+
+
+# At rest
+
+
+@pytest.mark.parametrize("timestep", [5e-4, 1e-3, 4e-3])
+@pytest.mark.parametrize("num_drones, shape", [(1, "box"), (2, "box"), (3, "point"), (4, "box"), (6, "box")])
+def test_the_formation_hangs_as_statics_says(num_drones, shape, timestep):
+    world = make_world(num_drones, payload__shape=shape, sim__timestep=timestep)
+    before, system = world.state_dict(), world.system
+    force = np.array(system.formation_force)
+    np.testing.assert_allclose(force.sum(axis=0), [0, 0, system.payload_mass * GRAVITY], atol=1e-9)
+    node = 0.01 * system.cable_length / 10 * GRAVITY
+    offset, tension = np.zeros((num_drones, 3)), 0.0
+    for j in range(10):  # each segment carries the nodes below it
+        pull = force + j * node[:, None] * [0, 0, 1]
+        tension = np.linalg.norm(pull, axis=1)
+        offset += pull / tension[:, None] * (system.cable_length / 10 + tension / 1e6)[:, None]
+    world.step(hover_thrust(world), round(0.4 / timestep))
+    for name in FORMATION:
+        np.testing.assert_allclose(getattr(world.state, name), before[f"state.{name}"], rtol=1e-8, atol=1e-9)
+    stretch, expected = chords(world)[0] - system.cable_length, np.linalg.norm(offset, axis=1) - system.cable_length
+    np.testing.assert_allclose(stretch, expected, rtol=1e-4)
+    np.testing.assert_allclose(world.state.cable_tension[0], tension, rtol=1e-6)
+    assert calm(world)
+
+
+@pytest.mark.parametrize("timestep", [5e-4, 1e-3, 4e-3])
+def test_a_changed_payload_stretches_the_cable_by_its_weight_and_the_ropes(timestep):
+    world = make_world(1, 5, drag=False, sim__timestep=timestep, cable__density=0.05, cable__segments=5)
+    mass = np.array([0.1, 0.2, 0.35, 0.7, 1.0])
+    world.set_payload_mass(np.ones(5, bool), mass)
+    thrust = (mass[:, None, None] + world.system.vehicle.mass + 0.05) * GRAVITY / 4
+    world.step(np.broadcast_to(thrust, (5, 1, 4)), round(1.0 / timestep))
+    expected = (mass * GRAVITY + 2 * 0.01 * GRAVITY) / 1e5  # on average a segment carries two of the five nodes
+    np.testing.assert_allclose(chords(world)[:, 0] - 1, expected, rtol=1e-4)
+    np.testing.assert_allclose(world.state.cable_tension[:, 0], (mass + 4 * 0.01) * GRAVITY, rtol=1e-4)
+    assert world.record.stretch_max[0] == pytest.approx(world.record.tension_max[0] / 1e5)
+
+
+@pytest.mark.parametrize("chord", [(0.3, 0.1, 0.9495), (0.9, 0, 0.4364), (0, 0, 1.00004), (1, 0, 0.001), (1, 0, -0.1)])
+def test_a_hanging_chain_spans_its_chord_in_balance(chord):
+    chord, links = np.array(chord) * 1.00003, np.zeros((10, 4))
+    hang(tuple(chord), 0.1, 1e6, 0.01, links)
+    directions, stretch = links[:, :3], links[:, 3]
+    np.testing.assert_allclose(directions.T @ (0.1 + stretch), chord, atol=1e-9)
+    pulls = 1e6 * stretch[:, None] * directions
+    np.testing.assert_allclose(np.diff(pulls, axis=0), np.tile([0, 0, 0.01], (9, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("chord", [(0, 0, 0.9999), (0.1, 0.2, 0.3), (0, 0, 0.0), (-0.8, 0, -0.2), (0, 0, -0.5)])
+def test_a_slack_chain_spans_its_chord_unstretched(chord):
+    links = np.zeros((10, 4))
+    hang(chord, 0.1, 1e6, 0.01, links)
+    np.testing.assert_allclose(links[:, :3].sum(axis=0) * 0.1, chord, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(links[:, :3], axis=1), 1, atol=1e-12)
+    assert (links[:, 3] == 0).all()
+
+
+# In motion
+
+
+@pytest.mark.parametrize(  # the integrator is of first order, and the fastest of these motions takes 0.1 ms
+    "damping, timestep, tolerance", [(1000.0, 5e-4, 0.05), (1000.0, 1e-4, 0.02), (100.0, 5e-5, 0.02)]
+)
+def test_a_stretched_chain_moves_as_its_masses_springs_and_dampers(damping, timestep, tolerance):
+    n, speed = 10, 0.2
+    world = make_world(drag=False, sim__timestep=timestep, cable__damping=damping, sim__control_hz=200)
+    system, rotors = world.system, world.system.vehicle
+    world.state.payload_velocity[0, 2] = -speed  # thrown apart, in free fall but for the least thrust of the rotors
+    load(world)
+    idle = 4 * rotors.thrust_coefficient * rotors.rotor_speed_min**2
+    thrust = steady(world, idle / 4)
+    world.state.drone_rotation[:], world.state.drone_velocity[:] = np.eye(3), 0
+    load(world)
+
+    mass = np.full(n + 1, 0.001)
+    mass[0], mass[-1] = system.payload_mass, mass[-1] + rotors.mass
+    springs = np.zeros((n + 1, n + 1))
+    for j in range(n):
+        springs[j : j + 2, j : j + 2] += [[1, -1], [-1, 1]]
+    zero, one = np.zeros_like(springs), np.eye(n + 1)
+    flow = np.block([[zero, one], [-1e6 * springs / mass[:, None], -n * damping * springs / mass[:, None]]])
+    flow = np.block([[flow, np.zeros((2 * n + 2, 1))], [np.zeros((1, 2 * n + 3))]])
+    flow[n + 1 : -1, -1] = -GRAVITY
+    flow[2 * n + 1, -1] += idle / mass[-1]
+    rest = (system.payload_mass + 0.001 * np.arange(n)) * GRAVITY / 1e6  # of the segments, at the start
+    exact = np.zeros(2 * n + 3)
+    exact[1 : n + 1], exact[-1] = np.cumsum(rest), 1
+    exact[n + 1 : -1] = -speed * (1 - np.arange(n + 1) / n)
+    propagator = expm(flow * timestep)
+    actual, expected = [], []
+    for _ in range(200):
+        world.step(thrust)
+        exact = propagator @ exact
+        actual.append(chords(world)[0, 0] - 1)
+        expected.append(exact[n] - exact[0])
+        if expected[-1] < 0:  # from here on it would buckle
+            break
+    error = np.sqrt(np.mean(np.subtract(actual, expected) ** 2) / np.mean(np.square(expected)))
+    assert len(actual) > 5
+    assert error < tolerance
+
+
+def test_a_slack_chain_holds_nothing():
+    world = make_world(4)
+    world.state.drone_position[..., 2] -= 0.5
+    load(world)
+    assert (world.state.cable_tension == 0).all()
+    world.step(hover_thrust(world), 25)
+    assert world.state.payload_velocity[0, 2] == pytest.approx(-0.981, rel=2e-3)
+    assert world.state.cable_tension.max() < 0.2
+    assert world.record.slack_time[0] > 0.07
+    assert calm(world)
+
+
+@pytest.mark.parametrize("shape", ["box", "point"])
+def test_momentum_changes_by_gravity_and_thrust_alone(shape):
+    world = make_world(3, drag=False, payload__shape=shape, sim__timestep=1e-3)
+    rng, vehicle = np.random.default_rng(0), world.system.vehicle
+    world.state.drone_velocity[:] = rng.uniform(-0.5, 0.5, (1, 3, 3))
+    world.state.payload_velocity[:] = rng.uniform(-0.5, 0.5, 3)
+    world.state.drone_body_rates[:] = rng.uniform(-1, 1, (1, 3, 3))
+    world.state.rotor_speed[:] = vehicle.rotor_speed_min
+    load(world)
+    thrust = np.full((1, 3, 4), vehicle.thrust_coefficient * vehicle.rotor_speed_min**2)
+    before, impulse = momentum(world), np.zeros(3)
+    for _ in range(200):
+        impulse += 4e-3 * thrust[0, 0, 0] * world.state.drone_rotation[0, :, :, 2].sum(axis=0)
+        world.step(thrust)
+    total = world.system.weight / GRAVITY
+    expected = before + impulse - [0, 0, 0.2 * GRAVITY * total]
+    np.testing.assert_allclose(momentum(world), expected, atol=2e-3 * total)
+    assert calm(world)
+
+
+@pytest.mark.parametrize("shape", ["box", "point"])
+def test_a_written_state_is_read_back(shape):
+    world = make_world(3, payload__shape=shape)
+    rng, state = np.random.default_rng(1), world.state
+    if shape == "box":
+        state.payload_body_rates[:] = rng.uniform(-1, 1, 3)
+    for array in (state.payload_velocity, state.drone_velocity, state.drone_body_rates):
+        array[:] = rng.uniform(-1, 1, array.shape)
+    state.drone_position[:] += rng.uniform(-0.1, 0.1, state.drone_position.shape) - [0, 0, 0.15]
+    before = {name: array.copy() for name, array in state._asdict().items()}
+    load(world)
+    for shard in world.shards:
+        shard.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+        shard.read()
+    for name, array in state._asdict().items():
+        if name != "cable_tension":
+            np.testing.assert_allclose(array, before[name], atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("timestep", [5e-4, 1e-3, 2e-3, 5e-3])
+def test_stiff_chains_are_stable_and_cause_no_warnings(timestep):
+    stiff = {"cable__stiffness": 1e6, "cable__damping": 1e4}
+    world = make_world(6, sim__timestep=timestep, sim__control_hz=100, payload__mass=3.0, **stiff)
+    world.state.payload_velocity[0] = [0.5, 0, 0]
+    load(world)
+    for _ in range(10):
+        world.step(hover_thrust(world), round(0.03 / timestep))
+    assert calm(world)
+    assert np.abs(world.state.payload_velocity).max() < 1.0
+    assert world.state.cable_tension.max() < 20
+
+
+@pytest.mark.parametrize("direction", [[1, 0, 0], [0, 1, 0], [0, -1, 0.001], [0, 0, -1], [0, 0, 1]], ids=str)
+def test_a_cable_may_point_anywhere(direction):
+    world = make_world(1, drag=False, payload__shape="point", sim__timestep=1e-3)
+    world.state.payload_position[:] = [0, 0, 20]
+    world.state.drone_position[:] = world.state.payload_position + 1.00001 * np.array(direction)
+    world.state.drone_velocity[:] = world.state.payload_velocity[:] = [0.5, 0.2, -0.3]
+    load(world)
+    world.step(hover_thrust(world), 100)
+    assert calm(world)
+    assert chords(world)[0, 0] < 1.001
+
+
+@pytest.mark.parametrize("density", [1e-4, 1e-3, 0.1])
+@pytest.mark.parametrize("segments", [2, 10, 30])
+def test_ropes_of_any_weight_stay_calm(density, segments):
+    world = make_world(3, cable__density=density, cable__segments=segments)
+    world.state.payload_velocity[0] = [0.1, 0, 0]
+    load(world)
+    world.step(hover_thrust(world), 100)
+    assert calm(world)
+    assert np.abs(world.state.cable_tension / world.system.resting_tension - 1).max() < 0.2
+    assert np.abs(chords(world) - world.system.cable_length).max() < 0.005
+
+
+def test_a_light_chain_of_stiff_segments_moves_as_a_massless_cable():
+    paths = []
+    for overrides in ({}, {**CHAIN, "cable.density": 1e-4, "cable.segments": 20}):
+        world = World(make_system(3, **{"sim.timestep": 1e-3, **overrides}), 1, 1)
+        world.plant.payload_force[:] = [0.3, 0.1, 0]
+        thrust, path = hover_thrust(world), []
+        for _ in range(100):
+            path.append(world.step(thrust, 10).payload_position[0].copy())
+        paths.append(np.array(path))
+    moved = np.linalg.norm(paths[0][-1] - paths[0][0])
+    assert moved > 0.05
+    assert np.abs(paths[1] - paths[0]).max() < 1e-3 * moved
+
+
+def test_a_bent_chain_pushes_its_ends_apart():
+    speeds = []
+    for stiffness in (0.0, 0.5):
+        world = make_world(1, cable__bending_stiffness=stiffness, sim__timestep=1e-3)
+        world.state.drone_position[..., 2] -= 0.1
+        load(world)
+        world.step(hover_thrust(world), 50)
+        speeds.append(world.state.payload_velocity[0, 2])
+    assert speeds[1] < speeds[0] - 0.05  # the bent rope pushes payload and drone apart
+
+
+def test_the_payload_comes_to_rest_on_the_ground():
+    world = make_world(4)
+    world.state.payload_position[:, 2] = 0.1
+    world.state.drone_position[..., 2] = 0.8
+    world.state.drone_rotation[:] = np.eye(3)
+    load(world)
+    weight = (world.system.vehicle.mass + 0.01) * GRAVITY
+    world.step(steady(world, weight / 4), 250)
+    assert world.state.payload_position[0, 2] == pytest.approx(0.075, abs=2e-3)
+    assert np.abs(world.state.payload_velocity).max() < 0.02
+    assert calm(world)
+
+
+# In the environment
+
+
+@pytest.mark.parametrize("num_drones", [1, 3, 4])
+def test_the_formation_flies_on_chains(num_drones):
+    vec = make(num_envs=3, num_drones=num_drones, **CHAIN)
+    vec.reset(seed=0)
+    for _ in range(100):
+        _, reward, terminated, _, _ = vec.step(zeros(vec))
+        assert not terminated.any()
+    assert np.isfinite(reward).all() and calm(vec.world)
+    assert vec.task.errors.distance.max() < 0.6
+
+
+def fly(vec, steps: int, first: int = 0):
+    """Fly every environment by actions of its own and return all there is to know afterwards."""
+    for step in range(first, first + steps):
+        shape = (vec.num_drones, vec.action_size)
+        envs = range(vec.first_env, vec.first_env + vec.num_envs)
+        vec.step(np.stack([np.random.default_rng((e, step)).uniform(-1, 1, shape) for e in envs]))
+    return vec.state_dict()
+
+
+def test_neither_threads_nor_neighbours_change_a_bit():
+    settings = {**CHAIN, "randomization.payload_mass": 0.3}
+    one, two = make(num_envs=3, **settings), make(num_envs=3, num_threads=2, **settings)
+    alone = make(num_envs=1, first_env=1, **settings)
+    for vec in (one, two, alone):
+        vec.reset(seed=0)
+    saved, threaded, single = fly(one, 20), fly(two, 20), fly(alone, 20)
+    assert same(saved, threaded)
+    assert same({key: array[1:2] for key, array in saved.items()}, single)
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_a_saved_team_continues_bit_for_bit(num_threads):
+    vec, other = make(num_envs=3, **CHAIN), make(num_envs=3, num_threads=num_threads, **CHAIN)
+    vec.reset(seed=0)
+    saved = fly(vec, 10)
+    expected = fly(vec, 10, first=10)
+    other.reset(seed=5)
+    fly(other, 5)
+    other.load_state_dict(saved)
+    assert same(fly(other, 10, first=10), expected)
+
+
+def test_a_mass_changed_in_flight_counts_from_the_next_step():
+    world, other = make_world(3, 2), make_world(3, 2)
+    thrust = hover_thrust(world)
+    world.step(thrust, 10)
+    world.set_payload_mass(mask(2, 1), np.full(2, 1.3))
+    other.load_state_dict(world.state_dict())
+    for each in (world, other):
+        each.step(thrust, 10)
+    assert same(world.state_dict(), other.state_dict())
+    assert not same(world.state.payload_position[0], world.state.payload_position[1])
+
+
+def test_a_masked_reset_is_a_fresh_start_and_leaves_the_others_alone():
+    vec, fresh, longer = make(num_envs=3, **CHAIN), make(num_envs=3, **CHAIN), make(num_envs=3, **CHAIN)
+    for each in (vec, fresh, longer):
+        each.reset(seed=0)
+    fly(vec, 5)
+    vec.reset(seed=0, mask=mask(3, 1))
+    fly(longer, 5)
+    again, first, onward = fly(vec, 5), fly(fresh, 5), fly(longer, 5)
+    worlds = [
+        [{key: saved[key][i] for key in saved if key.startswith("world.")} for i in range(3)]
+        for saved in (again, onward)
+    ]
+    assert same(worlds[0][0], worlds[1][0]) and same(worlds[0][2], worlds[1][2])
+    assert not same(worlds[0][1], worlds[1][1])
+    start = make(num_envs=3, **CHAIN)
+    start.reset(seed=0)
+    start.reset(seed=0, mask=mask(3, 1))
+    assert same(fly(start, 5), first)
+
+
+@pytest.mark.parametrize("force", [1e5, np.nan])
+def test_a_diverged_team_spares_the_others_and_is_healed_by_a_reset(force):
+    world, calm_one = make_world(3, 3), make_world(3, 3)
+    thrust = hover_thrust(world) * np.linspace(0.98, 1.02, 3)[:, None, None]
+    world.plant.payload_force[1] = force
+    for each in (world, calm_one):
+        each.step(thrust, 20)
+    assert world.diverged.tolist() == [False, True, False]
+    assert all(np.isfinite(array).all() for array in world.state)
+    others = [0, 2]
+    assert all(same(a[others], b[others]) for a, b in zip(world.state, calm_one.state, strict=True))
+    world.reset(mask(3, 1))
+    calm_one.reset(mask(3, 1))
+    for each in (world, calm_one):
+        each.step(thrust, 20)
+    assert same(world.state_dict(), calm_one.state_dict())
+
+
+def test_teams_start_with_their_cables_at_the_tension_of_rest():
+    vec = make(num_envs=16, **CHAIN, **{"randomization.payload_mass": 0.3})
+    vec.reset(seed=0)
+    load = vec.world.plant.payload_mass / vec.world.system.payload_mass
+    expected = vec.world.system.resting_tension * load[:, None]
+    np.testing.assert_allclose(vec.world.state.cable_tension, expected, rtol=0.01)
+    assert (vec.world.state.cable_tension == vec.world.state.cable_tension.clip(1)).all()
+
+
+@pytest.mark.parametrize("shape", ["box", "point"])
+def test_what_is_drawn_has_the_same_physics(shape):
+    system, states = make_system(3, **CHAIN, **{"payload.shape": shape}), []
+    for visuals in (False, True):
+        model, _ = build_model(system, visuals)
+        data = mujoco.MjData(model)
+        data.qvel[:] = np.random.default_rng(0).uniform(-1, 1, model.nv)
+        for _ in range(100):
+            mujoco.mj_step(model, data)
+        states.append(data.qpos.copy())
+    assert same(*states)
+
+
+@pytest.mark.parametrize(
+    "key, value, complaint",
+    [
+        ("cable.model", "rope", "massless"),
+        ("cable.segments", 1, "must be greater than or equal to 2"),
+        ("cable.density", 0.0, "must be greater than 0"),
+        ("cable.bending_stiffness", -1.0, "must be greater than or equal to 0"),
+        ("cable.bending_damping", -1.0, "must be greater than or equal to 0"),
+        ("cable.density", 1.5, "lift"),
+    ],
+)
+def test_impossible_chains_are_refused(key, value, complaint):
+    message = refusal(make_system, 4, **{**CHAIN, key: value})
+    assert message.startswith(key) or key == "cable.density"
+    assert complaint in message
