@@ -9,7 +9,8 @@ import pytest
 from conftest import GRAVITY, make_system, refusal, refuse_system, refuse_task
 
 import multilift_marl as ml
-from multilift_marl.config.system import MIN_THRUST_TO_WEIGHT, formation_forces
+from multilift_marl.config.rig import formation_forces
+from multilift_marl.config.system import MIN_THRUST_TO_WEIGHT
 from multilift_marl.config.vehicles import PRESETS
 
 # What is refused

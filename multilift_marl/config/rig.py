@@ -1,0 +1,170 @@
+"""The rig in numbers: payload and anchors of any team, and the pulls that hold the payload level."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from multilift_marl.config.mesh import Mesh, read_mesh
+from multilift_marl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from multilift_marl.config.schema import Config, PayloadConfig
+
+MAX_ANCHOR_DISTANCE = 0.1  # [m] of an anchor from the payload's surface
+REST_SEPARATION = 0.6  # [m] between falcons at rest, by which the standard rig is sized
+
+
+def standard_length(config: Config, scale: float) -> float:
+    """Return 1 m for a falcon's span, or more where a ring of drones about one point would be too narrow."""
+    n, spread = config.env.num_drones, np.sin(np.deg2rad(config.cable.angle))
+    if config.payload.shape != "point" or n == 1 or spread == 0:
+        return scale
+    return scale * max(1.0, REST_SEPARATION / (2 * np.sin(np.pi / n) * spread))
+
+
+def find_mesh(payload: PayloadConfig) -> Mesh | None:
+    """Return the payload's mesh, or None for another shape; a ConfigError if the two do not go together."""
+    if payload.shape == "mesh" and payload.mesh is not None:
+        return read_mesh(payload.mesh, payload.size)
+    if payload.shape == "mesh":
+        raise ConfigError("payload.shape=mesh needs payload.mesh; give the path of an .obj or .stl file")
+    if payload.mesh is not None:
+        raise ConfigError(f"payload.mesh means nothing to a {payload.shape}; drop it or use payload.shape=mesh")
+    return None
+
+
+def place_anchors(
+    config: Config, n: int, length: np.ndarray, scale: float, mesh: Mesh | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return anchors (n, 3) from the geometric centre and edges (3,): the configured or the standard ones."""
+    payload = config.payload
+    reach = length.min() * np.sin(np.deg2rad(config.cable.angle))
+    ring = max(0.27 * scale, REST_SEPARATION * scale / (2 * np.sin(np.pi / n)) - reach) if n > 1 else 0.0
+    edge = 2 * max(ring, 0.15 * scale)
+    rectangle = n == 4 and payload.shape != "cylinder"
+    standard = np.array([0.55, 0.45, 0.15]) * scale if rectangle else np.array([edge, edge, 0.15 * scale])
+    size = standard if payload.size is None else np.asarray(payload.size, float)
+    size = size if mesh is None else mesh.edges
+    inset = 0.005 * scale  # the cables are tied to rings this far inside the rim and above the lid
+    lid, rim = size[2] / 2 + inset, size[:2] / 2 - inset
+    if payload.anchors is not None:
+        anchors = np.asarray(payload.anchors, float)
+        if len(anchors) != n:
+            raise ConfigError(f"payload.anchors lists {len(anchors)} anchors for env.num_drones={n}: give one for each")
+    elif payload.shape == "point":
+        anchors = np.zeros((n, 3))
+    elif rectangle:
+        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+        anchors = np.concatenate([corners * rim, np.full((4, 1), lid)], axis=1)
+    else:
+        azimuth, ring = 2 * np.pi * np.arange(n) / n, min(ring, size[:2].min() / 2)
+        anchors = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(n, lid)], axis=1)
+    if payload.shape == "point":
+        for key in ("size", "inertia", "center_of_mass"):
+            if getattr(payload, key) is not None:
+                raise ConfigError(f"payload.{key} means nothing to a point; drop it or use payload.shape=box")
+        size = np.full(3, 0.1 * scale)
+        if np.any(anchors != 0):
+            raise ConfigError(
+                "payload.anchors of a point payload must all be [0, 0, 0]; use payload.shape=box for others"
+            )
+    return anchors, size
+
+
+def uniform_inertia(shape: str, mass: float, size: np.ndarray) -> np.ndarray:
+    """Return the principal moments (3,) of a uniform body [kg m²]."""
+    if shape == "cylinder":
+        across = size[0] ** 2 / 16 + size[2] ** 2 / 12
+        return mass * np.array([across, across, size[0] ** 2 / 8])
+    return mass / 12 * np.array([size[1] ** 2 + size[2] ** 2, size[0] ** 2 + size[2] ** 2, size[0] ** 2 + size[1] ** 2])
+
+
+def check_body(shape: str, size: np.ndarray, center_of_mass: np.ndarray, anchors: np.ndarray) -> None:
+    """Refuse bodies that cannot be, and anchors (N, 3) off the body, counted from its geometric centre."""
+    if shape == "cylinder" and size[0] != size[1]:
+        raise ConfigError(
+            f"payload.size {size.tolist()} of a cylinder must give its diameter twice, then its height; "
+            "make the first two equal"
+        )
+    if _outside(shape, size, center_of_mass[None])[0] > 1e-9:
+        raise ConfigError(
+            f"payload.center_of_mass {center_of_mass.tolist()} lies outside the payload of size {size.tolist()}; "
+            "count it from the geometric centre"
+        )
+    outside = _outside(shape, size, anchors)
+    if np.any(outside > MAX_ANCHOR_DISTANCE):
+        i = int(np.argmax(outside))
+        raise ConfigError(
+            f"payload.anchors: anchor {i} is out of reach, {outside[i]:.2f} m outside the payload; move it onto the "
+            "payload"
+        )
+
+
+def _outside(shape: str, size: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return how far (N,) points (N, 3), counted from the geometric centre, lie outside the body [m]."""
+    over = np.maximum(np.abs(points) - size / 2, 0)
+    if shape == "cylinder":
+        over[:, 0] = np.maximum(np.hypot(points[:, 0], points[:, 1]) - size[0] / 2, 0)
+        over[:, 1] = 0
+    return np.linalg.norm(over, axis=1)
+
+
+def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bool) -> np.ndarray:
+    """Return the cables' pulls (N, 3) [N] that hold a payload level, as near as possible to `angle` from the vertical.
+
+    The pulls nearest to equal, symmetric ones in the least-squares sense among all that balance the weight and
+    its moments about the centre of mass.
+
+    Args:
+        anchors: (N, 3) [m] from the centre of mass.
+        weight: of the payload [N].
+        angle: of the cables from the vertical [rad].
+        point: True where the payload has no attitude to hold.
+
+    Raises:
+        ConfigError: no pulls balance the payload, or some cable would have to push.
+    """
+    n = len(anchors)
+    centre = anchors[:, :2].mean(axis=0)
+    radial = anchors[:, :2] - centre
+    distance = np.linalg.norm(radial, axis=1, keepdims=True)
+    even = 2 * np.pi * np.arange(n) / n
+    radial = np.where(
+        distance > 1e-6, radial / np.maximum(distance, 1e-6), np.stack([np.cos(even), np.sin(even)], axis=1)
+    )
+    if n == 1:
+        radial = np.zeros((1, 2))
+    nominal = weight / n * np.concatenate([np.tan(angle) * radial, np.ones((n, 1))], axis=1)
+    balance = np.concatenate([np.eye(3)] * n, axis=1)
+    load = np.array([0, 0, weight, 0, 0, 0])
+    if point:
+        load = load[:3]
+    else:
+        moments = [[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in anchors]
+        balance = np.concatenate([balance, np.concatenate(np.array(moments, float), axis=1)], axis=0)
+    flat = nominal.ravel()
+    force = (flat + np.linalg.pinv(balance) @ (load - balance @ flat)).reshape(n, 3)
+    residual = np.abs(balance @ force.ravel() - load).max()
+    if residual > 1e-6 * weight:
+        raise ConfigError(
+            f"payload.anchors {np.round(anchors, 3).tolist()} cannot hold the payload level: place them around its "
+            "centre of mass"
+        )
+    if np.any(force[:, 2] < 0.02 * weight / n):
+        raise ConfigError(
+            f"payload.anchors: cable {int(force[:, 2].argmin())} would have to push; move the anchors around the "
+            "centre of mass"
+        )
+    return force
+
+
+def per_drone(value: float | tuple[float, ...], n: int, key: str) -> np.ndarray:
+    """Return one value for each of n drones (n,); a ConfigError that names `key` if a list has another length."""
+    values = np.atleast_1d(np.asarray(value, float))
+    if len(values) not in (1, n) or (isinstance(value, tuple) and len(values) != n):
+        raise ConfigError(
+            f"{key} lists {len(values)} values for env.num_drones={n}: give one value or one for each drone"
+        )
+    return np.broadcast_to(values, (n,)).copy()
