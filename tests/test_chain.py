@@ -9,6 +9,7 @@ from conftest import GRAVITY, hover_thrust, load, make_system, steady, without_d
 
 from multilift_marl.sim import World
 from multilift_marl.sim.hanging import hang
+from multilift_marl.validation.chains import exponential
 
 CHAIN = {"cable.model": "chain"}
 FORMATION = ("payload_position", "payload_rotation", "drone_position", "drone_rotation", "cable_tension")
@@ -35,15 +36,6 @@ def momentum(world: World) -> np.ndarray:
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
     return model.body_subtreemass[0] * data.subtree_linvel[0]
-
-
-def expm(a: np.ndarray) -> np.ndarray:
-    """Return the matrix exponential by Taylor's series of a/2^20 and repeated squaring."""
-    term = total = np.eye(len(a))
-    for order in range(1, 9):
-        term = term @ a / 2**20 / order
-        total = total + term
-    return np.linalg.matrix_power(total, 2**20)
 
 
 def calm(world: World) -> bool:
@@ -139,7 +131,7 @@ def test_a_stretched_chain_moves_as_its_masses_springs_and_dampers(damping, time
     exact = np.zeros(2 * n + 3)
     exact[1 : n + 1], exact[-1] = np.cumsum(rest), 1
     exact[n + 1 : -1] = -speed * (1 - np.arange(n + 1) / n)
-    propagator = expm(flow * timestep)
+    propagator = exponential(flow * timestep)
     actual, expected = [], []
     for _ in range(200):
         world.step(thrust)

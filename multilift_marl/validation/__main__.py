@@ -15,6 +15,7 @@ from multilift_marl.validation.experiment import Experiment, Result, Row
 EXPERIMENTS: dict[str, Experiment] = {
     "single_cable": cables.single_cable,
     "six_cables": cables.six_cables,
+    "stiff_cables": cables.stiff_cables,
     "integrators": cables.integrators,
     "slack_taut": bodies.slack_taut,
     "static_teams": bodies.static_teams,
