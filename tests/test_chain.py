@@ -91,6 +91,19 @@ def test_a_hanging_chain_spans_its_chord_in_balance(chord):
     np.testing.assert_allclose(np.diff(pulls, axis=0), np.tile([0, 0, 0.01], (9, 1)), atol=1e-6)
 
 
+@pytest.mark.parametrize("chord", [(0.5, 0, 0.865), (0.1, -0.3, 0.944), (0.98, 0, 0.05)])
+def test_a_sagging_chain_may_span_less_than_its_length(chord):
+    chord, links = np.array(chord), np.zeros((10, 4))
+    assert np.linalg.norm(chord) < 1
+    hang(tuple(chord), 0.1, 1e6, 0.05, links)
+    directions, stretch = links[:, :3], links[:, 3]
+    np.testing.assert_allclose(directions.T @ (0.1 + stretch), chord, atol=1e-9)
+    assert (stretch > 0).all()
+    np.testing.assert_allclose(
+        np.diff(1e6 * stretch[:, None] * directions, axis=0), np.tile([0, 0, 0.05], (9, 1)), atol=1e-6
+    )
+
+
 @pytest.mark.parametrize("chord", [(0, 0, 0.9999), (0.1, 0.2, 0.3), (0, 0, 0.0), (-0.8, 0, -0.2), (0, 0, -0.5)])
 def test_a_slack_chain_spans_its_chord_unstretched(chord):
     links = np.zeros((10, 4))

@@ -44,6 +44,7 @@ Vector = tuple[Float, Float, Float]
 Positive = Annotated[Float, Field(gt=0)]
 NotNegative = Annotated[Float, Field(ge=0)]
 PerDrone = Positive | tuple[Positive, ...]
+Links = Annotated[Int, Field(ge=2, le=100)]
 
 
 class Section(BaseModel):
@@ -125,8 +126,8 @@ class CableConfig(Section):
     length: PerDrone | None = Field(None, description="[m] natural length; None: 1 m, more if a point load needs it")
     stiffness: PerDrone = Field(1e5, description="[N/m] of the whole cable")
     damping: PerDrone = Field(1e3, description="[N s/m] of the whole cable")
-    segments: Int = Field(10, ge=2, le=100, description="links of a chain")
-    density: Positive = Field(0.01, description="[kg/m] of a chain")
+    segments: Links | tuple[Links, ...] = Field(10, description="links of a chain")
+    density: PerDrone = Field(0.01, description="[kg/m] of a chain")
     bending_stiffness: Float = Field(0.0, ge=0, description="[N m/rad] between the links of a chain")
     bending_damping: Float | None = Field(
         None, ge=0, description="[N m s/rad] between the links of a chain; None: as little as is stable"

@@ -45,7 +45,7 @@ class System:
         anchors: attachment of each cable from the payload's centre of mass, in its frame (N, 3) [m].
         cable_model: "massless" or "chain".
         cable_length, cable_stiffness, cable_damping: (N,) [m], [N/m], [N s/m].
-        cable_segments: links of each cable; 1 if massless.
+        cable_segments: links of each cable (N,); 1 if massless.
         cable_mass: (N,) [kg]; 0 if massless.
         bending_stiffness, bending_damping: between the links of a chain (N,) [N m/rad], [N m s/rad].
         formation_force: pull of each cable on the resting payload, in the payload frame (N, 3) [N].
@@ -71,7 +71,7 @@ class System:
     cable_length: np.ndarray
     cable_stiffness: np.ndarray
     cable_damping: np.ndarray
-    cable_segments: int
+    cable_segments: np.ndarray
     cable_mass: np.ndarray
     bending_stiffness: np.ndarray
     bending_damping: np.ndarray
@@ -101,12 +101,8 @@ class System:
     @property
     def resting_tension(self) -> np.ndarray:
         """Tension of each resting cable where it is measured, in its segment next to the drone (N,) [N]."""
-        return np.linalg.norm(self.segment_forces[:, -1], axis=1)
-
-    @property
-    def segment_forces(self) -> np.ndarray:
-        """Pull of each segment of the resting cables, from the payload up, payload frame (N, segments, 3) [N]."""
-        return _segment_forces(self.formation_force, self.cable_mass, self.cable_segments)
+        last = self.cable_mass * (1 - 1 / self.cable_segments)
+        return np.linalg.norm(self.formation_force + GRAVITY * last[:, None] * [0, 0, 1], axis=1)
 
 
 def resolve_system(config: Config) -> System:
@@ -141,15 +137,18 @@ def resolve_system(config: Config) -> System:
     stiffness = per_drone(cable.stiffness, n, "cable.stiffness")
     force = formation_forces(anchors, mass * GRAVITY, np.deg2rad(cable.angle), payload.shape == "point")
     chain = cable.model == "chain"
-    segments = cable.segments if chain else 1
-    rope = cable.density * length if chain else np.zeros(n)
-    forces = _segment_forces(force, rope, segments)
-    tension = np.linalg.norm(forces, axis=2)
-    reach = (length / segments)[:, None] + tension / (segments * stiffness)[:, None]
-    slots = anchors + (forces / tension[..., None] * reach[..., None]).sum(axis=1)
-    bending = cable.bending_damping
-    if bending is None:
-        bending = _steady_bending(tension[:, -1], rope, length, segments, config.sim.timestep) if chain else 0.0
+    segments = per_drone(cable.segments if chain else 1, n, "cable.segments").astype(int)
+    rope = per_drone(cable.density, n, "cable.density") * length if chain else np.zeros(n)
+    slots, bending = anchors.copy(), np.zeros(n)
+    for i, links in enumerate(segments):
+        forces = _segment_forces(force[i], rope[i], links)
+        tension = np.linalg.norm(forces, axis=1)
+        reach = length[i] / links + tension / (links * stiffness[i])
+        slots[i] += (forces / tension[:, None] * reach[:, None]).sum(axis=0)
+        if chain:
+            bending[i] = _steady_bending(tension[-1], rope[i], length[i], links, config.sim.timestep)
+    if cable.bending_damping is not None:
+        bending[:] = cable.bending_damping
     centred = np.hypot(slots[:, 0], slots[:, 1]) < 1e-9
     system = System(
         vehicle=vehicle,
@@ -169,7 +168,7 @@ def resolve_system(config: Config) -> System:
         cable_segments=segments,
         cable_mass=rope,
         bending_stiffness=np.full(n, cable.bending_stiffness),
-        bending_damping=np.broadcast_to(bending, n).astype(float),
+        bending_damping=bending,
         formation_force=force,
         slots=slots,
         slot_azimuth=np.where(centred, 0.0, np.arctan2(slots[:, 1], slots[:, 0])),
@@ -184,25 +183,24 @@ def resolve_system(config: Config) -> System:
     return system
 
 
-def _segment_forces(force: np.ndarray, mass: np.ndarray, segments: int) -> np.ndarray:
-    """Return the pulls (N, segments, 3) [N] of cables of `mass` (N,) [kg] that pull the payload by `force` (N, 3) [N].
+def _segment_forces(force: np.ndarray, mass: float, segments: int) -> np.ndarray:
+    """Return the pulls (segments, 3) [N] of a cable of `mass` [kg] that pulls the payload by `force` (3,) [N].
 
     The mass of each segment is at its upper end, so each carries one segment's weight more than that below it.
     """
-    carried = GRAVITY * mass[:, None] / segments * np.arange(segments)
-    return force[:, None] + carried[..., None] * [0, 0, 1]
+    return force + GRAVITY * mass / segments * np.arange(segments)[:, None] * [0, 0, 1]
 
 
-def _steady_bending(tension: np.ndarray, mass: np.ndarray, length: np.ndarray, n: int, h: float) -> np.ndarray:
-    """Return the bending damping (N,) [N m s/rad] that keeps the sideways motion of a chain's nodes stable.
+def _steady_bending(tension: float, mass: float, length: float, n: int, h: float) -> float:
+    """Return the bending damping [N m s/rad] that keeps the sideways motion of a chain's nodes stable.
 
     Tension T acts on it explicitly: mode λ = 2 - 2 cos(jπ/n) of nodes m on links l moves stably in steps h if
     m + h d λ²/l² ≥ h² T λ/4l. T l h is enough unless the nodes are light; twice the tension at rest is allowed for.
     """
     modes = 2 - 2 * np.cos(np.pi * np.arange(1, n) / n)
-    tension, node, link = tension[:, None], mass[:, None] / n, length[:, None] / n
+    node, link = mass / n, length / n
     least = 2 * tension * link * h / (4 * modes) - node * link**2 / (h * modes**2)
-    return np.maximum(tension[:, 0] * link[:, 0] * h, least.max(axis=1))
+    return max(tension * link * h, float(least.max()))
 
 
 def _check_possible(system: System, heaviest: float) -> None:

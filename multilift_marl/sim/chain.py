@@ -56,7 +56,12 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 class Chain(NamedTuple):
     """Numbers of the chains."""
 
-    segments: int
+    segments: np.ndarray
+    """(N,) links."""
+    coordinates: np.ndarray
+    """(N + 1,) where each cable's coordinates start, counted from the payload's."""
+    velocities: np.ndarray
+    """(N + 1,) likewise."""
     frames: np.ndarray
     """(N, 3, 3) frame of the first link in the payload's, in the resting formation."""
     length: np.ndarray
@@ -71,6 +76,8 @@ def make_chain(system: System) -> Chain:
     n = system.cable_segments
     return Chain(
         segments=n,
+        coordinates=np.cumsum(np.append(0, 5 * n + 4)),
+        velocities=np.cumsum(np.append(0, 4 * n + 3)),
         frames=np.stack([link_frame(force) for force in system.formation_force]),
         length=system.cable_length / n,
         stiffness=n * system.cable_stiffness,
@@ -107,7 +114,7 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
             putmat(state.drone_rotation[e, n], quat_to_mat(told[at + 3], told[at + 4], told[at + 5], told[at + 6]))
             pull = _tension(n, line, c, chain)
             keep_tension(e, n, pull, state, record, c)
-            slack = slack or pull <= chain.segments * chain.weight[n]  # the drone holds the cable, and nothing more
+            slack = slack or pull <= chain.segments[n] * chain.weight[n]  # the drone holds the cable, and nothing more
         if slack:
             record.slack_time[e] += c.timestep
 
@@ -115,8 +122,8 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
 @kernel
 def _tension(n, line, c, chain):
     """Return the tension of cable n in its segment next to the drone [N]; 0 where that is pushed together."""
-    at = c.qpos + c.payload_nq + n * (5 * chain.segments + 4) + 5 * chain.segments - 1
-    v = c.qvel + c.payload_nv + n * (4 * chain.segments + 3) + 4 * chain.segments - 1
+    at = c.qpos + c.payload_nq + chain.coordinates[n] + 5 * chain.segments[n] - 1
+    v = c.qvel + c.payload_nv + chain.velocities[n] + 4 * chain.segments[n] - 1
     return max(0.0, chain.stiffness[n] * line[at] + chain.damping[n] * line[v])
 
 
@@ -136,7 +143,7 @@ def _sound(line, told, c, chain):
         for j in range(7):
             if not isfinite(told[_SENSORS * n + j]):
                 return False
-    for j in range(c.payload_nq + count * (5 * chain.segments + 4)):
+    for j in range(c.payload_nq + chain.coordinates[count]):
         if not isfinite(line[c.qpos + j]):
             return False
     return True
@@ -149,8 +156,7 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
     A cable hangs between payload and drone as it would at rest, a slack one in an arc; its nodes move as if it were
     stretched evenly.
     """
-    n = chain.segments
-    links = np.zeros((n, 4))
+    links = np.zeros((chain.segments.max(), 4))
     for e in range(lo, hi):
         if not mask[e]:
             continue
@@ -161,11 +167,12 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
         if c.payload_nv == 3:
             attitude, spin = _UPRIGHT, (0.0, 0.0, 0.0)
         spin = mul(attitude, spin)
-        at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
         for i in range(chain.length.shape[0]):
+            n = chain.segments[i]
+            at, v = c.qpos + c.payload_nq + chain.coordinates[i], c.qvel + c.payload_nv + chain.velocities[i]
             anchor = mul(attitude, (c.anchors[i, 0], c.anchors[i, 1], c.anchors[i, 2]))
             chord = sub(vec(state.drone_position, e, i), add(row(state.payload_position, e), anchor))
-            hang(chord, chain.length[i], chain.stiffness[i], chain.weight[i], links)
+            hang(chord, chain.length[i], chain.stiffness[i], chain.weight[i], links[:n])
             opening = sub(vec(state.drone_velocity, e, i), add(row(state.payload_velocity, e), cross(spin, anchor)))
             frame, rate = matmul(attitude, matrow(chain.frames, i)), spin
             for j in range(n):
@@ -179,7 +186,6 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
             q = mat_to_quat(matmul(transpose(frame), drone))
             line[at], line[at + 1], line[at + 2], line[at + 3] = q
             put(line[v : v + 3], sub(vec(state.drone_body_rates, e, i), tmul(drone, rate)))
-            at, v = at + 4, v + 3
             keep_tension(e, i, _tension(i, line, c, chain), state, record, c)
 
 

@@ -50,7 +50,7 @@ def tested_stiffness(data: mujoco.MjData, system: System) -> float:
     The tensions are what statics says: the load's share below, one node's weight more with every segment, and the
     horizontal pull that goes with the direction of the lowest link.
     """
-    n = system.cable_segments
+    n = int(system.cable_segments[0])
     lowest = data.body("cable_0/link_0").xmat.reshape(3, 3)[:, 2]
     share = system.payload_mass * GRAVITY / system.num_drones
     upward = share + GRAVITY * system.cable_mass[0] / n * np.arange(n)
