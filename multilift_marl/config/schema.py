@@ -91,6 +91,10 @@ class VehicleConfig(Section):
     drag: tuple[NotNegative, NotNegative, NotNegative] | None = Field(
         None, description="[kg/s] linear drag along the body axes"
     )
+    rotor_radius: Float | None = Field(None, gt=0, description="[m] for wash and ground effect")
+    rolling_moment: Float | None = Field(
+        None, ge=0, description="[kg m] moment of a rotor over its speed and that of the air across it"
+    )
 
 
 class PayloadConfig(Section):
@@ -159,9 +163,19 @@ class RandomizationConfig(Section):
 
 
 class WindConfig(Section):
-    """The air."""
+    """The air (docs/air.md)."""
 
     velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s] mean wind in the world frame")
+    turbulence: bool = Field(False, description="Dryden turbulence of MIL-F-8785C, as strong as the mean wind")
+    gust: Vector = Field((0.0, 0.0, 0.0), description='[m/s] amplitude of a "1 - cosine" gust in the world frame')
+    gust_start: Float = Field(2.0, ge=0, description="[s] when the gust begins, from the start of the episode")
+    gust_rise: Float = Field(0.5, gt=0, description="[s] in which it rises, and falls")
+    gust_hold: Float | None = Field(1.0, ge=0, description="[s] that it lasts in between; None: for good")
+    wash: bool = Field(False, description="rotor wash of each drone on the drones and the payload below it")
+    ground_effect: bool = Field(False, description="more thrust near the ground (Cheeseman and Bennett 1955)")
+    roll_moment: Float = Field(
+        0.0, description="[N s] moment about body x for each m/s through the air along body y (report eqs 12-13)"
+    )
 
 
 class TrainConfig(Section):

@@ -17,11 +17,11 @@ from multilift_marl.config.rig import (
     standard_length,
     uniform_inertia,
 )
-from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, resolve_vehicle
+from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, check_rotors, resolve_vehicle
 from multilift_marl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from multilift_marl.config.schema import Config
+    from multilift_marl.config.schema import Config, WindConfig
 
 MIN_THRUST_TO_WEIGHT = 1.18
 MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the vehicle's span
@@ -53,6 +53,7 @@ class System:
         slot_azimuth: direction of each slot from the payload, in its horizontal plane (N,) [rad].
         min_separation: distance between drones that counts as a collision [m].
         wind: mean wind (3,) [m/s].
+        air: what else the air does.
         timestep: physics step [s].
         control_interval: physics steps for each control step.
     """
@@ -80,6 +81,7 @@ class System:
     slot_azimuth: np.ndarray
     min_separation: float
     wind: np.ndarray
+    air: WindConfig
     timestep: float
     control_interval: int
 
@@ -174,6 +176,7 @@ def resolve_system(config: Config) -> System:
         slot_azimuth=np.where(centred, 0.0, np.arctan2(slots[:, 1], slots[:, 0])),
         min_separation=MIN_SEPARATION * scale,
         wind=np.asarray(config.wind.velocity, float),
+        air=config.wind,
         timestep=config.sim.timestep,
         control_interval=whole_ratio(
             1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"
@@ -206,6 +209,8 @@ def _steady_bending(tension: float, mass: float, length: float, n: int, h: float
 def _check_possible(system: System, heaviest: float) -> None:
     """Refuse what cannot fly, hovering under a payload `heaviest` times its nominal mass included."""
     n, vehicle = system.num_drones, system.vehicle
+    if system.air.wash or system.air.ground_effect:
+        check_rotors(vehicle)
     thrust = 4 * vehicle.rotor_thrust_max
     if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
         lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"

@@ -215,6 +215,8 @@ class MultiliftVec:
         """Draw hidden parameters and a sound start for one environment."""
         key = (self.purpose, self.first_env + e, int(self.episodes[e]))
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(int(self.seeds[e]), spawn_key=key)))
+        if self.world.system.air.turbulence:  # a stream of its own: all other draws stay what they are without it
+            self.world.seed_turbulence(e, np.random.SeedSequence(int(self.seeds[e]), spawn_key=(*key, 1)))
         randomize(self.world, e, rng, self.config.randomization, self._mass)
         for _ in range(_MAX_REDRAWS):
             self.task.start(e, rng, float(self._mass[e]))

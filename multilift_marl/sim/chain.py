@@ -37,7 +37,8 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-from multilift_marl.sim.dynamics import (
+from multilift_marl.sim.hanging import hang
+from multilift_marl.sim.rows import (
     MAX_RATE,
     MAX_SPEED,
     MAX_STRETCH,
@@ -46,7 +47,6 @@ from multilift_marl.sim.dynamics import (
     read_payload,
     write_payload,
 )
-from multilift_marl.sim.hanging import hang
 from multilift_marl.sim.scene import link_frame
 
 _SENSORS = 13  # numbers of each drone: position, quaternion, velocity, body rates
@@ -88,7 +88,7 @@ def make_chain(system: System) -> Chain:
 
 @kernel
 def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
-    """Read the physical state of teams on chains, as `dynamics.read_rows` does; tensions too are current.
+    """Read the physical state of teams on chains, as `rows.read_rows` does; tensions too are current.
 
     Args:
         rows: `batch.state` of environments lo to hi.
@@ -151,7 +151,7 @@ def _sound(line, told, c, chain):
 
 @kernel
 def write_chains(rows, lo, hi, mask, state, record, c, chain):
-    """Write the state of the environments in `mask` into `batch.state`, as `dynamics.write_rows` does.
+    """Write the state of the environments in `mask` into `batch.state`, as `rows.write_rows` does.
 
     A cable hangs between payload and drone as it would at rest, a slack one in an arc; its nodes move as if it were
     stretched evenly.

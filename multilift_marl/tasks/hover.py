@@ -30,7 +30,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.sim.cables import cable_end
-from multilift_marl.sim.dynamics import hover_drone
+from multilift_marl.sim.rows import hover_drone
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.terms import tolerance
