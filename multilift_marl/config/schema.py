@@ -130,6 +130,7 @@ class CableConfig(Section):
     length: PerDrone | None = Field(None, description="[m] natural length; None: 1 m, more if a point load needs it")
     stiffness: PerDrone = Field(1e5, description="[N/m] of the whole cable")
     damping: PerDrone = Field(1e3, description="[N s/m] of the whole cable")
+    breaking_load: PerDrone | None = Field(None, description="[N] tension that breaks a cable; None: none does")
     segments: Links | tuple[Links, ...] = Field(10, description="links of a chain")
     density: PerDrone = Field(0.01, description="[kg/m] of a chain")
     bending_stiffness: Float = Field(0.0, ge=0, description="[N m/rad] between the links of a chain")

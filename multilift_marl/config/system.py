@@ -45,6 +45,7 @@ class System:
         anchors: attachment of each cable from the payload's centre of mass, in its frame (N, 3) [m].
         cable_model: "massless" or "chain".
         cable_length, cable_stiffness, cable_damping: (N,) [m], [N/m], [N s/m].
+        breaking_load: tension that breaks each cable (N,) [N]; infinite if none does.
         cable_segments: links of each cable (N,); 1 if massless.
         cable_mass: (N,) [kg]; 0 if massless.
         bending_stiffness, bending_damping: between the links of a chain (N,) [N m/rad], [N m s/rad].
@@ -72,6 +73,7 @@ class System:
     cable_length: np.ndarray
     cable_stiffness: np.ndarray
     cable_damping: np.ndarray
+    breaking_load: np.ndarray
     cable_segments: np.ndarray
     cable_mass: np.ndarray
     bending_stiffness: np.ndarray
@@ -167,6 +169,9 @@ def resolve_system(config: Config) -> System:
         cable_length=length,
         cable_stiffness=stiffness,
         cable_damping=per_drone(cable.damping, n, "cable.damping"),
+        breaking_load=per_drone(
+            np.inf if cable.breaking_load is None else cable.breaking_load, n, "cable.breaking_load"
+        ),
         cable_segments=segments,
         cable_mass=rope,
         bending_stiffness=np.full(n, cable.bending_stiffness),
@@ -225,6 +230,13 @@ def _check_possible(system: System, heaviest: float) -> None:
         raise ConfigError(
             f"drone {i} would need {hover[i]:.1f} N of its {thrust:.1f} N to hover under the heaviest payload; lower "
             "payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
+        )
+    tight = heaviest * system.resting_tension
+    if np.any(tight >= system.breaking_load):
+        i = int(np.argmax(tight - system.breaking_load))
+        raise ConfigError(
+            f"cable {i} would break at rest: {tight[i]:.1f} N under the heaviest payload, but cable.breaking_load is "
+            f"{system.breaking_load[i]:g} N; raise it or lower payload.mass"
         )
     if n > 1:
         apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)

@@ -218,6 +218,7 @@ class MultiliftVec:
         if self.world.system.air.turbulence:  # a stream of its own: all other draws stay what they are without it
             self.world.seed_turbulence(e, np.random.SeedSequence(int(self.seeds[e]), spawn_key=(*key, 1)))
         randomize(self.world, e, rng, self.config.randomization, self._mass)
+        self.world.state.cable_broken[e] = False
         for _ in range(_MAX_REDRAWS):
             self.task.start(e, rng, float(self._mass[e]))
             if self.task.begin(e):

@@ -100,7 +100,7 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
     """
     for e in range(lo, hi):
         line, told = rows[e - lo], sensors[e - lo]
-        if diverged[e] or not _sound(line, told, c, chain):
+        if diverged[e] or not _sound(line, told, state.cable_broken[e], c, chain):
             diverged[e] = True
             continue
         read_payload(e, line, state, c)
@@ -112,7 +112,7 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
                 state.drone_velocity[e, n, j] = told[at + 7 + j]
                 state.drone_body_rates[e, n, j] = told[at + 10 + j]
             putmat(state.drone_rotation[e, n], quat_to_mat(told[at + 3], told[at + 4], told[at + 5], told[at + 6]))
-            pull = _tension(n, line, c, chain)
+            pull = 0.0 if state.cable_broken[e, n] else _tension(n, line, c, chain)
             keep_tension(e, n, pull, state, record, c)
             slack = slack or pull <= chain.segments[n] * chain.weight[n]  # the drone holds the cable, and nothing more
         if slack:
@@ -128,7 +128,7 @@ def _tension(n, line, c, chain):
 
 
 @kernel
-def _sound(line, told, c, chain):
+def _sound(line, told, broken, c, chain):
     """Return whether a simulation's numbers are finite and within physical bounds."""
     for j in range(c.payload_nv):
         if not abs(line[c.qvel + j]) < (MAX_SPEED if j < 3 else MAX_RATE):
@@ -138,7 +138,7 @@ def _sound(line, told, c, chain):
         for j in range(7, _SENSORS):
             if not abs(told[_SENSORS * n + j]) < (MAX_SPEED if j < 10 else MAX_RATE):
                 return False
-        if not _tension(n, line, c, chain) < MAX_STRETCH * c.cable_stiffness[n] * c.cable_length[n]:
+        if not broken[n] and not _tension(n, line, c, chain) < MAX_STRETCH * c.cable_stiffness[n] * c.cable_length[n]:
             return False
         for j in range(7):
             if not isfinite(told[_SENSORS * n + j]):

@@ -50,6 +50,8 @@ class Constants(NamedTuple):
     """(N, 3) [m]."""
     cable_length: np.ndarray
     cable_stiffness: np.ndarray
+    breaking_load: np.ndarray
+    """(N,) [N]."""
     qpos: int
     """Offset of qpos in a row of `batch.state`; likewise the next ones."""
     qvel: int
@@ -86,6 +88,7 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         anchors=np.ascontiguousarray(system.anchors),
         cable_length=system.cable_length,
         cable_stiffness=system.cable_stiffness,
+        breaking_load=system.breaking_load,
         qpos=qpos,
         qvel=qvel,
         force=force,

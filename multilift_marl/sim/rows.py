@@ -80,8 +80,10 @@ def read_payload(e, line, state, c):
 
 @kernel
 def keep_tension(e, n, pull, state, record, c):
-    """Note the tension [N] of cable n in state and record."""
+    """Note the tension [N] of cable n in state and record, and whether it breaks."""
     state.cable_tension[e, n] = pull
+    if pull > c.breaking_load[n]:
+        state.cable_broken[e, n] = True
     record.tension_min[e] = min(record.tension_min[e], pull)
     record.tension_max[e] = max(record.tension_max[e], pull)
     record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[n] * c.cable_length[n]))

@@ -30,6 +30,8 @@ class SystemState(NamedTuple):
     """(E, N, 4) of each rotor, with its lag, never negative [rad/s]; times 30/π for revolutions per minute."""
     cable_tension: np.ndarray
     """(E, N) [N]. Massless: in the last physics step, exactly 0 when slack. Chain: now, next to the drone."""
+    cable_broken: np.ndarray
+    """(E, N) bool, once its tension has exceeded its breaking load, or by `World.break_cables`."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> SystemState:
@@ -38,6 +40,7 @@ class SystemState(NamedTuple):
         state = cls(
             *(np.zeros(shape) for shape in ((e, 3), (e, 3, 3), (e, 3), (e, 3))),
             *(np.zeros(shape) for shape in ((e, n, 3), (e, n, 3, 3), (e, n, 3), (e, n, 3), (e, n, 4), (e, n))),
+            np.zeros((e, n), bool),
         )
         state.payload_rotation[:] = np.eye(3)
         state.drone_rotation[:] = np.eye(3)

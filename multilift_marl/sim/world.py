@@ -16,6 +16,7 @@ from mujoco.batch import Batch, SimulationError
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
 from multilift_marl.sim.air import start_turbulence
+from multilift_marl.sim.breaking import cut_cables
 from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.chain import make_chain, read_chains, write_chains
 from multilift_marl.sim.dynamics import apply_loads, make_constants
@@ -40,6 +41,8 @@ class Shard:
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
     read: Callable[[], None]
     """`read_rows` or `read_chains` of these environments."""
+    broken: np.ndarray
+    """(hi - lo, N) cables that the batch's models lack."""
 
 
 class World:
@@ -77,6 +80,7 @@ class World:
         self.air, self.seed = Air.zeros(num_envs, self.num_drones), seed
         self.record = Record.zeros(num_envs)
         self.diverged = np.zeros(num_envs, bool)
+        self._breakable = bool(np.isfinite(system.breaking_load).any())
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool, self._pool_owner = None, 0
         self.reset()
@@ -135,6 +139,8 @@ class World:
             except SimulationError as error:
                 self.diverged[shard.lo + np.asarray(error.ids, int)] = True
             shard.read()
+            if self._breakable:
+                self._cut(shard)
 
     def run(self, work: Callable[[Shard], None]) -> None:
         """Call `work` for every shard, each on a thread of its own."""
@@ -187,12 +193,23 @@ class World:
         self.air.generator[env] = seed.generate_state(1, np.uint64)[0]
         start_turbulence(env, self.air)
 
+    def break_cables(self, mask: np.ndarray) -> None:
+        """Let the cables in `mask` (E, N) bool break; `reset` and `load` make them whole again."""
+        self.state.cable_broken[mask] = True
+        for shard in self.shards:
+            self._cut(shard)
+
     def load(self, mask: np.ndarray) -> None:
-        """Make `state` of the environments in `mask` (E,) the simulations' own; records and gusts start anew."""
+        """Make `state` of the environments in `mask` (E,) the simulations' own.
+
+        Records and gusts start anew, cables are whole.
+        """
+        self.state.cable_broken[mask] = False
         self.air.gust[mask] = self.air.wash[mask] = self.air.steps[mask] = 0
         for shard in self.shards:
             local = mask[shard.lo : shard.hi]
             if local.any():
+                self._cut(shard)
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
                 self._write(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.record, *self.constants)
         self.diverged[mask] = False
@@ -230,7 +247,15 @@ class World:
         for shard in self.shards:
             shard.batch.state[:] = saved["rows"][shard.lo : shard.hi]
             shard.batch.warning[:] = saved["warning"][shard.lo : shard.hi]
+            self._cut(shard)
         self.diverged[:] = saved["diverged"]
+
+    def _cut(self, shard: Shard) -> None:
+        """Bring the shard's models into line with `state.cable_broken`."""
+        broken = self.state.cable_broken[shard.lo : shard.hi]
+        if (broken != shard.broken).any():
+            cut_cables(shard.batch, self.model, self.system, broken)
+            shard.broken[:] = broken
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int)
@@ -247,7 +272,7 @@ class World:
             span, told = (batch.state, lo, hi), batch.bind("sensordata")
             apply = bind(apply_loads, *span, self.thrust, self.state, self.plant, self.air, self.record, constants)
             follow = bind(read, *span, told, self.state, self.record, self.diverged, *self.constants)
-            shards.append(Shard(lo, hi, batch, step, apply, follow))
+            shards.append(Shard(lo, hi, batch, step, apply, follow, np.zeros((hi - lo, self.num_drones), bool)))
         return shards
 
 
