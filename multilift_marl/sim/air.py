@@ -41,6 +41,8 @@ class AirConstants(NamedTuple):
     rotor_positions: np.ndarray
     """(4, 3) [m]."""
     arm: float
+    payload_breadth: float
+    """Radius of a disc as large as the payload's C_d A [m]."""
     thrust_coefficient: float
     ground_effect: bool
     rotor_distances: np.ndarray
@@ -70,6 +72,7 @@ def make_air(system: System) -> AirConstants:
         rotor_radius=float(vehicle.rotor_radius),
         rotor_positions=rotors,
         arm=float(vehicle.arm),
+        payload_breadth=sqrt(system.payload_drag_area / pi),
         thrust_coefficient=float(vehicle.thrust_coefficient),
         ground_effect=air.ground_effect,
         rotor_distances=((rotors[:, None] - rotors[None]) ** 2).sum(axis=-1),
@@ -188,23 +191,26 @@ def blow(e, wind, state, air, timestep, c):
 @kernel
 def spread_wash(e, state, air, c):
     """Find the rotors' wash at every body of environment e, from the state as it is; write `air.wash`."""
-    for i in range(air.wash.shape[1] - 1):
-        put(air.wash[e, i], wash_at(e, i, vec(state.drone_position, e, i), state, c))
-    put(air.wash[e, air.wash.shape[1] - 1], wash_at(e, -1, row(state.payload_position, e), state, c))
+    count = state.drone_position.shape[1]
+    for i in range(count):
+        put(air.wash[e, i], wash_at(e, i, vec(state.drone_position, e, i), c.arm, state, c))
+    put(air.wash[e, count], wash_at(e, -1, row(state.payload_position, e), c.payload_breadth, state, c))
 
 
 @kernel
-def wash_at(e, drone, point, state, c):
-    """Return the velocity of the wash of all drones but one at a point [m/s], world frame.
+def wash_at(e, drone, point, breadth, state, c):
+    """Return the velocity of the wash of all drones but one at a body [m/s], world frame.
 
     Every rotor blows a round turbulent jet against its thrust f: the momentum flux ρ w² is Gaussian across it and
     adds up to f at any distance, the width grows in proportion to the distance once it exceeds that of the contracted
-    slipstream of momentum theory. The momentum fluxes of jets add up (Reichardt 1942).
+    slipstream of momentum theory. The momentum fluxes of jets add up (Reichardt 1942). A body feels their mean over
+    its breadth, with a Gaussian weight, so that no drag exceeds the momentum that there is.
 
     Args:
         e: the environment.
         drone: whose own wash does not count; -1 for none.
-        point: [m].
+        point: middle of the body [m].
+        breadth: its radius [m]; 0 for the velocity at a point.
         state: SystemState; positions, attitudes and rotor speeds are used.
         c: AirConstants.
     """
@@ -216,16 +222,18 @@ def wash_at(e, drone, point, state, c):
         attitude = mat(state.drone_rotation, e, n)
         axis, away = column(attitude, 2), sub(point, vec(state.drone_position, e, n))
         depth = -dot(away, axis)
-        width = max(c.rotor_radius / sqrt(2.0), growth * depth)
-        if depth <= 0.0 or dot(away, away) - depth * depth > (c.arm + _REACH * width) ** 2:
+        if depth <= 0.0:
+            continue
+        square = max(c.rotor_radius / sqrt(2.0), growth * depth) ** 2 + breadth * breadth
+        if dot(away, away) - depth * depth > (c.arm + _REACH * sqrt(square)) ** 2:
             continue
         amount = 0.0
         for k in range(4):
             rotor = mul(attitude, row(c.rotor_positions, k))
-            beside = add(sub(away, rotor), scale(depth, axis))
+            beside = sub(add(away, scale(depth, axis)), rotor)
             thrust = c.thrust_coefficient * state.rotor_speed[e, n, k] ** 2
-            amount += thrust * exp(-dot(beside, beside) / (width * width))
-        flux = sub(flux, scale(amount / (AIR_DENSITY * pi * width * width), axis))
+            amount += thrust * exp(-dot(beside, beside) / square)
+        flux = sub(flux, scale(amount / (AIR_DENSITY * pi * square), axis))
     size = norm(flux)
     return scale(1.0 / sqrt(size), flux) if size > 0.0 else flux
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from multilift_marl.errors import nearest
-from multilift_marl.validation import bodies, cables, flight
+from multilift_marl.validation import air, bodies, cables, flight
 from multilift_marl.validation.experiment import Experiment, Result, Row
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -23,6 +23,10 @@ EXPERIMENTS: dict[str, Experiment] = {
     "motor_lag": bodies.motor_lag,
     "spin": bodies.spin,
     "circle": flight.circle,
+    "turbulence": air.turbulence_spectra,
+    "gust": air.gust,
+    "wash": air.wash,
+    "ground_effect": air.ground_effect,
 }
 
 
@@ -106,6 +110,8 @@ def draw(results: dict[str, Result], out: Path) -> None:
         axes.grid(color="0.9")
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False)
+        if plot.log:
+            axes.set(xscale="log", yscale="log")
         if plot.equal:
             axes.set_aspect("equal")
         figure.savefig(out / f"{plot.name}.png", dpi=110)

@@ -50,6 +50,8 @@ class Plot:
     curves: list[Curve] = field(default_factory=list)
     equal: bool = False
     """Whether both axes have the same scale."""
+    log: bool = False
+    """Whether both axes are logarithmic."""
 
 
 @dataclass
