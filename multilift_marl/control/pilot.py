@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from multilift_marl._jit import bind
 from multilift_marl.config.schema import Config
 from multilift_marl.control.actions import ACTIONS, Call, Team
-from multilift_marl.control.disturbance import Disturbance, bind_rejection, forget, make_rejection
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
 from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.geometric import make_gains
 from multilift_marl.control.setpoints import Setpoint
@@ -69,8 +70,8 @@ class Pilot:
         follow = self.interface.follow(lo, hi, team) if plan is None else self.interface.ride(lo, hi, plan, act, team)
         if rejection is None:
             return act, follow
-        known, own = (state, self.reference, goal.pull, thrust), (rejection, g, self._rejection)
-        estimate = bind_rejection(lo, hi, *known, *own, self._kind)
+        known, own = (state, self.reference, goal.pull), (rejection, g, self._rejection)
+        estimate = bind(REJECTIONS[self._kind], lo, hi, *known, *own)
         return act, (*follow[:-1], estimate, follow[-1])
 
     def start(self, e: int) -> None:
