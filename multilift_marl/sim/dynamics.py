@@ -18,11 +18,11 @@ from multilift_marl.sim.air import (
     AIR_DENSITY,
     AirConstants,
     air_moment,
-    blow,
     ground_gain,
     make_air,
     spread_wash,
 )
+from multilift_marl.sim.gusts import blow
 from multilift_marl.sim.scene import Layout
 
 

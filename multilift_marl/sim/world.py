@@ -15,10 +15,10 @@ from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
-from multilift_marl.sim.air import start_turbulence
 from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.chain import make_chain, read_chains, write_chains
 from multilift_marl.sim.dynamics import apply_loads, make_constants
+from multilift_marl.sim.gusts import start_turbulence
 from multilift_marl.sim.rows import hover_drone, read_rows, write_rows
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.state import Air, Plant, Record, SystemState
