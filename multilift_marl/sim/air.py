@@ -21,7 +21,7 @@ _REACH = 4.0  # [-] widths of a jet beyond which it is not felt
 
 
 class AirConstants(NamedTuple):
-    """Numbers of the compiled loops; what is switched off costs one branch."""
+    """Numbers of the compiled loops."""
 
     gusts: bool
     """Whether there is turbulence or a gust."""
@@ -50,6 +50,11 @@ class AirConstants(NamedTuple):
     """[kg m] of each rotor."""
     rotor_spin: np.ndarray
 
+    @property
+    def still(self) -> bool:
+        """Whether all of it is switched off."""
+        return not (self.gusts or self.wash or self.ground_effect or self.moments)
+
 
 def make_air(system: System) -> AirConstants:
     """Return the air of `system`."""
@@ -59,7 +64,7 @@ def make_air(system: System) -> AirConstants:
     distances, counts = np.unique(squares.round(12), return_counts=True)
     hold = float("inf") if air.gust_hold is None else air.gust_hold
     return AirConstants(
-        gusts=air.turbulence or any(air.gust),
+        gusts=bool(air.turbulence or any(air.gust)),
         turbulence=air.turbulence,
         gust=tuple(float(x) for x in air.gust),
         gust_start=float(air.gust_start),

@@ -15,6 +15,7 @@ from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
+from multilift_marl.sim.air import make_air
 from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.chain import make_chain, read_chains, write_chains
 from multilift_marl.sim.dynamics import apply_loads, make_constants
@@ -244,8 +245,11 @@ class World:
             offsets = [_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied", "xfrc_applied")]
             constants = make_constants(self.system, self.layout, *offsets)  # the same for every shard
             self.constants = (constants, make_chain(self.system)) if chain else (constants,)
+            flow = make_air(self.system)
+            air, flow = (None, None) if flow.still else (self.air, flow)
             span, told = (batch.state, lo, hi), batch.bind("sensordata")
-            apply = bind(apply_loads, *span, self.thrust, self.state, self.plant, self.air, self.record, constants)
+            blown = (self.thrust, self.state, self.plant, self.record, constants, air, flow)
+            apply = bind(apply_loads, *span, *blown)
             follow = bind(read, *span, told, self.state, self.record, self.diverged, *self.constants)
             shards.append(Shard(lo, hi, batch, step, apply, follow))
         return shards
