@@ -146,8 +146,10 @@ def test_commands_of_documents_run_in_order(tmp_path):
             command += f" {short}"
         if script == "evaluate.py":
             command = re.sub(r"episodes=\d+", "episodes=2", command) + " env.episode_seconds=0.4"
-        if script.startswith("bench/"):
+        if script == "bench/bench.py":
             command += " repeats=1 seconds=0.05 env.num_envs=4"
+        if script == "bench/disturbance.py":
+            command = command.split(" rigs=")[0].replace("seconds=30", "") + " rigs=report4 seconds=0.05"
         done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
 
