@@ -131,6 +131,11 @@ def test_a_reset_world_starts_its_turbulence_anew_and_a_seed_changes_it():
     assert not same(other.air.filter[1], World(system, 3, 1, seed=1).air.filter[1])
 
 
+def test_a_negative_seed_is_refused():
+    with pytest.raises(ValueError, match="seed=-1 must be at least 0"):
+        World(make_system(1), 1, 1, seed=-1)
+
+
 # Episodes
 
 

@@ -68,6 +68,8 @@ class World:
     def __init__(self, system: System, num_envs: int, num_threads: int = 0, seed: int = 0):
         if num_envs < 1 or num_threads < 0:
             raise ValueError(f"num_envs={num_envs} must be at least 1 and num_threads={num_threads} at least 0")
+        if seed < 0:
+            raise ValueError(f"seed={seed} must be at least 0")
         _quiet_mujoco()
         self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
         self.model, self.layout = build_model(system)
