@@ -23,6 +23,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "swing": bodies.swing,
     "free_fall": bodies.free_fall,
     "spin": bodies.spin,
+    "ground": bodies.ground,
     "motor_lag": bodies.motor_lag,
     "momentum": momentum.momentum,
     "symmetry": symmetry.symmetry,

@@ -11,6 +11,7 @@ from multilift_marl.config.load import load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.config.system import GRAVITY
 from multilift_marl.sim.dynamics import AIR_DENSITY
+from multilift_marl.sim.scene import drone_half_size
 from multilift_marl.sim.world import World
 from multilift_marl.validation.cables import hanging_load
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row, ms, order_row, relative
@@ -177,3 +178,40 @@ def _mean(a: float, b: float) -> float:
     while abs(a - b) > 1e-15 * a:
         a, b = 0.5 * (a + b), float(np.sqrt(a * b))
     return a
+
+
+def ground(fast: bool) -> Result:
+    """A payload and drones, dropped tilted with their rotors still, come to rest on the ground and stay there."""
+    caption = "Dropped from 30 cm with tilts of 10°: heights of payload and one drone above their resting heights."
+    plot = Plot("ground", "coming to rest on the ground", "time [s]", "height [m]", caption=caption)
+    result = Result(plots=[plot])
+    for timestep in (4e-3, 1e-3):
+        system = make_config(4, timestep, vehicle__rotor_speed_min=0.0).system
+        world = World(system, 1, 1)
+        state, half = world.state, drone_half_size(system.vehicle)[2]
+        frame = np.zeros(9)
+        mujoco.mju_quat2Mat(frame, np.array([np.cos(np.deg2rad(5)), np.sin(np.deg2rad(5)), 0, 0]))
+        state.payload_position[0] = [0, 0, system.payload_size[2] / 2 + 0.3]
+        outward = system.slots[:, :2] / np.linalg.norm(system.slots[:, :2], axis=1, keepdims=True)
+        state.drone_position[0, :, :2] = system.anchors[:, :2] + 0.6 * outward
+        state.drone_position[0, :, 2] = half + 0.3
+        state.payload_rotation[:] = state.drone_rotation[:] = frame.reshape(3, 3)
+        state.rotor_speed[:] = 0.0
+        world.load(np.ones(1, bool))
+        rest, thrust = np.array([system.payload_size[2] / 2] + [half] * 4), np.zeros((1, 4, 4))
+        heights = []
+        for _ in range(round(3.0 / timestep)):
+            world.step(thrust)
+            heights.append(np.array([state.payload_position[0, 2], *state.drone_position[0, :, 2]]) - rest)
+        where = np.concatenate([state.payload_position, state.drone_position[0]])
+        world.step(thrust, round(5.0 / timestep))
+        later = np.concatenate([state.payload_position, state.drone_position[0]])
+        name = f"on the ground, {ms(timestep)}"
+        sunk, moved = float(np.abs(heights[-1]).max()), float(np.abs(later - where).max())
+        result.rows.append(Row(name, "height over that of rigid contact 3 s after the drop [m]", 0.0, sunk, sunk, 1e-3))
+        result.rows.append(Row(name, "motion in the 5 s that follow [m]", 0.0, moved, moved, 1e-6))
+        shown = round(1.0 / timestep)
+        time = timestep * np.arange(1, shown + 1)
+        for label, column in (("payload", 0), ("drone 0", 1)):
+            plot.curves.append(Curve(f"{label}, {ms(timestep)}", time, np.array(heights)[:shown, column]))
+    return result

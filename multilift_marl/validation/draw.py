@@ -28,6 +28,8 @@ def draw(plots: list[Plot], out: Path) -> list[Path]:
         axes = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
         for panel, axis in zip(panels, axes, strict=True):
             _draw_panel(axis, panel)
+        if plot.below is not None and {c.label for c in plot.below.curves} <= {c.label for c in plot.curves}:
+            axes[1].get_legend().remove()  # the one above tells it all
         axes[0].set_title(plot.title, fontsize=11)
         axes[-1].set_xlabel(plot.x_label)
         if plot.phases:
