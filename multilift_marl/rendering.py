@@ -109,6 +109,8 @@ class Renderer:
         world, goal = self._vec.world, self._vec.task.goal
         if not world.diverged[env]:
             self.data.qpos[:] = world.qpos(env)
+        if self.model.ntendon:
+            self.model.tendon_rgba[:, 3] = ~world.state.cable_broken[env]
         self.data.mocap_pos[0] = target = goal.position[env]
         self.data.mocap_quat[0] = mat_to_quat(tuple(goal.rotation[env].ravel()))
         mujoco.mj_fwdPosition(self.model, self.data)

@@ -9,6 +9,7 @@ from conftest import GRAVITY, hover_thrust, load, make_system, steady, without_d
 
 from multilift_marl.sim import World
 from multilift_marl.sim.hanging import hang
+from multilift_marl.validation.chains import exponential
 
 CHAIN = {"cable.model": "chain"}
 FORMATION = ("payload_position", "payload_rotation", "drone_position", "drone_rotation", "cable_tension")
@@ -35,15 +36,6 @@ def momentum(world: World) -> np.ndarray:
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
     return model.body_subtreemass[0] * data.subtree_linvel[0]
-
-
-def expm(a: np.ndarray) -> np.ndarray:
-    """Return the matrix exponential by Taylor's series of a/2^20 and repeated squaring."""
-    term = total = np.eye(len(a))
-    for order in range(1, 9):
-        term = term @ a / 2**20 / order
-        total = total + term
-    return np.linalg.matrix_power(total, 2**20)
 
 
 def calm(world: World) -> bool:
@@ -99,6 +91,19 @@ def test_a_hanging_chain_spans_its_chord_in_balance(chord):
     np.testing.assert_allclose(np.diff(pulls, axis=0), np.tile([0, 0, 0.01], (9, 1)), atol=1e-6)
 
 
+@pytest.mark.parametrize("chord", [(0.5, 0, 0.865), (0.1, -0.3, 0.944), (0.98, 0, 0.05)])
+def test_a_sagging_chain_may_span_less_than_its_length(chord):
+    chord, links = np.array(chord), np.zeros((10, 4))
+    assert np.linalg.norm(chord) < 1
+    hang(tuple(chord), 0.1, 1e6, 0.05, links)
+    directions, stretch = links[:, :3], links[:, 3]
+    np.testing.assert_allclose(directions.T @ (0.1 + stretch), chord, atol=1e-9)
+    assert (stretch > 0).all()
+    np.testing.assert_allclose(
+        np.diff(1e6 * stretch[:, None] * directions, axis=0), np.tile([0, 0, 0.05], (9, 1)), atol=1e-6
+    )
+
+
 @pytest.mark.parametrize("chord", [(0, 0, 0.9999), (0.1, 0.2, 0.3), (0, 0, 0.0), (-0.8, 0, -0.2), (0, 0, -0.5)])
 def test_a_slack_chain_spans_its_chord_unstretched(chord):
     links = np.zeros((10, 4))
@@ -139,7 +144,7 @@ def test_a_stretched_chain_moves_as_its_masses_springs_and_dampers(damping, time
     exact = np.zeros(2 * n + 3)
     exact[1 : n + 1], exact[-1] = np.cumsum(rest), 1
     exact[n + 1 : -1] = -speed * (1 - np.arange(n + 1) / n)
-    propagator = expm(flow * timestep)
+    propagator = exponential(flow * timestep)
     actual, expected = [], []
     for _ in range(200):
         world.step(thrust)

@@ -24,6 +24,23 @@ def test_the_formation_flies_on_chains(num_drones):
     assert vec.task.errors.distance.max() < 0.6
 
 
+def test_unequal_cables_hang_and_fly():
+    unequal = {
+        "cable.length": (1.0, 1.2, 0.9), "cable.segments": (4, 10, 7), "cable.density": (0.05, 0.01, 0.02),
+        "cable.stiffness": (1e5, 2e5, 5e4), "cable.damping": (1e3, 2e3, 5e2),
+    }  # fmt: skip
+    world = make_world(3, **{key.replace(".", "__"): value for key, value in unequal.items()})
+    before = world.state.drone_position.copy()
+    world.step(hover_thrust(world), 100)
+    np.testing.assert_allclose(world.state.drone_position, before, atol=1e-8)
+    np.testing.assert_allclose(world.state.cable_tension[0], world.system.resting_tension, rtol=1e-6)
+    vec = make(num_envs=2, num_drones=3, **CHAIN, **unequal)
+    vec.reset(seed=0)
+    for _ in range(50):
+        assert not vec.step(zeros(vec))[2].any()
+    assert calm(vec.world)
+
+
 def fly(vec, steps: int, first: int = 0):
     """Fly every environment by actions of its own and return all there is to know afterwards."""
     for step in range(first, first + steps):

@@ -13,7 +13,7 @@ import multilift_marl as ml
 
 HOVER = """
 from multilift_marl.config.system import GRAVITY
-from multilift_marl.sim.dynamics import hover_drone
+from multilift_marl.sim.rows import hover_drone
 from multilift_marl.sim.state import SystemState
 state = SystemState.zeros(1, 1)
 hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, 1.0, 1.0)

@@ -28,7 +28,7 @@ def test_every_row_has_the_keys_and_all_but_speed_pass(rows):
 def test_the_reports_figures_are_within_its_limits(rows):
     found, _ = rows
     static = [row for row in found if row["quantity"].startswith("static stiffness")]
-    assert len(static) == 7 and max(row["error"] for row in static) < 1e-4
+    assert len(static) == 14 and max(row["error"] for row in static) < 1e-4
     flown = {row["experiment"]: row["error"] for row in found if row["quantity"].startswith("mean position error")}
     assert flown["circle, report4, 0.2 rad/s"] <= 0.005 and flown["circle, report4, 0.4 rad/s"] <= 0.010
     assert flown["circle, falcon4, 0.2 rad/s"] <= 0.005 and flown["circle, falcon4, 0.4 rad/s"] <= 0.015

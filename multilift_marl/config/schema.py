@@ -44,6 +44,7 @@ Vector = tuple[Float, Float, Float]
 Positive = Annotated[Float, Field(gt=0)]
 NotNegative = Annotated[Float, Field(ge=0)]
 PerDrone = Positive | tuple[Positive, ...]
+Links = Annotated[Int, Field(ge=2, le=100)]
 
 
 class Section(BaseModel):
@@ -90,6 +91,10 @@ class VehicleConfig(Section):
     drag: tuple[NotNegative, NotNegative, NotNegative] | None = Field(
         None, description="[kg/s] linear drag along the body axes"
     )
+    rotor_radius: Float | None = Field(None, gt=0, description="[m] for wash and ground effect")
+    rolling_moment: Float | None = Field(
+        None, ge=0, description="[kg m] moment of a rotor over its speed and that of the air across it"
+    )
 
 
 class PayloadConfig(Section):
@@ -125,8 +130,9 @@ class CableConfig(Section):
     length: PerDrone | None = Field(None, description="[m] natural length; None: 1 m, more if a point load needs it")
     stiffness: PerDrone = Field(1e5, description="[N/m] of the whole cable")
     damping: PerDrone = Field(1e3, description="[N s/m] of the whole cable")
-    segments: Int = Field(10, ge=2, le=100, description="links of a chain")
-    density: Positive = Field(0.01, description="[kg/m] of a chain")
+    breaking_load: PerDrone | None = Field(None, description="[N] tension that breaks a cable; None: none does")
+    segments: Links | tuple[Links, ...] = Field(10, description="links of a chain")
+    density: PerDrone = Field(0.01, description="[kg/m] of a chain")
     bending_stiffness: Float = Field(0.0, ge=0, description="[N m/rad] between the links of a chain")
     bending_damping: Float | None = Field(
         None, ge=0, description="[N m s/rad] between the links of a chain; None: as little as is stable"
@@ -137,9 +143,15 @@ class CableConfig(Section):
 class ControlConfig(Section):
     """The drones' geometric controller and its action interface."""
 
-    action: Literal["reference"] = Field("reference", description="what an action means (control/actions.py)")
+    action: Literal["reference", "velocity", "acceleration", "acc_rates", "ctbr", "rotor"] = Field(
+        "reference", description="what an action means (docs/control.md)"
+    )
     max_offset: Float = Field(0.5, gt=0, description="[m] slot offset of a full action, along each axis")
     max_yaw: Float = Field(0.5, gt=0, description="[rad] yaw offset of a full action")
+    max_velocity: Float = Field(1.0, gt=0, description="[m/s] of a full action of `velocity`, along each axis")
+    max_acceleration: Float = Field(3.0, gt=0, description="[m/s²] of a full action of `acceleration`, `acc_rates`")
+    max_tilt_rate: Float = Field(4.0, gt=0, description="[rad/s] roll, pitch of a full action of `acc_rates`, `ctbr`")
+    max_yaw_rate: Float = Field(1.5, gt=0, description="[rad/s] of a full action of `velocity`, `acceleration`, `ctbr`")
     reference_frequency: Float = Field(6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference")
     reference_speed: Float = Field(1.0, gt=0, description="[m/s] speed limit of the smoothed reference")
     position_frequency: Float = Field(4.0, gt=0, description="[rad/s] of the position loop; at most 1/5 of attitude's")
@@ -148,6 +160,13 @@ class ControlConfig(Section):
     attitude_damping: Float = Field(0.8, gt=0, description="[-] its damping ratio")
     drag_feedforward: bool = Field(False, description="feed the drones' nominal drag in still air forward")
     yaw_frequency: Float = Field(8.0, gt=0, description="[rad/s] natural frequency of yaw")
+    disturbance: Literal["none", "integral", "indi"] = Field(
+        "none", description="rejection of unknown forces on a drone (docs/control.md)"
+    )
+    disturbance_frequency: Float = Field(
+        3.0, gt=0, description="[rad/s] bandwidth of that rejection; less where the load asks for it (docs/control.md)"
+    )
+    disturbance_limit: Float = Field(0.5, gt=0, description="[-] largest force rejected, in weights of the drone")
 
 
 class RandomizationConfig(Section):
@@ -158,9 +177,19 @@ class RandomizationConfig(Section):
 
 
 class WindConfig(Section):
-    """The air."""
+    """The air (docs/air.md)."""
 
     velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s] mean wind in the world frame")
+    turbulence: bool = Field(False, description="Dryden turbulence of MIL-F-8785C, as strong as the mean wind")
+    gust: Vector = Field((0.0, 0.0, 0.0), description='[m/s] amplitude of a "1 - cosine" gust in the world frame')
+    gust_start: Float = Field(2.0, ge=0, description="[s] when the gust begins, from the start of the episode")
+    gust_rise: Float = Field(0.5, gt=0, description="[s] in which it rises, and falls")
+    gust_hold: Float | None = Field(1.0, ge=0, description="[s] that it lasts in between; None: for good")
+    wash: bool = Field(False, description="rotor wash of each drone on the drones and the payload below it")
+    ground_effect: bool = Field(False, description="more thrust near the ground (Cheeseman and Bennett 1955)")
+    roll_moment: Float = Field(
+        0.0, description="[N s] moment about body x for each m/s through the air along body y (report eqs 12-13)"
+    )
 
 
 class TrainConfig(Section):

@@ -17,11 +17,11 @@ from multilift_marl.config.rig import (
     standard_length,
     uniform_inertia,
 )
-from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, resolve_vehicle
+from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, check_rotors, resolve_vehicle
 from multilift_marl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from multilift_marl.config.schema import Config
+    from multilift_marl.config.schema import Config, WindConfig
 
 MIN_THRUST_TO_WEIGHT = 1.18
 MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the vehicle's span
@@ -45,7 +45,8 @@ class System:
         anchors: attachment of each cable from the payload's centre of mass, in its frame (N, 3) [m].
         cable_model: "massless" or "chain".
         cable_length, cable_stiffness, cable_damping: (N,) [m], [N/m], [N s/m].
-        cable_segments: links of each cable; 1 if massless.
+        breaking_load: tension that breaks each cable (N,) [N]; infinite if none does.
+        cable_segments: links of each cable (N,); 1 if massless.
         cable_mass: (N,) [kg]; 0 if massless.
         bending_stiffness, bending_damping: between the links of a chain (N,) [N m/rad], [N m s/rad].
         formation_force: pull of each cable on the resting payload, in the payload frame (N, 3) [N].
@@ -53,6 +54,7 @@ class System:
         slot_azimuth: direction of each slot from the payload, in its horizontal plane (N,) [rad].
         min_separation: distance between drones that counts as a collision [m].
         wind: mean wind (3,) [m/s].
+        air: what else the air does.
         timestep: physics step [s].
         control_interval: physics steps for each control step.
     """
@@ -71,7 +73,8 @@ class System:
     cable_length: np.ndarray
     cable_stiffness: np.ndarray
     cable_damping: np.ndarray
-    cable_segments: int
+    breaking_load: np.ndarray
+    cable_segments: np.ndarray
     cable_mass: np.ndarray
     bending_stiffness: np.ndarray
     bending_damping: np.ndarray
@@ -80,6 +83,7 @@ class System:
     slot_azimuth: np.ndarray
     min_separation: float
     wind: np.ndarray
+    air: WindConfig
     timestep: float
     control_interval: int
 
@@ -101,12 +105,8 @@ class System:
     @property
     def resting_tension(self) -> np.ndarray:
         """Tension of each resting cable where it is measured, in its segment next to the drone (N,) [N]."""
-        return np.linalg.norm(self.segment_forces[:, -1], axis=1)
-
-    @property
-    def segment_forces(self) -> np.ndarray:
-        """Pull of each segment of the resting cables, from the payload up, payload frame (N, segments, 3) [N]."""
-        return _segment_forces(self.formation_force, self.cable_mass, self.cable_segments)
+        last = self.cable_mass * (1 - 1 / self.cable_segments)
+        return np.linalg.norm(self.formation_force + GRAVITY * last[:, None] * [0, 0, 1], axis=1)
 
 
 def resolve_system(config: Config) -> System:
@@ -141,15 +141,18 @@ def resolve_system(config: Config) -> System:
     stiffness = per_drone(cable.stiffness, n, "cable.stiffness")
     force = formation_forces(anchors, mass * GRAVITY, np.deg2rad(cable.angle), payload.shape == "point")
     chain = cable.model == "chain"
-    segments = cable.segments if chain else 1
-    rope = cable.density * length if chain else np.zeros(n)
-    forces = _segment_forces(force, rope, segments)
-    tension = np.linalg.norm(forces, axis=2)
-    reach = (length / segments)[:, None] + tension / (segments * stiffness)[:, None]
-    slots = anchors + (forces / tension[..., None] * reach[..., None]).sum(axis=1)
-    bending = cable.bending_damping
-    if bending is None:
-        bending = _steady_bending(tension[:, -1], rope, length, segments, config.sim.timestep) if chain else 0.0
+    segments = per_drone(cable.segments if chain else 1, n, "cable.segments").astype(int)
+    rope = per_drone(cable.density, n, "cable.density") * length if chain else np.zeros(n)
+    slots, bending = anchors.copy(), np.zeros(n)
+    for i, links in enumerate(segments):
+        forces = _segment_forces(force[i], rope[i], links)
+        tension = np.linalg.norm(forces, axis=1)
+        reach = length[i] / links + tension / (links * stiffness[i])
+        slots[i] += (forces / tension[:, None] * reach[:, None]).sum(axis=0)
+        if chain:
+            bending[i] = _steady_bending(tension[-1], rope[i], length[i], links, config.sim.timestep)
+    if cable.bending_damping is not None:
+        bending[:] = cable.bending_damping
     centred = np.hypot(slots[:, 0], slots[:, 1]) < 1e-9
     system = System(
         vehicle=vehicle,
@@ -166,15 +169,19 @@ def resolve_system(config: Config) -> System:
         cable_length=length,
         cable_stiffness=stiffness,
         cable_damping=per_drone(cable.damping, n, "cable.damping"),
+        breaking_load=per_drone(
+            np.inf if cable.breaking_load is None else cable.breaking_load, n, "cable.breaking_load"
+        ),
         cable_segments=segments,
         cable_mass=rope,
         bending_stiffness=np.full(n, cable.bending_stiffness),
-        bending_damping=np.broadcast_to(bending, n).astype(float),
+        bending_damping=bending,
         formation_force=force,
         slots=slots,
         slot_azimuth=np.where(centred, 0.0, np.arctan2(slots[:, 1], slots[:, 0])),
         min_separation=MIN_SEPARATION * scale,
         wind=np.asarray(config.wind.velocity, float),
+        air=config.wind,
         timestep=config.sim.timestep,
         control_interval=whole_ratio(
             1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"
@@ -184,30 +191,31 @@ def resolve_system(config: Config) -> System:
     return system
 
 
-def _segment_forces(force: np.ndarray, mass: np.ndarray, segments: int) -> np.ndarray:
-    """Return the pulls (N, segments, 3) [N] of cables of `mass` (N,) [kg] that pull the payload by `force` (N, 3) [N].
+def _segment_forces(force: np.ndarray, mass: float, segments: int) -> np.ndarray:
+    """Return the pulls (segments, 3) [N] of a cable of `mass` [kg] that pulls the payload by `force` (3,) [N].
 
     The mass of each segment is at its upper end, so each carries one segment's weight more than that below it.
     """
-    carried = GRAVITY * mass[:, None] / segments * np.arange(segments)
-    return force[:, None] + carried[..., None] * [0, 0, 1]
+    return force + GRAVITY * mass / segments * np.arange(segments)[:, None] * [0, 0, 1]
 
 
-def _steady_bending(tension: np.ndarray, mass: np.ndarray, length: np.ndarray, n: int, h: float) -> np.ndarray:
-    """Return the bending damping (N,) [N m s/rad] that keeps the sideways motion of a chain's nodes stable.
+def _steady_bending(tension: float, mass: float, length: float, n: int, h: float) -> float:
+    """Return the bending damping [N m s/rad] that keeps the sideways motion of a chain's nodes stable.
 
     Tension T acts on it explicitly: mode λ = 2 - 2 cos(jπ/n) of nodes m on links l moves stably in steps h if
     m + h d λ²/l² ≥ h² T λ/4l. T l h is enough unless the nodes are light; twice the tension at rest is allowed for.
     """
     modes = 2 - 2 * np.cos(np.pi * np.arange(1, n) / n)
-    tension, node, link = tension[:, None], mass[:, None] / n, length[:, None] / n
+    node, link = mass / n, length / n
     least = 2 * tension * link * h / (4 * modes) - node * link**2 / (h * modes**2)
-    return np.maximum(tension[:, 0] * link[:, 0] * h, least.max(axis=1))
+    return max(tension * link * h, float(least.max()))
 
 
 def _check_possible(system: System, heaviest: float) -> None:
     """Refuse what cannot fly, hovering under a payload `heaviest` times its nominal mass included."""
     n, vehicle = system.num_drones, system.vehicle
+    if system.air.wash or system.air.ground_effect:
+        check_rotors(vehicle)
     thrust = 4 * vehicle.rotor_thrust_max
     if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
         lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"
@@ -222,6 +230,13 @@ def _check_possible(system: System, heaviest: float) -> None:
         raise ConfigError(
             f"drone {i} would need {hover[i]:.1f} N of its {thrust:.1f} N to hover under the heaviest payload; lower "
             "payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
+        )
+    tight = heaviest * system.resting_tension
+    if np.any(tight >= system.breaking_load):
+        i = int(np.argmax(tight - system.breaking_load))
+        raise ConfigError(
+            f"cable {i} would break at rest: {tight[i]:.1f} N under the heaviest payload, but cable.breaking_load is "
+            f"{system.breaking_load[i]:g} N; raise it or lower payload.mass"
         )
     if n > 1:
         apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)

@@ -34,6 +34,8 @@ class Vehicle:
         rotor_speed_min: idle speed [rad/s].
         rotor_thrust_max: largest thrust of one rotor [N].
         drag: linear drag along the body axes [kg/s].
+        rotor_radius: [m].
+        rolling_moment: of a rotor, over its speed and that of the air across it [kg m].
     """
 
     name: str
@@ -47,8 +49,10 @@ class Vehicle:
     rotor_speed_min: float
     rotor_thrust_max: float
     drag: tuple[float, float, float]
+    rotor_radius: float
     rotor_azimuth: tuple[float, ...] = tuple(np.pi / 4 + np.pi / 2 * np.arange(4))
     rotor_spin: tuple[float, ...] = (1.0, -1.0, 1.0, -1.0)
+    rolling_moment: float = 0.0
 
     @property
     def rotor_positions(self) -> np.ndarray:
@@ -79,7 +83,8 @@ class Vehicle:
 
 # Mass, inertia, arm, rotor and motor constants: TU Delft multi-lift simulation (arXiv 2508.01522), flycrane.urdf and
 # motor_model.py: 0.6 kg body and four rotors of 4.2 g, 20 N in all (5 N a rotor; its speed limit of 2800 rad/s lies
-# beyond that). Drag per unit mass: Faessler et al., RA-L 3(2), 2018, table of identified coefficients.
+# beyond that). Drag per unit mass: Faessler et al., RA-L 3(2), 2018, table of identified coefficients. Rotor radius:
+# not stated, assumed that of the largest common propellers that fit the arm, 5 inches across.
 _FALCON_MASS = 0.6 + 4 * 0.0042
 _FALCON = Vehicle(
     name="falcon",
@@ -93,13 +98,15 @@ _FALCON = Vehicle(
     rotor_speed_min=150.0,
     rotor_thrust_max=5.0,
     drag=(0.54 * _FALCON_MASS, 0.39 * _FALCON_MASS, 0.0),
+    rotor_radius=0.0635,
 )
 
 # Mass, inertia, arm, torque ratio, no drag: IMRCLab/col-trans, sim/config/initialize.yaml. Its inertia is that of
 # Förster, "System identification of the Crazyflie 2.0", ETH Zurich 2015, which is also where the thrust coefficient
 # comes from (as quoted by gsilano/CrazyS, rotors_description/urdf/crazyflie2.xacro). Thrust limit: CrazyMARL (arXiv
 # 2509.14126). Motor lag: viktorlorentz/crazyMARL, crazymarl/configs/multi_quad_config.py, motor_tau 0.15 with "time
-# constant is T/4" beside it. Idle speed: stated by none of them, assumed zero.
+# constant is T/4" beside it. Idle speed: stated by none of them, assumed zero. Rotor radius:
+# utiasDSL/gym-pybullet-drones, gym_pybullet_drones/assets/cf2x.urdf, prop_radius; likewise below.
 _CRAZYFLIE = Vehicle(
     name="crazyflie",
     mass=0.034,
@@ -112,6 +119,7 @@ _CRAZYFLIE = Vehicle(
     rotor_speed_min=0.0,
     rotor_thrust_max=0.14,
     drag=(0.0, 0.0, 0.0),
+    rotor_radius=2.31348e-2,
 )
 
 # Identified from flights of a Crazyflie 2.x with L250 propellers: learnsyslab/drone-models,
@@ -132,6 +140,7 @@ _CRAZYFLIE_ID = Vehicle(
     rotor_speed_min=(0.012817578393224994 / _CRAZYFLIE_ID_THRUST) ** 0.5,
     rotor_thrust_max=0.12,
     drag=(0.01471782, 0.01471782, 0.01277641),
+    rotor_radius=2.31348e-2,
 )
 
 
@@ -143,7 +152,8 @@ def _rotor_drag(mass: float, thrust_coefficient: float, coefficient: float) -> t
 
 # ethz-asl/rotors_simulator, rotors_description/urdf/hummingbird.xacro: body and rotors, + layout, the front rotor turns
 # clockwise (its reaction torque is counter-clockwise). Inertia as its controller takes it for all of 0.716 kg. No idle
-# speed. Drag of the rotors linear in their speed, taken at hover; the rolling moment (1e-6) is not modelled.
+# speed. Drag of the rotors linear in their speed, taken at hover; the rolling moment (1e-6) is
+# off: its sign there does not follow the rotor's, see docs/air.md.
 _HUMMINGBIRD_MASS = 0.68 + 4 * 0.009
 _HUMMINGBIRD = Vehicle(
     name="hummingbird",
@@ -157,6 +167,7 @@ _HUMMINGBIRD = Vehicle(
     rotor_speed_min=0.0,
     rotor_thrust_max=8.54858e-6 * 838.0**2,
     drag=_rotor_drag(_HUMMINGBIRD_MASS, 8.54858e-6, 8.06428e-5),
+    rotor_radius=0.1,
     rotor_azimuth=(0.0, float(np.pi / 2), float(np.pi), float(3 * np.pi / 2)),
 )
 
@@ -178,12 +189,24 @@ _IRIS = Vehicle(
     rotor_speed_min=0.0,
     rotor_thrust_max=5.84e-6 * 1100.0**2,
     drag=_rotor_drag(_IRIS_MASS, 5.84e-6, 1.75e-4),
+    rotor_radius=0.128,
     rotor_azimuth=(_IRIS_FRONT, float(np.pi) - _IRIS_FRONT, float(np.pi) + _IRIS_FRONT, float(2 * np.pi) - _IRIS_FRONT),
 )
 
 PRESETS: dict[str, Vehicle] = {
     vehicle.name: vehicle for vehicle in (_FALCON, _CRAZYFLIE, _CRAZYFLIE_ID, _HUMMINGBIRD, _IRIS)
 }
+
+
+def check_rotors(vehicle: Vehicle) -> None:
+    """Refuse rotors that overlap, which the models of wash and ground effect know nothing of."""
+    rotors = vehicle.rotor_positions
+    apart = min(float(np.linalg.norm(a - b)) for i, a in enumerate(rotors) for b in rotors[:i])
+    if 2 * vehicle.rotor_radius > apart:
+        raise ConfigError(
+            f"rotors of vehicle.rotor_radius={vehicle.rotor_radius:g} m overlap, their axes {apart:.3g} m apart; "
+            "lower it or raise vehicle.arm, or switch wind.wash and wind.ground_effect off"
+        )
 
 
 def resolve_vehicle(config: VehicleConfig) -> Vehicle:

@@ -129,11 +129,18 @@ def smooth(lo, hi, reference, frequency, speed, dt):
             put(reference.velocity[e, n], v)
             put(reference.acceleration[e, n], a)
             put(reference.jerk[e, n], jerk)
-            turn_gap = wrap(reference.command_yaw[e, n] - reference.yaw[e, n])
-            rate = reference.yaw_rate[e, n]
-            rate += dt * (w * w * clip(turn_gap, -1.0, 1.0) - 2.0 * w * rate)
-            reference.yaw_rate[e, n] = rate
-            reference.yaw[e, n] += dt * rate
+            smooth_yaw(e, n, reference, w, dt)
+
+
+@kernel
+def smooth_yaw(e, n, reference, frequency, dt):
+    """Move the yaw of one drone's reference one control step towards its command, the short way."""
+    w = frequency
+    gap = wrap(reference.command_yaw[e, n] - reference.yaw[e, n])
+    rate = reference.yaw_rate[e, n]
+    rate += dt * (w * w * clip(gap, -1.0, 1.0) - 2.0 * w * rate)
+    reference.yaw_rate[e, n] = rate
+    reference.yaw[e, n] += dt * rate
 
 
 @kernel

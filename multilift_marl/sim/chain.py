@@ -37,7 +37,8 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-from multilift_marl.sim.dynamics import (
+from multilift_marl.sim.hanging import hang
+from multilift_marl.sim.rows import (
     MAX_RATE,
     MAX_SPEED,
     MAX_STRETCH,
@@ -46,7 +47,6 @@ from multilift_marl.sim.dynamics import (
     read_payload,
     write_payload,
 )
-from multilift_marl.sim.hanging import hang
 from multilift_marl.sim.scene import link_frame
 
 _SENSORS = 13  # numbers of each drone: position, quaternion, velocity, body rates
@@ -56,7 +56,12 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 class Chain(NamedTuple):
     """Numbers of the chains."""
 
-    segments: int
+    segments: np.ndarray
+    """(N,) links."""
+    coordinates: np.ndarray
+    """(N + 1,) where each cable's coordinates start, counted from the payload's."""
+    velocities: np.ndarray
+    """(N + 1,) likewise."""
     frames: np.ndarray
     """(N, 3, 3) frame of the first link in the payload's, in the resting formation."""
     length: np.ndarray
@@ -71,6 +76,8 @@ def make_chain(system: System) -> Chain:
     n = system.cable_segments
     return Chain(
         segments=n,
+        coordinates=np.cumsum(np.append(0, 5 * n + 4)),
+        velocities=np.cumsum(np.append(0, 4 * n + 3)),
         frames=np.stack([link_frame(force) for force in system.formation_force]),
         length=system.cable_length / n,
         stiffness=n * system.cable_stiffness,
@@ -81,7 +88,7 @@ def make_chain(system: System) -> Chain:
 
 @kernel
 def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
-    """Read the physical state of teams on chains, as `dynamics.read_rows` does; tensions too are current.
+    """Read the physical state of teams on chains, as `rows.read_rows` does; tensions too are current.
 
     Args:
         rows: `batch.state` of environments lo to hi.
@@ -93,7 +100,7 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
     """
     for e in range(lo, hi):
         line, told = rows[e - lo], sensors[e - lo]
-        if diverged[e] or not _sound(line, told, c, chain):
+        if diverged[e] or not _sound(line, told, state.cable_broken[e], c, chain):
             diverged[e] = True
             continue
         read_payload(e, line, state, c)
@@ -105,9 +112,9 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
                 state.drone_velocity[e, n, j] = told[at + 7 + j]
                 state.drone_body_rates[e, n, j] = told[at + 10 + j]
             putmat(state.drone_rotation[e, n], quat_to_mat(told[at + 3], told[at + 4], told[at + 5], told[at + 6]))
-            pull = _tension(n, line, c, chain)
+            pull = 0.0 if state.cable_broken[e, n] else _tension(n, line, c, chain)
             keep_tension(e, n, pull, state, record, c)
-            slack = slack or pull <= chain.segments * chain.weight[n]  # the drone holds the cable, and nothing more
+            slack = slack or pull <= chain.segments[n] * chain.weight[n]  # the drone holds the cable, and nothing more
         if slack:
             record.slack_time[e] += c.timestep
 
@@ -115,13 +122,13 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
 @kernel
 def _tension(n, line, c, chain):
     """Return the tension of cable n in its segment next to the drone [N]; 0 where that is pushed together."""
-    at = c.qpos + c.payload_nq + n * (5 * chain.segments + 4) + 5 * chain.segments - 1
-    v = c.qvel + c.payload_nv + n * (4 * chain.segments + 3) + 4 * chain.segments - 1
+    at = c.qpos + c.payload_nq + chain.coordinates[n] + 5 * chain.segments[n] - 1
+    v = c.qvel + c.payload_nv + chain.velocities[n] + 4 * chain.segments[n] - 1
     return max(0.0, chain.stiffness[n] * line[at] + chain.damping[n] * line[v])
 
 
 @kernel
-def _sound(line, told, c, chain):
+def _sound(line, told, broken, c, chain):
     """Return whether a simulation's numbers are finite and within physical bounds."""
     for j in range(c.payload_nv):
         if not abs(line[c.qvel + j]) < (MAX_SPEED if j < 3 else MAX_RATE):
@@ -131,12 +138,12 @@ def _sound(line, told, c, chain):
         for j in range(7, _SENSORS):
             if not abs(told[_SENSORS * n + j]) < (MAX_SPEED if j < 10 else MAX_RATE):
                 return False
-        if not _tension(n, line, c, chain) < MAX_STRETCH * c.cable_stiffness[n] * c.cable_length[n]:
+        if not broken[n] and not _tension(n, line, c, chain) < MAX_STRETCH * c.cable_stiffness[n] * c.cable_length[n]:
             return False
         for j in range(7):
             if not isfinite(told[_SENSORS * n + j]):
                 return False
-    for j in range(c.payload_nq + count * (5 * chain.segments + 4)):
+    for j in range(c.payload_nq + chain.coordinates[count]):
         if not isfinite(line[c.qpos + j]):
             return False
     return True
@@ -144,13 +151,12 @@ def _sound(line, told, c, chain):
 
 @kernel
 def write_chains(rows, lo, hi, mask, state, record, c, chain):
-    """Write the state of the environments in `mask` into `batch.state`, as `dynamics.write_rows` does.
+    """Write the state of the environments in `mask` into `batch.state`, as `rows.write_rows` does.
 
     A cable hangs between payload and drone as it would at rest, a slack one in an arc; its nodes move as if it were
     stretched evenly.
     """
-    n = chain.segments
-    links = np.zeros((n, 4))
+    links = np.zeros((chain.segments.max(), 4))
     for e in range(lo, hi):
         if not mask[e]:
             continue
@@ -161,11 +167,12 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
         if c.payload_nv == 3:
             attitude, spin = _UPRIGHT, (0.0, 0.0, 0.0)
         spin = mul(attitude, spin)
-        at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
         for i in range(chain.length.shape[0]):
+            n = chain.segments[i]
+            at, v = c.qpos + c.payload_nq + chain.coordinates[i], c.qvel + c.payload_nv + chain.velocities[i]
             anchor = mul(attitude, (c.anchors[i, 0], c.anchors[i, 1], c.anchors[i, 2]))
             chord = sub(vec(state.drone_position, e, i), add(row(state.payload_position, e), anchor))
-            hang(chord, chain.length[i], chain.stiffness[i], chain.weight[i], links)
+            hang(chord, chain.length[i], chain.stiffness[i], chain.weight[i], links[:n])
             opening = sub(vec(state.drone_velocity, e, i), add(row(state.payload_velocity, e), cross(spin, anchor)))
             frame, rate = matmul(attitude, matrow(chain.frames, i)), spin
             for j in range(n):
@@ -179,7 +186,6 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
             q = mat_to_quat(matmul(transpose(frame), drone))
             line[at], line[at + 1], line[at + 2], line[at + 3] = q
             put(line[v : v + 3], sub(vec(state.drone_body_rates, e, i), tmul(drone, rate)))
-            at, v = at + 4, v + 3
             keep_tension(e, i, _tension(i, line, c, chain), state, record, c)
 
 

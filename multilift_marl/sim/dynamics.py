@@ -6,38 +6,24 @@ which needs no Jacobian. Drones on chains have no free joint: theirs are Cartesi
 
 from __future__ import annotations
 
-from math import exp, isfinite, sqrt
+from math import exp, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.math3d import (
-    add,
-    clip,
-    dot,
-    mat,
-    mat_to_quat,
-    matrow,
-    mul,
-    norm,
-    put,
-    putmat,
-    quat_to_mat,
-    row,
-    scale,
-    sub,
-    thrust_frame,
-    tmul,
-    vec,
+from multilift_marl.config.system import System
+from multilift_marl.math3d import add, clip, mat, mul, norm, put, row, scale, sub, tmul, vec
+from multilift_marl.sim.air import (
+    AIR_DENSITY,
+    AirConstants,
+    air_moment,
+    blow,
+    ground_gain,
+    make_air,
+    spread_wash,
 )
 from multilift_marl.sim.scene import Layout
-
-AIR_DENSITY = 1.225  # [kg/m³] at sea level, 15 °C (ISA)
-MAX_SPEED = 100.0  # [m/s] beyond this a simulation has diverged
-MAX_RATE = 500.0  # [rad/s]
-MAX_STRETCH = 0.2  # [-] of a cable's length
 
 
 class Constants(NamedTuple):
@@ -64,6 +50,8 @@ class Constants(NamedTuple):
     """(N, 3) [m]."""
     cable_length: np.ndarray
     cable_stiffness: np.ndarray
+    breaking_load: np.ndarray
+    """(N,) [N]."""
     qpos: int
     """Offset of qpos in a row of `batch.state`; likewise the next ones."""
     qvel: int
@@ -74,6 +62,7 @@ class Constants(NamedTuple):
     """Whether those torques are in the world frame in place of the body frame."""
     payload_nq: int
     payload_nv: int
+    air: AirConstants
 
 
 def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: int, cartesian: int) -> Constants:
@@ -99,6 +88,7 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         anchors=np.ascontiguousarray(system.anchors),
         cable_length=system.cable_length,
         cable_stiffness=system.cable_stiffness,
+        breaking_load=system.breaking_load,
         qpos=qpos,
         qvel=qvel,
         force=force,
@@ -106,6 +96,7 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         world_torque=chain,
         payload_nq=layout.payload_nq,
         payload_nv=layout.payload_nv,
+        air=make_air(system),
     )
 
 
@@ -114,24 +105,28 @@ def _lag(h: float) -> tuple[float, float, float]:
 
 
 @kernel
-def apply_loads(rows, lo, hi, thrust, state, plant, record, c):
+def apply_loads(rows, lo, hi, thrust, state, plant, air, record, c):
     """Advance the rotors by one physics step and write the loads of that step into `batch.state`.
 
     The rotor speed follows its command with a first-order lag, one for rising and one for falling. The thrust applied
     is the exact mean of b ω² over the step, so the impulse is exact. Reaction torque is κ f (report eqs 5-8), drag of
     a drone is linear in its velocity through the air along its body axes (Faessler 2018), drag of the payload
-    quadratic.
+    quadratic. What else the air does, if switched on, is in `air.py`.
 
     Args:
         rows: `batch.state` of environments lo to hi.
         lo, hi: the environments.
         thrust: commanded thrust of each rotor (E, N, 4) [N].
-        state, plant, record: SystemState, Plant, Record of all environments.
+        state, plant, air, record: SystemState, Plant, Air, Record of all environments.
         c: Constants.
     """
     for e in range(lo, hi):
         line = rows[e - lo]
         wind = row(plant.wind, e)
+        if c.air.gusts:
+            wind = add(wind, blow(e, wind, state, air, c.timestep, c.air))
+        if c.air.wash:
+            spread_wash(e, state, air, c.air)
         for n in range(thrust.shape[1]):
             total, mx, my, mz, power = 0.0, 0.0, 0.0, 0.0, 0.0
             for k in range(4):
@@ -149,9 +144,16 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c):
                 my -= c.rotor_positions[k, 0] * f
                 mz += c.rotor_spin[k] * c.torque_ratio * f
                 power += c.torque_ratio * f * 0.5 * (before + after)
+            if c.air.ground_effect:
+                gain = ground_gain(state.drone_position[e, n, 2], c.air)
+                total, mx, my = gain * total, gain * mx, gain * my
             attitude = mat(state.drone_rotation, e, n)
-            air = tmul(attitude, sub(vec(state.drone_velocity, e, n), wind))
-            body = (-c.drag[0] * air[0], -c.drag[1] * air[1], total - c.drag[2] * air[2])
+            here = add(wind, vec(air.wash, e, n)) if c.air.wash else wind
+            through = tmul(attitude, sub(vec(state.drone_velocity, e, n), here))
+            if c.air.moments:
+                more = air_moment(e, n, through, state, c.air)
+                mx, my = mx + more[0], my + more[1]
+            body = (-c.drag[0] * through[0], -c.drag[1] * through[1], total - c.drag[2] * through[2])
             torque = (mx, my, mz)
             if c.world_torque:
                 torque = mul(attitude, torque)
@@ -159,140 +161,7 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c):
             put(line[at : at + 3], mul(attitude, body))
             put(line[at + 3 : at + 6], torque)
             record.energy[e] += c.timestep * power
-        air = sub(row(state.payload_velocity, e), wind)
-        drag = scale(-c.payload_drag * norm(air), air)
+        here = add(wind, vec(air.wash, e, thrust.shape[1])) if c.air.wash else wind
+        through = sub(row(state.payload_velocity, e), here)
+        drag = scale(-c.payload_drag * norm(through), through)
         put(line[c.force : c.force + 3], add(drag, row(plant.payload_force, e)))
-
-
-@kernel
-def read_rows(rows, lo, hi, tension, state, record, diverged, c):
-    """Read the physical state out of `batch.state` and mark environments that have diverged.
-
-    A diverged environment keeps its last sound state.
-
-    Args:
-        rows: `batch.state` of environments lo to hi.
-        lo, hi: the environments.
-        tension: cable tensions of the last physics step (hi - lo, N) [N].
-        state, record: written.
-        diverged: (E,) bool, set, never cleared.
-        c: Constants.
-    """
-    for e in range(lo, hi):
-        line = rows[e - lo]
-        if diverged[e] or not _sound(line, tension[e - lo], c):
-            diverged[e] = True
-            continue
-        read_payload(e, line, state, c)
-        at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
-        slack = False
-        for n in range(tension.shape[1]):
-            for j in range(3):
-                state.drone_position[e, n, j] = line[at + j]
-                state.drone_velocity[e, n, j] = line[v + j]
-                state.drone_body_rates[e, n, j] = line[v + 3 + j]
-            putmat(state.drone_rotation[e, n], quat_to_mat(line[at + 3], line[at + 4], line[at + 5], line[at + 6]))
-            at += 7
-            v += 6
-            pull = tension[e - lo, n]
-            keep_tension(e, n, pull, state, record, c)
-            slack = slack or pull <= 0.0
-        if slack:
-            record.slack_time[e] += c.timestep
-
-
-@kernel
-def read_payload(e, line, state, c):
-    """Read the payload's state out of a row of `batch.state`."""
-    at, v = c.qpos, c.qvel
-    for j in range(3):
-        state.payload_position[e, j] = line[at + j]
-        state.payload_velocity[e, j] = line[v + j]
-    if c.payload_nv == 6:
-        putmat(state.payload_rotation[e], quat_to_mat(line[at + 3], line[at + 4], line[at + 5], line[at + 6]))
-        for j in range(3):
-            state.payload_body_rates[e, j] = line[v + 3 + j]
-
-
-@kernel
-def keep_tension(e, n, pull, state, record, c):
-    """Note the tension [N] of cable n in state and record."""
-    state.cable_tension[e, n] = pull
-    record.tension_min[e] = min(record.tension_min[e], pull)
-    record.tension_max[e] = max(record.tension_max[e], pull)
-    record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[n] * c.cable_length[n]))
-
-
-@kernel
-def _sound(line, tension, c):
-    """Return whether a simulation's numbers are finite and within physical bounds."""
-    v = c.qvel
-    for j in range(c.payload_nv):
-        bound = MAX_SPEED if j < 3 else MAX_RATE
-        if not abs(line[v + j]) < bound:
-            return False
-    v += c.payload_nv
-    for n in range(tension.shape[0]):
-        for j in range(6):
-            if not abs(line[v + 6 * n + j]) < (MAX_SPEED if j < 3 else MAX_RATE):
-                return False
-        if not tension[n] < MAX_STRETCH * c.cable_stiffness[n] * c.cable_length[n]:
-            return False
-    for j in range(c.payload_nq + 7 * tension.shape[0]):
-        if not isfinite(line[c.qpos + j]):
-            return False
-    return True
-
-
-@kernel
-def hover_drone(e, n, state, pull, yaw, mass, thrust_coefficient):
-    """Let drone n of environment e hold still: attitude and rotor speeds that pull its cable by `pull` [N]."""
-    force = add(pull, (0.0, 0.0, mass * GRAVITY))
-    putmat(state.drone_rotation[e, n], thrust_frame(force, yaw))
-    for k in range(4):
-        state.rotor_speed[e, n, k] = sqrt(norm(force) / (4.0 * thrust_coefficient))
-
-
-@kernel
-def write_rows(rows, lo, hi, mask, state, record, c):
-    """Write the state of the environments in `mask` into `batch.state`; tensions follow from the stretch."""
-    for e in range(lo, hi):
-        if not mask[e]:
-            continue
-        line = rows[e - lo]
-        clear_record(e, record)
-        write_payload(e, line, state, c)
-        attitude = matrow(state.payload_rotation, e)
-        at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
-        for n in range(state.drone_position.shape[1]):
-            position = vec(state.drone_position, e, n)
-            put(line[at : at + 3], position)
-            q = mat_to_quat(mat(state.drone_rotation, e, n))
-            line[at + 3], line[at + 4], line[at + 5], line[at + 6] = q
-            put(line[v : v + 3], vec(state.drone_velocity, e, n))
-            put(line[v + 3 : v + 6], vec(state.drone_body_rates, e, n))
-            at += 7
-            v += 6
-            anchor = (c.anchors[n, 0], c.anchors[n, 1], c.anchors[n, 2])
-            cable = sub(position, add(row(state.payload_position, e), mul(attitude, anchor)))
-            pull = c.cable_stiffness[n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[n])
-            keep_tension(e, n, pull, state, record, c)
-
-
-@kernel
-def write_payload(e, line, state, c):
-    """Write the payload's state into a row of `batch.state`."""
-    at, v = c.qpos, c.qvel
-    put(line[at : at + 3], row(state.payload_position, e))
-    put(line[v : v + 3], row(state.payload_velocity, e))
-    if c.payload_nv == 6:
-        q = mat_to_quat(matrow(state.payload_rotation, e))
-        line[at + 3], line[at + 4], line[at + 5], line[at + 6] = q
-        put(line[v + 3 : v + 6], row(state.payload_body_rates, e))
-
-
-@kernel
-def clear_record(e, record):
-    """Let the record of environment e start anew."""
-    record.energy[e], record.slack_time[e] = 0.0, 0.0
-    record.tension_min[e], record.tension_max[e], record.stretch_max[e] = 1e9, 0.0, 0.0

@@ -9,6 +9,8 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.math3d import add, cross, dot, norm, put, scale, sub, unit
 
+SLACK = 0.98  # of its length: a cable whose ends are closer is laid in an arc, one that sags less hangs by its weight
+
 
 @kernel
 def hang(chord, length, stiffness, weight, links):
@@ -24,7 +26,7 @@ def hang(chord, length, stiffness, weight, links):
         links: written.
     """
     n, distance = links.shape[0], norm(chord)
-    if distance < n * length:
+    if distance < SLACK * n * length:
         _hang_slack(chord, distance, length, links)
         return
     middle = max(stiffness * (distance / n - length), n * weight)
@@ -43,6 +45,9 @@ def hang(chord, length, stiffness, weight, links):
         force = trial
         energy, gap, step = found
     straight = not norm(gap) < 1e-9 * distance
+    if straight and distance < n * length:
+        _hang_slack(chord, distance, length, links)
+        return
     for j in range(n):
         pull = add(force, (0.0, 0.0, j * weight))
         put(links[j], unit(chord if straight else pull))

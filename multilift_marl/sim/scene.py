@@ -57,7 +57,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
     for i in range(system.num_drones):
         if chain:
             link = _add_chain(spec.body("payload"), system, i, visuals)
-            body = link.add_body(name=f"drone_{i}", pos=[0, 0, system.cable_length[i] / system.cable_segments])
+            body = link.add_body(name=f"drone_{i}", pos=[0, 0, system.cable_length[i] / system.cable_segments[i]])
             body.add_joint(name=f"drone_{i}", type=mujoco.mjtJoint.mjJNT_BALL)
             _add_drone(body, system, i, visuals)
             _add_drone_sensors(spec, i)
@@ -218,7 +218,8 @@ def _add_cable(spec: mujoco.MjSpec, system: System, i: int) -> None:
 
 def _add_chain(payload: mujoco.MjsBody, system: System, i: int, visuals: bool) -> mujoco.MjsBody:
     """Hang the links of cable i on the payload, one on the other, and return the last; see sim/chain.py."""
-    n, length = system.cable_segments, system.cable_length[i] / system.cable_segments
+    n = int(system.cable_segments[i])
+    length = system.cable_length[i] / n
     mass = system.cable_mass[i] / n
     bending = {"stiffness": [system.bending_stiffness[i], 0, 0], "damping": [system.bending_damping[i], 0, 0]}
     parent, place, quat = payload, system.anchors[i], np.zeros(4)

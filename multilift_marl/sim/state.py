@@ -27,9 +27,11 @@ class SystemState(NamedTuple):
     drone_body_rates: np.ndarray
     """(E, N, 3) body frame [rad/s]."""
     rotor_speed: np.ndarray
-    """(E, N, 4) [rad/s]."""
+    """(E, N, 4) of each rotor, with its lag, never negative [rad/s]; times 30/π for revolutions per minute."""
     cable_tension: np.ndarray
     """(E, N) [N]. Massless: in the last physics step, exactly 0 when slack. Chain: now, next to the drone."""
+    cable_broken: np.ndarray
+    """(E, N) bool, once its tension has exceeded its breaking load, or by `World.break_cables`."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> SystemState:
@@ -38,6 +40,7 @@ class SystemState(NamedTuple):
         state = cls(
             *(np.zeros(shape) for shape in ((e, 3), (e, 3, 3), (e, 3), (e, 3))),
             *(np.zeros(shape) for shape in ((e, n, 3), (e, n, 3, 3), (e, n, 3), (e, n, 3), (e, n, 4), (e, n))),
+            np.zeros((e, n), bool),
         )
         state.payload_rotation[:] = np.eye(3)
         state.drone_rotation[:] = np.eye(3)
@@ -53,6 +56,29 @@ class Plant(NamedTuple):
     """(E, 3) constant external force on the payload's centre of mass, world frame [N]."""
     wind: np.ndarray
     """(E, 3) air velocity, world frame [m/s]."""
+
+
+class Air(NamedTuple):
+    """What blows beside the mean wind, and what that depends on; all zero where it is switched off."""
+
+    gust: np.ndarray
+    """(E, 3) turbulence and gust in the last physics step, the same for all bodies, world frame [m/s]."""
+    wash: np.ndarray
+    """(E, N + 1, 3) wash of the other drones at each drone, then at the payload, likewise [m/s]."""
+    filter: np.ndarray
+    """(E, 5) states of the turbulence filters: one of u, two each of v and w [-]."""
+    generator: np.ndarray
+    """(E,) uint64, state of the random numbers."""
+    steps: np.ndarray
+    """(E,) int64, physics steps since the reset, while there are gusts."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, num_drones: int) -> Air:
+        """Return still air."""
+        return cls(
+            np.zeros((num_envs, 3)), np.zeros((num_envs, num_drones + 1, 3)), np.zeros((num_envs, 5)),
+            np.zeros(num_envs, np.uint64), np.zeros(num_envs, np.int64),
+        )  # fmt: skip
 
 
 class Record(NamedTuple):

@@ -15,11 +15,14 @@ from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
+from multilift_marl.sim.air import start_turbulence
+from multilift_marl.sim.breaking import cut_cables
 from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.chain import make_chain, read_chains, write_chains
-from multilift_marl.sim.dynamics import apply_loads, hover_drone, make_constants, read_rows, write_rows
+from multilift_marl.sim.dynamics import apply_loads, make_constants
+from multilift_marl.sim.rows import hover_drone, read_rows, write_rows
 from multilift_marl.sim.scene import build_model
-from multilift_marl.sim.state import Plant, Record, SystemState
+from multilift_marl.sim.state import Air, Plant, Record, SystemState
 
 _log = logging.getLogger("multilift_marl.mujoco")
 REST_HEIGHT = 1.5  # [m] of the payload after World.reset
@@ -38,6 +41,8 @@ class Shard:
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
     read: Callable[[], None]
     """`read_rows` or `read_chains` of these environments."""
+    broken: np.ndarray
+    """(hi - lo, N) cables that the batch's models lack."""
 
 
 class World:
@@ -48,15 +53,18 @@ class World:
         num_envs: E.
         num_threads: threads; 0 for one on each available CPU. Results do not depend on it, bit for bit.
 
+        seed: of the turbulence that each `reset` starts with; `seed_turbulence` gives another.
+
     Attributes:
         state: SystemState of all environments; live arrays, E first.
         thrust: commanded thrust of each rotor (E, N, 4) [N].
         plant: true parameters and loads; write `wind` and `payload_force` freely, the mass by `set_payload_mass`.
+        air: what blows beside the mean wind.
         record: what accumulated since the reset.
         diverged: (E,) bool, until reset.
     """
 
-    def __init__(self, system: System, num_envs: int, num_threads: int = 0):
+    def __init__(self, system: System, num_envs: int, num_threads: int = 0, seed: int = 0):
         if num_envs < 1 or num_threads < 0:
             raise ValueError(f"num_envs={num_envs} must be at least 1 and num_threads={num_threads} at least 0")
         _quiet_mujoco()
@@ -69,8 +77,10 @@ class World:
             payload_force=np.zeros((num_envs, 3)),
             wind=np.tile(system.wind, (num_envs, 1)),
         )
+        self.air, self.seed = Air.zeros(num_envs, self.num_drones), seed
         self.record = Record.zeros(num_envs)
         self.diverged = np.zeros(num_envs, bool)
+        self._breakable = bool(np.isfinite(system.breaking_load).any())
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool, self._pool_owner = None, 0
         self.reset()
@@ -91,6 +101,9 @@ class World:
         self.set_payload_mass(mask, np.full(self.num_envs, system.payload_mass))
         self.plant.payload_force[mask] = 0
         self.plant.wind[mask] = system.wind
+        if system.air.turbulence:
+            for e in np.flatnonzero(mask):
+                self.seed_turbulence(e, np.random.SeedSequence(self.seed, spawn_key=(int(e),)))
         self.load(mask)
         return state
 
@@ -126,6 +139,8 @@ class World:
             except SimulationError as error:
                 self.diverged[shard.lo + np.asarray(error.ids, int)] = True
             shard.read()
+            if self._breakable:
+                self._cut(shard)
 
     def run(self, work: Callable[[Shard], None]) -> None:
         """Call `work` for every shard, each on a thread of its own."""
@@ -173,11 +188,28 @@ class World:
             inverse_weight = shard.batch.expanded("tendon_invweight0")[local]
             solref[local] = limit_solref(system.cable_stiffness, system.cable_damping, inverse_weight)
 
+    def seed_turbulence(self, env: int, seed: np.random.SeedSequence) -> None:
+        """Start the turbulence of one environment anew, from its stationary distribution."""
+        self.air.generator[env] = seed.generate_state(1, np.uint64)[0]
+        start_turbulence(env, self.air)
+
+    def break_cables(self, mask: np.ndarray) -> None:
+        """Let the cables in `mask` (E, N) bool break; `reset` and `load` make them whole again."""
+        self.state.cable_broken[mask] = True
+        for shard in self.shards:
+            self._cut(shard)
+
     def load(self, mask: np.ndarray) -> None:
-        """Make `state` of the environments in `mask` (E,) the simulations' own; their records start anew."""
+        """Make `state` of the environments in `mask` (E,) the simulations' own.
+
+        Records and gusts start anew, cables are whole.
+        """
+        self.state.cable_broken[mask] = False
+        self.air.gust[mask] = self.air.wash[mask] = self.air.steps[mask] = 0
         for shard in self.shards:
             local = mask[shard.lo : shard.hi]
             if local.any():
+                self._cut(shard)
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
                 self._write(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.record, *self.constants)
         self.diverged[mask] = False
@@ -199,6 +231,7 @@ class World:
         """Return copies of all that the future of the simulations depends on."""
         saved = {f"state.{name}": array.copy() for name, array in self.state._asdict().items()}
         saved |= {f"plant.{name}": array.copy() for name, array in self.plant._asdict().items()}
+        saved |= {f"air.{name}": array.copy() for name, array in self.air._asdict().items()}
         saved |= {f"record.{name}": array.copy() for name, array in self.record._asdict().items()}
         saved["rows"] = np.concatenate([shard.batch.state for shard in self.shards])
         saved["warning"] = np.concatenate([shard.batch.warning for shard in self.shards])
@@ -208,13 +241,21 @@ class World:
     def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
         """Continue bit for bit from what `state_dict` returned, at any number of threads."""
         self.set_payload_mass(np.ones(self.num_envs, bool), saved["plant.payload_mass"])
-        for prefix, group in (("state", self.state), ("plant", self.plant), ("record", self.record)):
+        for prefix, group in (("state", self.state), ("plant", self.plant), ("air", self.air), ("record", self.record)):
             for name, array in group._asdict().items():
                 array[:] = saved[f"{prefix}.{name}"]
         for shard in self.shards:
             shard.batch.state[:] = saved["rows"][shard.lo : shard.hi]
             shard.batch.warning[:] = saved["warning"][shard.lo : shard.hi]
+            self._cut(shard)
         self.diverged[:] = saved["diverged"]
+
+    def _cut(self, shard: Shard) -> None:
+        """Bring the shard's models into line with `state.cable_broken`."""
+        broken = self.state.cable_broken[shard.lo : shard.hi]
+        if (broken != shard.broken).any():
+            cut_cables(shard.batch, self.model, self.system, broken)
+            shard.broken[:] = broken
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int)
@@ -229,9 +270,9 @@ class World:
             constants = make_constants(self.system, self.layout, *offsets)  # the same for every shard
             self.constants = (constants, make_chain(self.system)) if chain else (constants,)
             span, told = (batch.state, lo, hi), batch.bind("sensordata")
-            apply = bind(apply_loads, *span, self.thrust, self.state, self.plant, self.record, constants)
+            apply = bind(apply_loads, *span, self.thrust, self.state, self.plant, self.air, self.record, constants)
             follow = bind(read, *span, told, self.state, self.record, self.diverged, *self.constants)
-            shards.append(Shard(lo, hi, batch, step, apply, follow))
+            shards.append(Shard(lo, hi, batch, step, apply, follow, np.zeros((hi - lo, self.num_drones), bool)))
         return shards
 
 

@@ -20,10 +20,11 @@ CAUSES = (
     "cable_angle",  # over 90° from the drone's down axis or 135° from the payload's up axis
     "below_payload",  # a drone lower than the payload
     "tilt",  # a drone tilted over 80°
+    "cable_broken",  # its tension has exceeded cable.breaking_load
     "out_of_range",  # payload over 3 m from its target, whatever the vehicle
     "diverged",  # the simulation has failed, not the team
 )
-_GROUND, _COLLISION, _CROSSING, _CABLE, _BELOW, _TILT, _RANGE, DIVERGED = range(1, len(CAUSES))
+_GROUND, _COLLISION, _CROSSING, _CABLE, _BELOW, _TILT, _BROKEN, _RANGE, DIVERGED = range(1, len(CAUSES))
 
 MAX_DISTANCE = 3.0  # [m]
 _CABLE_DISTANCE = 0.1  # [m] for the span of a falcon
@@ -95,6 +96,8 @@ def _cause(e, state, errors, limits, min_separation):
         cable = unit(sub(drone, anchor))
         if drone[2] - _extent(frame, limits.drone_half) < _TOUCH:
             return _GROUND
+        if state.cable_broken[e, n]:
+            return _BROKEN
         if frame[8] < _MIN_UP:
             return _TILT
         if drone[2] < payload[2]:

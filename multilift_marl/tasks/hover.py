@@ -30,7 +30,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.sim.cables import cable_end
-from multilift_marl.sim.dynamics import hover_drone
+from multilift_marl.sim.rows import hover_drone
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.terms import tolerance
@@ -142,7 +142,7 @@ def _start(e, rng, state, goal, rig, ranges, cables, team):
         direction = scale(1.0 / norm(cable), cable)
         half = (0.0, 0.0, 0.5 * cable_weight[n])
         tension = load * norm(sub(vec(goal.pull, e, n), half))  # in the middle, whose direction is the cable's
-        end = cable_end(direction, tension, cable_length[n], cable_stiffness[n], segments, cable_weight[n])
+        end = cable_end(direction, tension, cable_length[n], cable_stiffness[n], segments[n], cable_weight[n])
         put(state.drone_position[e, n], add(anchor, end))
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from multilift_marl.errors import nearest
-from multilift_marl.validation import bodies, cables, flight, momentum, symmetry, teams
+from multilift_marl.validation import air, bodies, cables, flight, momentum, symmetry, teams
 from multilift_marl.validation.document import describe, format_table, write_document
 from multilift_marl.validation.draw import draw
 from multilift_marl.validation.experiment import Experiment, Result
@@ -17,6 +17,7 @@ from multilift_marl.validation.experiment import Experiment, Result
 EXPERIMENTS: dict[str, Experiment] = {
     "single_cable": cables.single_cable,
     "six_cables": cables.six_cables,
+    "stiff_cables": cables.stiff_cables,
     "integrators": cables.integrators,
     "slack_taut": teams.slack_taut,
     "static_teams": teams.static_teams,
@@ -27,6 +28,10 @@ EXPERIMENTS: dict[str, Experiment] = {
     "motor_lag": bodies.motor_lag,
     "momentum": momentum.momentum,
     "symmetry": symmetry.symmetry,
+    "turbulence": air.turbulence_spectra,
+    "gust": air.gust,
+    "wash": air.wash,
+    "ground_effect": air.ground_effect,
     "flight": flight.flight,
 }
 

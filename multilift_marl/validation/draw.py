@@ -10,6 +10,7 @@ from multilift_marl.validation.experiment import Plot
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B", "#7F7F7F")  # Okabe & Ito 2008
 _DOTS = 90  # per inch
+_FEW = 8  # points of a curve that are marked one by one
 _PALETTE = 255  # colours of a picture: enough for thin lines, and half the size
 
 
@@ -50,7 +51,7 @@ def _draw_panel(axes, plot: Plot) -> None:
             axes.axvspan(start, end, color="0.94", linewidth=0)
     for i, curve in enumerate(simulated):
         colour = COLOURS[i % len(COLOURS)]
-        marker = "o" if plot.log else None
+        marker = "o" if len(curve.x) <= _FEW else None
         axes.plot(curve.x, curve.y, color=colour, label=curve.label or None, linewidth=1.4, marker=marker, markersize=4)
     for curve in plot.curves:
         if curve.theory:
@@ -61,7 +62,9 @@ def _draw_panel(axes, plot: Plot) -> None:
         axes.set_yscale("log")
     if plot.log:
         axes.set_xscale("log")
-        axes.set_xticks(sorted({float(x) for curve in plot.curves for x in curve.x}))
+    places = sorted({float(x) for curve in plot.curves for x in curve.x})
+    if plot.log and len(places) <= _FEW:
+        axes.set_xticks(places)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
     if plot.equal:

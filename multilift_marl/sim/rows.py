@@ -1,0 +1,164 @@
+"""MuJoCo's generalised coordinates and the physical state: reading one from the other, and writing it."""
+
+from __future__ import annotations
+
+from math import isfinite, sqrt
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.system import GRAVITY
+from multilift_marl.math3d import (
+    add,
+    dot,
+    mat,
+    mat_to_quat,
+    matrow,
+    mul,
+    norm,
+    put,
+    putmat,
+    quat_to_mat,
+    row,
+    sub,
+    thrust_frame,
+    vec,
+)
+
+MAX_SPEED = 100.0  # [m/s] beyond this a simulation has diverged
+MAX_RATE = 500.0  # [rad/s]
+MAX_STRETCH = 0.2  # [-] of a cable's length
+
+
+@kernel
+def read_rows(rows, lo, hi, tension, state, record, diverged, c):
+    """Read the physical state out of `batch.state` and mark environments that have diverged.
+
+    A diverged environment keeps its last sound state.
+
+    Args:
+        rows: `batch.state` of environments lo to hi.
+        lo, hi: the environments.
+        tension: cable tensions of the last physics step (hi - lo, N) [N].
+        state, record: written.
+        diverged: (E,) bool, set, never cleared.
+        c: Constants of `dynamics`.
+    """
+    for e in range(lo, hi):
+        line = rows[e - lo]
+        if diverged[e] or not _sound(line, tension[e - lo], c):
+            diverged[e] = True
+            continue
+        read_payload(e, line, state, c)
+        at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
+        slack = False
+        for n in range(tension.shape[1]):
+            for j in range(3):
+                state.drone_position[e, n, j] = line[at + j]
+                state.drone_velocity[e, n, j] = line[v + j]
+                state.drone_body_rates[e, n, j] = line[v + 3 + j]
+            putmat(state.drone_rotation[e, n], quat_to_mat(line[at + 3], line[at + 4], line[at + 5], line[at + 6]))
+            at += 7
+            v += 6
+            pull = tension[e - lo, n]
+            keep_tension(e, n, pull, state, record, c)
+            slack = slack or pull <= 0.0
+        if slack:
+            record.slack_time[e] += c.timestep
+
+
+@kernel
+def read_payload(e, line, state, c):
+    """Read the payload's state out of a row of `batch.state`."""
+    at, v = c.qpos, c.qvel
+    for j in range(3):
+        state.payload_position[e, j] = line[at + j]
+        state.payload_velocity[e, j] = line[v + j]
+    if c.payload_nv == 6:
+        putmat(state.payload_rotation[e], quat_to_mat(line[at + 3], line[at + 4], line[at + 5], line[at + 6]))
+        for j in range(3):
+            state.payload_body_rates[e, j] = line[v + 3 + j]
+
+
+@kernel
+def keep_tension(e, n, pull, state, record, c):
+    """Note the tension [N] of cable n in state and record, and whether it breaks."""
+    state.cable_tension[e, n] = pull
+    if pull > c.breaking_load[n]:
+        state.cable_broken[e, n] = True
+    record.tension_min[e] = min(record.tension_min[e], pull)
+    record.tension_max[e] = max(record.tension_max[e], pull)
+    record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[n] * c.cable_length[n]))
+
+
+@kernel
+def _sound(line, tension, c):
+    """Return whether a simulation's numbers are finite and within physical bounds."""
+    v = c.qvel
+    for j in range(c.payload_nv):
+        bound = MAX_SPEED if j < 3 else MAX_RATE
+        if not abs(line[v + j]) < bound:
+            return False
+    v += c.payload_nv
+    for n in range(tension.shape[0]):
+        for j in range(6):
+            if not abs(line[v + 6 * n + j]) < (MAX_SPEED if j < 3 else MAX_RATE):
+                return False
+        if not tension[n] < MAX_STRETCH * c.cable_stiffness[n] * c.cable_length[n]:
+            return False
+    for j in range(c.payload_nq + 7 * tension.shape[0]):
+        if not isfinite(line[c.qpos + j]):
+            return False
+    return True
+
+
+@kernel
+def hover_drone(e, n, state, pull, yaw, mass, thrust_coefficient):
+    """Let drone n of environment e hold still: attitude and rotor speeds that pull its cable by `pull` [N]."""
+    force = add(pull, (0.0, 0.0, mass * GRAVITY))
+    putmat(state.drone_rotation[e, n], thrust_frame(force, yaw))
+    for k in range(4):
+        state.rotor_speed[e, n, k] = sqrt(norm(force) / (4.0 * thrust_coefficient))
+
+
+@kernel
+def write_rows(rows, lo, hi, mask, state, record, c):
+    """Write the state of the environments in `mask` into `batch.state`; tensions follow from the stretch."""
+    for e in range(lo, hi):
+        if not mask[e]:
+            continue
+        line = rows[e - lo]
+        clear_record(e, record)
+        write_payload(e, line, state, c)
+        attitude = matrow(state.payload_rotation, e)
+        at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
+        for n in range(state.drone_position.shape[1]):
+            position = vec(state.drone_position, e, n)
+            put(line[at : at + 3], position)
+            q = mat_to_quat(mat(state.drone_rotation, e, n))
+            line[at + 3], line[at + 4], line[at + 5], line[at + 6] = q
+            put(line[v : v + 3], vec(state.drone_velocity, e, n))
+            put(line[v + 3 : v + 6], vec(state.drone_body_rates, e, n))
+            at += 7
+            v += 6
+            anchor = (c.anchors[n, 0], c.anchors[n, 1], c.anchors[n, 2])
+            cable = sub(position, add(row(state.payload_position, e), mul(attitude, anchor)))
+            pull = c.cable_stiffness[n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[n])
+            keep_tension(e, n, pull, state, record, c)
+
+
+@kernel
+def write_payload(e, line, state, c):
+    """Write the payload's state into a row of `batch.state`."""
+    at, v = c.qpos, c.qvel
+    put(line[at : at + 3], row(state.payload_position, e))
+    put(line[v : v + 3], row(state.payload_velocity, e))
+    if c.payload_nv == 6:
+        q = mat_to_quat(matrow(state.payload_rotation, e))
+        line[at + 3], line[at + 4], line[at + 5], line[at + 6] = q
+        put(line[v + 3 : v + 6], row(state.payload_body_rates, e))
+
+
+@kernel
+def clear_record(e, record):
+    """Let the record of environment e start anew."""
+    record.energy[e], record.slack_time[e] = 0.0, 0.0
+    record.tension_min[e], record.tension_max[e], record.stretch_max[e] = 1e9, 0.0, 0.0

@@ -1,0 +1,166 @@
+"""Chains below fixed anchors, and what eqs 14-16 of the report say about them, solved without MuJoCo."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from multilift_marl.config.load import load_config
+from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.sim.scene import build_model
+
+ROPE = 0.01  # [kg/m]
+SEGMENTS = 10
+_ANCHOR_MASS = 1e6  # [kg] of what holds the upper ends; it moves by less than 1e-6 m
+
+
+def hanging_chain(mass: float, timestep: float, cables: int = 1, angle: float = 0.0, **overrides):
+    """Return a load below fixed anchors on chains of 1 m, straight and at their natural length.
+
+    It is the package's own model, with drones so heavy that they stay where they are, held against gravity and
+    against what the load will weigh.
+
+    Args:
+        mass: of the load, a point [kg].
+        timestep: [s].
+        cables: evenly spaced about the vertical.
+        angle: of the cables from the vertical [rad].
+        **overrides: configuration values by name, with __ for the dot.
+
+    Returns:
+        The model, its data before the first step, and the system.
+    """
+    values = {
+        "env.num_drones": cables, "cable.model": "chain", "cable.length": 1.0, "cable.angle": float(np.rad2deg(angle)),
+        "cable.density": ROPE, "cable.segments": SEGMENTS, "payload.shape": "point", "payload.mass": mass,
+        "vehicle.mass": _ANCHOR_MASS, "vehicle.rotor_thrust_max": 100 * _ANCHOR_MASS,
+        "vehicle.inertia": (_ANCHOR_MASS,) * 3, "sim.timestep": timestep, "sim.control_hz": 1 / timestep,
+    }  # fmt: skip
+    system = load_config("hover", values | {key.replace("__", "."): value for key, value in overrides.items()}).system
+    model, layout = build_model(system)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    data = mujoco.MjData(model)
+    data.xfrc_applied[list(layout.drone_bodies), :3] = system.drone_pull + [0, 0, _ANCHOR_MASS * GRAVITY]
+    return model, data, system
+
+
+def tested_stiffness(data: mujoco.MjData, system: System) -> float:
+    """Return the stiffness [N/m] of the first cable of a load at rest: its tensions over its stretches.
+
+    The tensions are what statics says: the load's share below, one node's weight more with every segment, and the
+    horizontal pull that goes with the direction of the lowest link.
+    """
+    n = int(system.cable_segments[0])
+    lowest = data.body("cable_0/link_0").xmat.reshape(3, 3)[:, 2]
+    share = system.payload_mass * GRAVITY / system.num_drones
+    upward = share + GRAVITY * system.cable_mass[0] / n * np.arange(n)
+    tension = np.hypot(upward, share * np.hypot(lowest[0], lowest[1]) / lowest[2])
+    stretch = [data.joint(f"cable_0/stretch_{j}").qpos[0] for j in range(n)]
+    return float(tension.sum() / (n * np.sum(stretch)))
+
+
+def exponential(matrix: np.ndarray) -> np.ndarray:
+    """Return the exponential of a square matrix, by Taylor's series of matrix/2^k and k squarings."""
+    halvings = max(0, int(np.ceil(np.log2(np.linalg.norm(matrix, 1))))) + 4
+    term = total = np.eye(len(matrix))
+    for order in range(1, 14):
+        term = term @ matrix / 2**halvings / order
+        total = total + term
+    for _ in range(halvings):
+        total = total @ total
+    return total
+
+
+def straight_chain(mass: float, stiffness: float, damping: float, gravity: float, t: np.ndarray) -> np.ndarray:
+    """Return the elongation (T,) [m] of a vertical chain that is let go at its natural length.
+
+    The matrix exponential of SEGMENTS masses, springs and dampers, the last mass being the load.
+
+    Args:
+        mass: of the load [kg].
+        stiffness, damping: of the whole chain [N/m], [N s/m].
+        gravity: along the chain [m/s²].
+        t: evenly spaced times, the first one step after the start (T,) [s].
+    """
+    n = SEGMENTS
+    masses = np.full(n, ROPE / n)  # each segment's mass is at its upper end, the first one's at the anchor
+    masses[-1] = mass
+    springs = np.diag(np.r_[np.full(n - 1, 2.0), 1.0]) - np.eye(n, k=1) - np.eye(n, k=-1)
+    rest = np.linalg.solve(n * stiffness * springs, gravity * masses)
+    inverse = 1 / masses[:, None]
+    flow = np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-n * stiffness * springs * inverse, -n * damping * springs * inverse]]
+    )
+    propagator, state, depth = exponential(flow * t[0]), np.r_[-rest, np.zeros(n)], []
+    for _ in t:
+        state = propagator @ state
+        depth.append(state[n - 1] + rest[-1])
+    return np.array(depth)
+
+
+def inclined_chains(
+    mass: float, stiffness: float, damping: float, cables: int, angle: float, t: np.ndarray, step: float = 5e-5
+) -> np.ndarray:
+    """Return the depth (T,) [m] of a load that evenly spaced inclined chains let go at their natural length.
+
+    Unlike `straight_chain`, chains of a load that is light against them sag while they stretch. One of them, in its
+    plane, is solved by the implicit midpoint rule in Cartesian coordinates.
+
+    Args:
+        mass, stiffness, damping: as in `straight_chain`.
+        cables: number of chains.
+        angle: from the vertical [rad].
+        t: times (T,) [s], multiples of `step`.
+        step: of the midpoint rule [s]; its error is of second order in it.
+    """
+    n, link = SEGMENTS, 1.0 / SEGMENTS
+    along = np.array([np.sin(angle), np.cos(angle)])
+    place = link * np.arange(n)[:, None] * along  # the load and the n - 1 free nodes; horizontal, vertical
+    velocity, top = np.zeros_like(place), along
+    masses = np.full((n, 2), ROPE / n)
+    masses[0] = mass / cables
+    free = np.ones(2 * n, bool)
+    free[0] = False  # by symmetry the load moves vertically
+    times, depth, kept = np.round(t / step).astype(int), [], 0
+    for i in range(1, times[-1] + 1):
+        change = np.zeros_like(velocity)
+        for _ in range(20):  # Newton's method for the change of velocity
+            middle, speed = place + 0.5 * step * (velocity + 0.5 * change), velocity + 0.5 * change
+            force, by_place, by_speed = _pulls(middle, speed, top, link, n * stiffness, n * damping)
+            gap = (masses * change - step * (force - masses * [0, GRAVITY])).ravel()
+            slope = np.diag(masses.ravel()) + step * (0.25 * step * by_place + 0.5 * by_speed)
+            correction = np.zeros(2 * n)
+            correction[free] = np.linalg.solve(slope[np.ix_(free, free)], gap[free])
+            change -= correction.reshape(n, 2)
+            if np.abs(correction).max() < 1e-13:
+                break
+        place = place + step * (velocity + 0.5 * change)
+        velocity = velocity + change
+        if i == times[kept]:
+            depth.append(-place[0, 1])
+            kept += 1
+    return np.array(depth)
+
+
+def _pulls(place: np.ndarray, velocity: np.ndarray, top: np.ndarray, length: float, stiffness: float, damping: float):
+    """Return forces (n, 2) of eqs 14-15 on the nodes, and minus their derivatives by place and velocity (2n, 2n)."""
+    n = len(place)
+    link = np.diff(np.vstack([place, top]), axis=0)
+    opening = np.diff(np.vstack([velocity, [0.0, 0.0]]), axis=0)
+    size = np.linalg.norm(link, axis=1, keepdims=True)
+    along = link / size
+    tension = stiffness * (size - length) + damping * (along * opening).sum(axis=1, keepdims=True)
+    force = tension * along
+    total = force.copy()
+    total[1:] -= force[:-1]
+    outer = along[:, :, None] * along[:, None, :]
+    across = (tension / size)[..., None] * (np.eye(2) - outer)
+    by_place, by_speed = np.zeros((2, n, 2, n, 2))
+    for blocks, sums in ((stiffness * outer + across, by_place), (damping * outer, by_speed)):
+        for j in range(n):
+            sums[j, :, j] += blocks[j]
+            if j + 1 < n:
+                sums[j + 1, :, j + 1] += blocks[j]
+                sums[j, :, j + 1] -= blocks[j]
+                sums[j + 1, :, j] -= blocks[j]
+    return total, by_place.reshape(2 * n, 2 * n), by_speed.reshape(2 * n, 2 * n)
