@@ -33,6 +33,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "wash": air.wash,
     "ground_effect": air.ground_effect,
     "flight": flight.flight,
+    "flight_in_wind": flight.flight_in_wind,
 }
 
 

@@ -134,15 +134,17 @@ def spin(fast: bool) -> Result:
 
 def swing(fast: bool) -> Result:
     """A load of 1 kg swings from 30° for 20 s: its period, and what the integrator takes of its energy."""
-    caption = "A load swings from 30°: its energy, of which the integrator and the cable's own damper take a little."
-    plot = Plot("swing", "energy of a swinging load", "time [s]", "energy over the initial one", caption=caption)
+    caption = "A load swings from 30°: its energy, averaged over a swing, of which integrator and damper take a little."
+    plot = Plot("swing", "energy of a swinging load", "time [s]", "mean energy over the initial one", caption=caption)
     result, seconds = Result(plots=[plot]), 5.0 if fast else 20.0
     start, length = np.deg2rad(30.0), 1.0 + GRAVITY / 1e5
     period = 2 * np.pi * np.sqrt(length / GRAVITY) / _mean(1.0, np.cos(start / 2))
     losses, periods = [], []
     for timestep in STEPS:
         time, angle, energy = _swing(timestep, seconds, start, length)
-        plot.curves.append(Curve(ms(timestep), time, energy))
+        swing_steps = round(period / timestep)
+        mean = np.convolve(energy, np.full(swing_steps, 1 / swing_steps), mode="valid")
+        plot.curves.append(Curve(ms(timestep), time[swing_steps // 2 :][: len(mean)], mean))
         window = round(2.0 / timestep)
         losses.append(1 - float(energy[-window:].mean()) / float(energy[:window].mean()))
         limit = 0.01 if timestep == 4e-3 else float("inf")

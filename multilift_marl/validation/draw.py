@@ -51,7 +51,7 @@ def _draw_panel(axes, plot: Plot) -> None:
             axes.axvspan(start, end, color="0.94", linewidth=0)
     for i, curve in enumerate(simulated):
         colour = COLOURS[i % len(COLOURS)]
-        marker = "o" if len(curve.x) <= _FEW else None
+        marker = "o" if plot.log and len(curve.x) <= _FEW else None
         axes.plot(curve.x, curve.y, color=colour, label=curve.label or None, linewidth=1.4, marker=marker, markersize=4)
     for curve in plot.curves:
         if curve.theory:
@@ -71,7 +71,8 @@ def _draw_panel(axes, plot: Plot) -> None:
         axes.set_aspect("equal")
     axes.grid(color="0.88", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
-    crowded = sum(bool(curve.label) for curve in plot.curves) > 4 or plot.equal
+    named = [curve for curve in plot.curves if curve.label.strip("_")]
+    crowded = len(named) > (3 if plot.phases else 4) or plot.equal
     beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)} if crowded else {}
     axes.legend(frameon=False, fontsize=9, **beside)
 

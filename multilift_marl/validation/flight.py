@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from multilift_marl.config.load import load_config
+from multilift_marl.config.schema import Config
 from multilift_marl.config.system import System
+from multilift_marl.control.disturbance import Disturbance, bind_rejection, make_rejection
 from multilift_marl.control.formation import Reference
-from multilift_marl.control.geometric import fly, make_gains
+from multilift_marl.control.geometric import Gains, fly, make_gains
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row
 from multilift_marl.validation.trajectory import (
@@ -26,6 +29,7 @@ LIMITS = {"report4": (0.005, 0.010), "falcon4": (0.005, 0.015)}
 """Mean position error of a drone [m] on the circle at 0.2 and 0.4 rad/s, by rig."""
 _CIRCLES = ("slow circle", "fast circle")
 _OVERSHOOT = 0.1  # [m]
+_WIND = 5.0  # [m/s]
 
 
 class Flight(NamedTuple):
@@ -73,9 +77,42 @@ def flight(fast: bool) -> Result:
     return result
 
 
-def fly_rig(rig: str, plan: Plan) -> Flight:
-    """Fly `plan` with the team of a rig (a configuration in configs/rigs), beside one on plain feed-forward."""
-    config = load_config(f"rigs/{rig}", {"control.drag_feedforward": True})
+def flight_in_wind(fast: bool) -> Result:
+    """The same flight in 5 m/s of wind with its turbulence, with and without rejection of disturbances (`indi`)."""
+    result = Result()
+    caption = "Mean position error of the drones in 5 m/s of wind with turbulence, with and without rejection."
+    plot = Plot("flight_in_wind", "the flight in wind", "time [s]", "error [cm]", caption=caption)
+    for rig in LIMITS:
+        plan = make_plan((0.25, 0.5) if fast else (1.0, 1.0))
+        plot.phases = _phases(plan, "fast circle")
+        for kind in ("indi", "none"):
+            wind = {"wind__velocity": [_WIND, 0.0, 0.0], "wind__turbulence": True}
+            flown = fly_rig(rig, plan, control__disturbance=kind, **wind)
+            for phase, rate in zip(_CIRCLES, plan.rates, strict=True):
+                during, name = plan.during(phase, flown.time), f"in wind, {rig}, {rate:g} rad/s, {kind}"
+                error = float(flown.drone_error[during].mean(axis=0).max())
+                limit = 0.03 if kind == "indi" else float("inf")
+                quantity = "mean position error [m] of the drone with the largest"
+                result.rows.append(Row(name, quantity, 0.0, error, error, limit))
+                payload = float(flown.payload_error[during].mean())
+                result.rows.append(Row(name, "mean payload error [m]", 0.0, payload, payload, float("inf")))
+            shown = flown.time >= plan.start[1]
+            error = 100 * flown.drone_error[shown].mean(axis=1)
+            plot.curves.append(Curve(f"{rig}, {kind}", flown.time[shown], error))
+    result.plots.append(plot)
+    return result
+
+
+def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
+    """Fly `plan` with the team of a rig (a configuration in configs/rigs), beside one on plain feed-forward.
+
+    Args:
+        rig: its name.
+        plan: phases.
+        **overrides: configuration values by name, with __ for the dot.
+    """
+    values = {"control.drag_feedforward": True} | {key.replace("__", "."): value for key, value in overrides.items()}
+    config = load_config(f"rigs/{rig}", values)
     system, dt = config.system, 1 / config.sim.control_hz
     time = dt * np.arange(round(plan.end / dt))
     ways = [make_trajectory(system, plan, time, plain) for plain in (False, True)]
@@ -83,7 +120,10 @@ def fly_rig(rig: str, plan: Plan) -> Flight:
     _put_down(world)
     state, reference = world.state, Reference.zeros(len(ways), system.num_drones)
     pull = np.zeros((len(ways), system.num_drones, 3))
-    gains = make_gains(config.control, system)._replace(load_share=np.zeros(system.num_drones))
+    gains = make_gains(config.control, system)
+    disturbance = Disturbance.zeros(len(ways), system.num_drones)
+    reject = _bind_rejection(config, world, reference, pull, disturbance, gains)
+    gains = gains._replace(load_share=np.zeros(system.num_drones))  # the pulls hold the load's inertia
     payload, drones, tension, yaw_error = [], [], [], []
     for i, t in enumerate(time):
         for e, way in enumerate(ways):
@@ -98,12 +138,25 @@ def fly_rig(rig: str, plan: Plan) -> Flight:
         if t < plan.start[1]:
             world.thrust[:] = 0.0  # at rest the rotors idle
         else:
-            fly(0, len(ways), state, reference, pull, world.thrust, gains)
+            reject()
+            fly(0, len(ways), state, reference, disturbance.pull, world.thrust, gains)
         world.step(world.thrust, system.control_interval)
         tension.append(state.cable_tension[0].copy())
     both = np.array(payload)
     flown = np.array(drones), np.array(tension), np.array(yaw_error)
     return Flight(plan, system, time, ways[0], both[:, 0], *flown, both[:, 1])
+
+
+def _bind_rejection(
+    config: Config, world: World, reference: Reference, pull: np.ndarray, disturbance: Disturbance, gains: Gains
+) -> Callable[[], None]:
+    """Return the call that writes pulls and estimated disturbance into `disturbance.pull` before each control step."""
+    if config.control.disturbance == "none":
+        return lambda: disturbance.pull.__setitem__(slice(None), pull)
+    rejection = make_rejection(config.control, world.system, gains, 1 / config.sim.control_hz)
+    told = gains._replace(load_share=np.zeros(world.num_drones))
+    flown = (world.state, reference, pull, world.thrust, disturbance, told, rejection)
+    return bind_rejection(0, world.num_envs, *flown, config.control.disturbance)
 
 
 def _put_down(world: World) -> None:
