@@ -15,7 +15,7 @@ import sys
 import numpy as np
 
 from multilift_marl.config import Config, load_config, parse_overrides
-from multilift_marl.control.disturbance import Disturbance, bind_rejection, forget, make_rejection
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.geometric import fly, make_gains
 from multilift_marl.sim.world import REST_HEIGHT, World
@@ -31,7 +31,6 @@ CASES = {  # true payload mass over nominal, mean wind [m/s], gust amplitude [m/
     "wind 5 ± 2 m/s, 0.3 rad/s": (1.0, 5.0, 2.0, 0.3),
     "wind 5 ± 2 m/s, 1 rad/s": (1.0, 5.0, 2.0, 1.0),
 }
-REJECTIONS = ("none", "integral", "indi")
 
 
 def circle(t: float, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, float]:
@@ -73,7 +72,6 @@ def fly_cases(config: Config, rate: float, seconds: float) -> tuple[np.ndarray, 
         for i in range(e):
             forget(i, state, disturbance, rejection.thrust_coefficient)
         flown = disturbance.pull
-        reject = bind_rejection(0, e, state, reference, pull, world.thrust, disturbance, gains, rejection, kind)
     slots, rest = system.slots + [0, 0, REST_HEIGHT], np.array([0, 0, REST_HEIGHT])
     drones, payload, counted = np.zeros(e), np.zeros(e), 0
     for tick in range(round((START + seconds) / dt)):
@@ -88,7 +86,7 @@ def fly_cases(config: Config, rate: float, seconds: float) -> tuple[np.ndarray, 
             payload += np.linalg.norm(state.payload_position - rest - position, axis=-1)
             counted += 1
         if kind != "none":
-            reject()
+            REJECTIONS[kind](0, e, state, reference, pull, disturbance, gains, rejection)
         fly(0, e, state, reference, flown, world.thrust, gains)
         world.step(world.thrust, system.control_interval)
     if world.diverged.any():
@@ -102,9 +100,11 @@ def main(arguments: list[str]) -> None:
     seconds = float(values.pop("seconds", 30.0))
     for rig in str(values.pop("rigs", "falcon4")).split(","):
         told = {"control.drag_feedforward": True} | values
-        configs = {kind: load_config(f"rigs/{rig}", told | {"control.disturbance": kind}) for kind in REJECTIONS}
+        configs = {
+            kind: load_config(f"rigs/{rig}", told | {"control.disturbance": kind}) for kind in ("none", *REJECTIONS)
+        }
         print(f"\n{rig}: drones' error [cm], mean over {seconds:g} s (payload's)\n")
-        columns = [(rate, kind) for rate in (0.0, 0.2, 0.4) for kind in REJECTIONS]
+        columns = [(rate, kind) for rate in (0.0, 0.2, 0.4) for kind in configs]
         print("| | " + " | ".join(f"{f'{rate:g} rad/s' if rate else 'hover'}, {kind}" for rate, kind in columns) + " |")
         print("|---" * (len(columns) + 1) + "|")
         flown = [fly_cases(configs[kind], rate, seconds) for rate, kind in columns]

@@ -15,7 +15,7 @@ import numpy as np
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import GRAVITY
-from multilift_marl.control.formation import Goal, Reference, smooth
+from multilift_marl.control.formation import Goal, Reference, leave_goal, smooth, smooth_moving
 from multilift_marl.control.geometric import Gains, control, fly
 from multilift_marl.control.setpoints import (
     Setpoint,
@@ -69,6 +69,10 @@ class Interface:
         """Return what is called in turn at every control step, the last of them for the thrusts."""
         raise NotImplementedError
 
+    def ride(self, lo: int, hi: int, plan: Call, act: Call, team: Team) -> tuple[Call, ...]:
+        """Return the same as `follow` for goals that move, by calling `plan`, at every control step."""
+        return plan, *self.follow(lo, hi, team)
+
 
 class ReferenceAction(Interface):
     """Offset of the drone's slot in the formation about the target payload pose; zero is the scripted formation.
@@ -92,6 +96,14 @@ class ReferenceAction(Interface):
         if self.settings.disturbance == "none":  # both in one call, which is quicker
             return (bind(control, lo, hi, *flown, *smoothing),)
         return bind(smooth, lo, hi, team.reference, *smoothing), bind(fly, lo, hi, *flown)
+
+    def ride(self, lo: int, hi: int, plan: Call, act: Call, team: Team) -> tuple[Call, ...]:
+        """See `Interface.ride`."""
+        smoothing = (self.settings.reference_frequency, self.settings.reference_speed, self.dt)
+        flown = (team.state, team.reference, team.pull, team.thrust, team.gains)
+        leave = bind(leave_goal, lo, hi, team.reference, team.goal)
+        moved = bind(smooth_moving, lo, hi, team.reference, team.goal, *smoothing)
+        return leave, plan, act, moved, bind(fly, lo, hi, *flown)
 
 
 class VelocityAction(Interface):
@@ -208,7 +220,7 @@ def _command_offset(lo, hi, action, goal, reference, max_offset, max_yaw):
     for e in range(lo, hi):
         for n in range(action.shape[1]):
             put(reference.command[e, n], add(vec(goal.slots, e, n), _in_world(e, n, action, goal, max_offset)))
-            reference.command_yaw[e, n] = goal.yaw[e] + max_yaw * action[e, n, 3]
+            reference.command_yaw[e, n] = goal.drone_yaw[e] + max_yaw * action[e, n, 3]
 
 
 @kernel
@@ -226,7 +238,7 @@ def _command_acc_rates(lo, hi, action, goal, reference, rates, max_acceleration,
             put(reference.acceleration[e, n], _in_world(e, n, action, goal, max_acceleration))
             rates[e, n, 0] = max_tilt_rate * action[e, n, 3]
             rates[e, n, 1] = max_tilt_rate * action[e, n, 4]
-            reference.command_yaw[e, n] = goal.yaw[e]
+            reference.command_yaw[e, n] = goal.drone_yaw[e]
 
 
 @kernel

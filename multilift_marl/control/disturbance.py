@@ -6,19 +6,16 @@ whatever flies with the one flies with the other.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import exp, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import bind, kernel
+from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.control.formation import Reference
 from multilift_marl.control.geometric import Gains
 from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale, sub, tmul, vec
-from multilift_marl.sim.state import SystemState
 
 # Bandwidth over ω_p m/(m + m_L), at most: ω_p of the position loop, m and m_L the masses of a drone and of its load.
 # The share m_L/(m + m_L) of a thrust comes back as pull of the cable, which slows any loop around the drone. Faster,
@@ -45,7 +42,7 @@ class Disturbance(NamedTuple):
 
 
 class Rejection(NamedTuple):
-    """Numbers of the rejection."""
+    """Numbers of a rejection."""
 
     dt: float
     """Control step [s]."""
@@ -90,7 +87,7 @@ def forget(e, state, disturbance, thrust_coefficient):
 
 
 @kernel
-def integrate_error(lo, hi, state, reference, pull, thrust, disturbance, g, c):
+def integrate_error(lo, hi, state, reference, pull, disturbance, g, c):
     """Add the integral of the position error to the pulls of environments lo to hi: `integral`.
 
     F_i = -m k_p ω ∫ (p - p_d) dt, no longer than the limit. While a rotor is at its limit the integral may only shrink.
@@ -99,15 +96,16 @@ def integrate_error(lo, hi, state, reference, pull, thrust, disturbance, g, c):
         lo, hi: the environments.
         state, reference: SystemState, Reference.
         pull: nominal pulls (E, N, 3) [N].
-        thrust: rotor thrusts of the last control step (E, N, 4) [N].
         disturbance: Disturbance, written.
         g, c: Gains, Rejection.
     """
+    margin = 0.01 * g.thrust_max
     for e in range(lo, hi):
-        for n in range(thrust.shape[1]):
+        for n in range(pull.shape[1]):
             saturated = False
             for k in range(4):
-                saturated = saturated or thrust[e, n, k] >= g.thrust_max or thrust[e, n, k] <= g.thrust_min
+                thrust = c.thrust_coefficient * state.rotor_speed[e, n, k] ** 2
+                saturated = saturated or thrust > g.thrust_max - margin or thrust < g.thrust_min + margin
             error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
             before = vec(disturbance.force, e, n)
             force = limit(sub(before, scale(c.gain * c.dt, error)), c.largest)
@@ -145,11 +143,4 @@ def estimate_force(lo, hi, state, reference, pull, disturbance, g, c):
             put(disturbance.pull[e, n], add(nominal, force))
 
 
-def bind_rejection(
-    lo: int, hi: int, state: SystemState, reference: Reference, pull: np.ndarray, thrust: np.ndarray,
-    disturbance: Disturbance, g: Gains, c: Rejection, kind: str,
-) -> Callable[[], None]:  # fmt: skip
-    """Return the call that, before each control step, brings `disturbance.pull` of environments lo to hi up to date."""
-    if kind == "indi":
-        return bind(estimate_force, lo, hi, state, reference, pull, disturbance, g, c)
-    return bind(integrate_error, lo, hi, state, reference, pull, thrust, disturbance, g, c)
+REJECTIONS = {"integral": integrate_error, "indi": estimate_force}

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from multilift_marl._jit import bind
 from multilift_marl.config.schema import Config
 from multilift_marl.control.actions import ACTIONS, Call, Team
-from multilift_marl.control.disturbance import Disturbance, bind_rejection, forget, make_rejection
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
 from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.geometric import make_gains
 from multilift_marl.control.setpoints import Setpoint
@@ -50,17 +51,27 @@ class Pilot:
             self.disturbance = Disturbance.zeros(e, n)
             self._rejection = make_rejection(settings, world.system, self._gains, dt)
 
-    def bind(self, lo: int, hi: int, action: np.ndarray, goal: Goal) -> tuple[Call, tuple[Call, ...]]:
-        """Return what environments lo to hi call once for each policy step, and in turn at each control step."""
+    def bind(
+        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
+    ) -> tuple[Call, tuple[Call, ...]]:
+        """Return what environments lo to hi call once for each policy step, and in turn at each control step.
+
+        Args:
+            lo, hi: the environments.
+            action: (E, N, A), live array.
+            goal: of the task.
+            plan: moves the goals on by one control step; None if they stay.
+        """
         state, thrust, g = self.world.state, self.world.thrust, self._gains
         rejection = self.disturbance
         pull = goal.pull if rejection is None else rejection.pull
         team = Team(state, goal, self.reference, self._setpoint, pull, thrust, g)
-        act, follow = self.interface.act(lo, hi, action, team), self.interface.follow(lo, hi, team)
+        act = self.interface.act(lo, hi, action, team)
+        follow = self.interface.follow(lo, hi, team) if plan is None else self.interface.ride(lo, hi, plan, act, team)
         if rejection is None:
             return act, follow
-        known, own = (state, self.reference, goal.pull, thrust), (rejection, g, self._rejection)
-        estimate = bind_rejection(lo, hi, *known, *own, self._kind)
+        known, own = (state, self.reference, goal.pull), (rejection, g, self._rejection)
+        estimate = bind(REJECTIONS[self._kind], lo, hi, *known, *own)
         return act, (*follow[:-1], estimate, follow[-1])
 
     def start(self, e: int) -> None:

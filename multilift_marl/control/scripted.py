@@ -65,7 +65,7 @@ def check_interface(name: str, action: str) -> None:
     if action != "reference":
         raise ConfigError(
             f"the scripted policy '{name}' acts by control.action=reference and cannot fly control.action={action}; "
-            "set control.action=reference, or baseline=none where a script is for comparison alone"
+            "set control.action=reference, or leave the script out (baseline=none, train.residual=formation)"
         )
 
 

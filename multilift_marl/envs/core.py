@@ -59,9 +59,9 @@ class MultiliftVec:
         self.task = task(config, self.world, self.reference)
         self.action_names = self.pilot.action_names
         self.action_size = len(self.action_names)
-        self.observation_names = observation_names(self.action_size)
+        self.observation_names = observation_names(self.action_size, task.EXTRA)
         self.observation_size = len(self.observation_names)
-        self.state_size = state_size(n, self.action_size)
+        self.state_size = state_size(n, self.action_size) + task.EXTRA_STATE
         self.reward_terms, self.failure_causes = tuple(task.REWARD), CAUSES
         self._action = np.zeros((e, n, self.action_size))
         self._previous = np.zeros_like(self._action)
@@ -189,7 +189,7 @@ class MultiliftVec:
         self._calls: dict[int, tuple] = {}
         for shard in self.world.shards:
             span = (shard.lo, shard.hi)
-            act, follow = self.pilot.bind(*span, self._action, self.task.goal)
+            act, follow = self.pilot.bind(*span, self._action, self.task.goal, self.task.planner(*span))
             after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
             self._calls[shard.lo] = (act, follow, after)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, pi, radians, sin, sqrt
+from math import radians
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -11,28 +11,22 @@ from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section
-from multilift_marl.config.system import GRAVITY
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import (
     add,
     axis_angle,
-    heading,
     matmul,
     matrow,
-    mul,
     norm,
     put,
     putmat,
     rot_z,
     scale,
-    sub,
-    vec,
 )
-from multilift_marl.sim.cables import cable_end
-from multilift_marl.sim.rows import hover_drone
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.starts import hang_team, in_ball
 from multilift_marl.tasks.terms import tolerance
 
 
@@ -72,15 +66,12 @@ class Hover(Task):
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, displacement, tilt and velocity; see `Task.start`."""
-        option, world, vehicle = self.options, self.world, self.world.system.vehicle
+        option = self.options
         ranges = StartRanges(
             option.target_xy, *option.target_height, radians(option.target_yaw),
             option.start_radius, radians(option.start_tilt), option.start_speed,
         )  # fmt: skip
-        load = mass / world.system.payload_mass
-        cables = (world.system.cable_length, world.system.cable_stiffness, world.system.cable_mass * GRAVITY)
-        team = (world.system.cable_segments, load, vehicle.mass, vehicle.thrust_coefficient)
-        _start(env, rng, world.state, self.goal, self.rig, ranges, cables, team)
+        _start(env, rng, self.world.state, self.goal, self.rig, ranges, self.hanging, mass)
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
@@ -108,18 +99,7 @@ class StartRanges(NamedTuple):
 
 
 @kernel
-def in_ball(rng, radius):
-    """Return a vector uniform in a ball."""
-    z, azimuth = rng.uniform(-1.0, 1.0), rng.uniform(-pi, pi)
-    r = radius * rng.uniform(0.0, 1.0) ** (1.0 / 3.0)
-    flat = r * sqrt(1.0 - z * z)
-    return (flat * cos(azimuth), flat * sin(azimuth), r * z)
-
-
-@kernel
-def _start(e, rng, state, goal, rig, ranges, cables, team):
-    cable_length, cable_stiffness, cable_weight = cables
-    segments, load, drone_mass, thrust_coefficient = team
+def _start(e, rng, state, goal, rig, ranges, hanging, mass):
     x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
     put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))
     putmat(goal.rotation[e], rot_z(rng.uniform(-ranges.yaw, ranges.yaw)))
@@ -132,22 +112,7 @@ def _start(e, rng, state, goal, rig, ranges, cables, team):
     attitude = matrow(goal.rotation, e)
     if np.any(rig.anchors != 0.0):  # a point has no attitude: it counts as aligned
         attitude = matmul(tilt, attitude)
-    put(state.payload_position[e], payload)
-    put(state.payload_velocity[e], velocity)
-    putmat(state.payload_rotation[e], attitude)
-    state.payload_body_rates[e] = 0.0
-    for n in range(rig.slots.shape[0]):
-        anchor = add(payload, mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
-        cable = sub(add(vec(goal.slots, e, n), moved), anchor)
-        direction = scale(1.0 / norm(cable), cable)
-        half = (0.0, 0.0, 0.5 * cable_weight[n])
-        tension = load * norm(sub(vec(goal.pull, e, n), half))  # in the middle, whose direction is the cable's
-        end = cable_end(direction, tension, cable_length[n], cable_stiffness[n], segments[n], cable_weight[n])
-        put(state.drone_position[e, n], add(anchor, end))
-        put(state.drone_velocity[e, n], velocity)
-        state.drone_body_rates[e, n] = 0.0
-        pull = add(scale(tension, direction), half)
-        hover_drone(e, n, state, pull, heading(matrow(goal.rotation, e)), drone_mass, thrust_coefficient)
+    hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, moved)
 
 
 @kernel

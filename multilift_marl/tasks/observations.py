@@ -48,9 +48,14 @@ _STATE_SHARED = 26  # numbers of the global state that belong to no drone; see o
 _STATE_DRONE = 16  # numbers for each drone, beside its action
 
 
-def observation_names(action_size: int) -> tuple[str, ...]:
-    """Return the name of every number in an observation, such as "velocity_1", for actions of `action_size` numbers."""
-    components = (*OBSERVATION[:-1], OBSERVATION[-1]._replace(size=action_size))
+def observation_names(action_size: int, extra: tuple[Component, ...] = ()) -> tuple[str, ...]:
+    """Return the name of every number in an observation, such as "velocity_1".
+
+    Args:
+        action_size: numbers of an action.
+        extra: what a task adds.
+    """
+    components = (*OBSERVATION[:-1], OBSERVATION[-1]._replace(size=action_size), *extra)
     return tuple(f"{part.name}_{i}" for part in components for i in range(part.size))
 
 
