@@ -10,7 +10,7 @@ import numpy as np
 from multilift_marl.config.load import load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.config.system import System
-from multilift_marl.control.disturbance import Disturbance, bind_rejection, make_rejection
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.geometric import Gains, fly, make_gains
 from multilift_marl.sim.world import World
@@ -120,9 +120,8 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
     _put_down(world)
     state, reference = world.state, Reference.zeros(len(ways), system.num_drones)
     pull = np.zeros((len(ways), system.num_drones, 3))
+    reject = _make_rejection(config, world, reference)
     gains = make_gains(config.control, system)
-    disturbance = Disturbance.zeros(len(ways), system.num_drones)
-    reject = _bind_rejection(config, world, reference, pull, disturbance, gains)
     gains = gains._replace(load_share=np.zeros(system.num_drones))  # the pulls hold the load's inertia
     payload, drones, tension, yaw_error = [], [], [], []
     for i, t in enumerate(time):
@@ -138,8 +137,7 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
         if t < plan.start[1]:
             world.thrust[:] = 0.0  # at rest the rotors idle
         else:
-            reject()
-            fly(0, len(ways), state, reference, disturbance.pull, world.thrust, gains)
+            fly(0, len(ways), state, reference, reject(pull, gains), world.thrust, gains)
         world.step(world.thrust, system.control_interval)
         tension.append(state.cable_tension[0].copy())
     both = np.array(payload)
@@ -147,16 +145,21 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
     return Flight(plan, system, time, ways[0], both[:, 0], *flown, both[:, 1])
 
 
-def _bind_rejection(
-    config: Config, world: World, reference: Reference, pull: np.ndarray, disturbance: Disturbance, gains: Gains
-) -> Callable[[], None]:
-    """Return the call that writes pulls and estimated disturbance into `disturbance.pull` before each control step."""
-    if config.control.disturbance == "none":
-        return lambda: disturbance.pull.__setitem__(slice(None), pull)
-    rejection = make_rejection(config.control, world.system, gains, 1 / config.sim.control_hz)
-    told = gains._replace(load_share=np.zeros(world.num_drones))
-    flown = (world.state, reference, pull, world.thrust, disturbance, told, rejection)
-    return bind_rejection(0, world.num_envs, *flown, config.control.disturbance)
+def _make_rejection(config: Config, world: World, reference: Reference) -> Callable[[np.ndarray, Gains], np.ndarray]:
+    """Return what turns nominal pulls (E, N, 3) [N] and gains into the pulls to fly with: the configured rejection."""
+    kind = config.control.disturbance
+    if kind == "none":
+        return lambda pull, gains: pull
+    rejection = make_rejection(
+        config.control, world.system, make_gains(config.control, world.system), 1 / config.sim.control_hz
+    )
+    disturbance = Disturbance.zeros(world.num_envs, world.num_drones)
+
+    def reject(pull: np.ndarray, gains: Gains) -> np.ndarray:
+        REJECTIONS[kind](0, world.num_envs, world.state, reference, pull, disturbance, gains, rejection)
+        return disturbance.pull
+
+    return reject
 
 
 def _put_down(world: World) -> None:
