@@ -9,7 +9,7 @@ import pytest
 from conftest import free_world, hover_thrust, make, make_system, mask, same, weightless, zeros
 
 from multilift_marl.sim import Air, World
-from multilift_marl.sim.air import advance_turbulence, dryden, gust_share, start_turbulence, turbulence
+from multilift_marl.sim.gusts import advance_turbulence, dryden, gust_share, start_turbulence, turbulence
 from multilift_marl.validation.air import COMPONENTS, correlation, sample_turbulence, spectrum
 
 WINDY = {"wind.velocity": [4.0, -3.0, 0.0], "wind.turbulence": True}

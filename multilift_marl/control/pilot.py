@@ -78,7 +78,7 @@ class Pilot:
         """Let references and estimates of environment e start from the state of its drones."""
         start_reference(e, self.world.state, self.reference)
         if self.disturbance is not None:
-            forget(e, self.world.state, self.disturbance, self._rejection.thrust_coefficient)
+            forget(e, self.world.state, self.disturbance)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the arrays that outlive a step."""

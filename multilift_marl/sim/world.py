@@ -15,11 +15,12 @@ from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
-from multilift_marl.sim.air import start_turbulence
+from multilift_marl.sim.air import make_air
 from multilift_marl.sim.breaking import cut_cables
 from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.chain import make_chain, read_chains, write_chains
 from multilift_marl.sim.dynamics import apply_loads, make_constants
+from multilift_marl.sim.gusts import start_turbulence
 from multilift_marl.sim.rows import hover_drone, read_rows, write_rows
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.state import Air, Plant, Record, SystemState
@@ -269,8 +270,11 @@ class World:
             offsets = [_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied", "xfrc_applied")]
             constants = make_constants(self.system, self.layout, *offsets)  # the same for every shard
             self.constants = (constants, make_chain(self.system)) if chain else (constants,)
+            flow = make_air(self.system)
+            air, flow = (None, None) if flow.still else (self.air, flow)
             span, told = (batch.state, lo, hi), batch.bind("sensordata")
-            apply = bind(apply_loads, *span, self.thrust, self.state, self.plant, self.air, self.record, constants)
+            blown = (self.thrust, self.state, self.plant, self.record, constants, air, flow)
+            apply = bind(apply_loads, *span, *blown)
             follow = bind(read, *span, told, self.state, self.record, self.diverged, *self.constants)
             shards.append(Shard(lo, hi, batch, step, apply, follow, np.zeros((hi - lo, self.num_drones), bool)))
         return shards

@@ -9,7 +9,7 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.math3d import add, heading, matrow, mul, norm, put, putmat, scale, sub, vec
+from multilift_marl.math3d import add, mul, norm, put, putmat, scale, sub, vec
 from multilift_marl.sim.cables import cable_end
 from multilift_marl.sim.rows import hover_drone
 
@@ -81,6 +81,4 @@ def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, m
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
         pull = add(scale(tension, direction), half)
-        hover_drone(
-            e, n, state, pull, heading(matrow(goal.rotation, e)), hanging.drone_mass, hanging.thrust_coefficient
-        )
+        hover_drone(e, n, state, pull, goal.drone_yaw[e], hanging.drone_mass, hanging.thrust_coefficient)
