@@ -17,7 +17,9 @@ def starts(config: str, count: int = 200):
 def test_default_starts_are_as_documented():
     vec = starts("recover")
     state, goal, system = vec.world.state, vec.task.goal, vec.world.system
-    assert (np.abs(goal.position[:, :2]) <= 1).all() and goal.position[:, 2].min() >= 1.5 > goal.position[:, 2].max() - 1
+    assert (np.abs(goal.position[:, :2]) <= 1).all() and goal.position[:, 2].min() >= 1.5 > goal.position[
+        :, 2
+    ].max() - 1
     assert vec.task.errors.distance.max() <= 0.5
     tilt = np.rad2deg(np.arccos(np.clip(state.drone_rotation[..., 2, 2], -1, 1)))
     assert tilt.max() <= 90 + 1e-9 and tilt.max() > 80
