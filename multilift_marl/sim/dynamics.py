@@ -126,7 +126,7 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
             for k in range(4):
                 before = state.rotor_speed[e, n, k]
                 target = sqrt(max(thrust[e, n, k], 0.0) / c.thrust_coefficient)
-                target = clip(target, c.speed_min, c.speed_max)
+                target = 0.0 if plant.motors_off[e, n] else clip(target, c.speed_min, c.speed_max)
                 gap = before - target
                 decay, mean_first, mean_second = c.falling if gap > 0.0 else c.rising
                 after = target + gap * decay

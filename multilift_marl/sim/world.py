@@ -63,6 +63,7 @@ class World:
         air: what blows beside the mean wind.
         record: what accumulated since the reset.
         diverged: (E,) bool, until reset.
+        breakable: whether `state.cable_broken` is looked at after every physics step.
     """
 
     def __init__(self, system: System, num_envs: int, num_threads: int = 0, seed: int = 0):
@@ -79,11 +80,12 @@ class World:
             payload_mass=np.full(num_envs, system.payload_mass),
             payload_force=np.zeros((num_envs, 3)),
             wind=np.tile(system.wind, (num_envs, 1)),
+            motors_off=np.zeros((num_envs, system.num_drones), bool),
         )
         self.air, self.seed = Air.zeros(num_envs, self.num_drones), seed
         self.record = Record.zeros(num_envs)
         self.diverged = np.zeros(num_envs, bool)
-        self._breakable = bool(np.isfinite(system.breaking_load).any())
+        self.breakable = bool(np.isfinite(system.breaking_load).any())
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool, self._pool_owner = None, 0
         self.reset()
@@ -142,7 +144,7 @@ class World:
             except SimulationError as error:
                 self.diverged[shard.lo + np.asarray(error.ids, int)] = True
             shard.read()
-            if self._breakable:
+            if self.breakable:
                 self._cut(shard)
 
     def run(self, work: Callable[[Shard], None]) -> None:
@@ -205,9 +207,9 @@ class World:
     def load(self, mask: np.ndarray) -> None:
         """Make `state` of the environments in `mask` (E,) the simulations' own.
 
-        Records and gusts start anew, cables are whole.
+        Records and gusts start anew, cables are whole, motors run.
         """
-        self.state.cable_broken[mask] = False
+        self.state.cable_broken[mask] = self.plant.motors_off[mask] = False
         self.air.gust[mask] = self.air.wash[mask] = self.air.steps[mask] = 0
         for shard in self.shards:
             local = mask[shard.lo : shard.hi]
