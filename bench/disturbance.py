@@ -17,7 +17,8 @@ import numpy as np
 from multilift_marl.config import Config, load_config, parse_overrides
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
 from multilift_marl.control.formation import Reference
-from multilift_marl.control.geometric import fly, make_gains
+from multilift_marl.control.gains import make_gains
+from multilift_marl.control.geometric import fly
 from multilift_marl.sim.world import REST_HEIGHT, World
 
 RADIUS = 5.0  # [m]

@@ -96,7 +96,8 @@ class Renderer:
     def _frame_team(self, aspect: float) -> None:
         """Set the camera's distance and how far above the target it looks, so that a picture holds a team there."""
         system, tilt = self._vec.world.system, np.deg2rad(self._camera.elevation)
-        drone, half_payload = 2 * system.vehicle.arm, system.payload_size / 2 + np.abs(system.payload_center)
+        drone = 2 * max(vehicle.arm for vehicle in system.vehicles)
+        half_payload = system.payload_size / 2 + np.abs(system.payload_center)
         reach = max(np.hypot(*system.slots[:, :2].T).max() + drone, np.hypot(*half_payload[:2]))
         top, bottom = max(system.slots[:, 2].max() + drone, half_payload[2]), -half_payload[2]
         self._lift, height = (top + bottom) / 2, (top - bottom) / 2

@@ -111,17 +111,18 @@ def _outside(shape: str, size: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(over, axis=1)
 
 
-def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bool) -> np.ndarray:
+def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bool, strength: np.ndarray) -> np.ndarray:
     """Return the cables' pulls (N, 3) [N] that hold a payload level, as near as possible to `angle` from the vertical.
 
-    The pulls nearest to equal, symmetric ones in the least-squares sense among all that balance the weight and
-    its moments about the centre of mass.
+    The pulls nearest to those in proportion to the drones' strength, each measured by its own, in the least-squares
+    sense among all that balance the weight and its moments about the centre of mass.
 
     Args:
         anchors: (N, 3) [m] from the centre of mass.
         weight: of the payload [N].
         angle: of the cables from the vertical [rad].
         point: True where the payload has no attitude to hold.
+        strength: of each drone, relative to the mean (N,) [-].
 
     Raises:
         ConfigError: no pulls balance the payload, or some cable would have to push.
@@ -136,7 +137,8 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
     )
     if n == 1:
         radial = np.zeros((1, 2))
-    nominal = weight / n * np.concatenate([np.tan(angle) * radial, np.ones((n, 1))], axis=1)
+    strong = strength[:, None]
+    nominal = weight / n * strong * np.concatenate([np.tan(angle) * radial, np.ones((n, 1))], axis=1)
     balance = np.concatenate([np.eye(3)] * n, axis=1)
     load = np.array([0, 0, weight, 0, 0, 0])
     if point:
@@ -144,20 +146,35 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
     else:
         moments = [[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in anchors]
         balance = np.concatenate([balance, np.concatenate(np.array(moments, float), axis=1)], axis=0)
-    flat = nominal.ravel()
-    force = (flat + np.linalg.pinv(balance) @ (load - balance @ flat)).reshape(n, 3)
+    flat, measure = nominal.ravel(), np.repeat(strength, 3)
+    force = (flat + measure * (np.linalg.pinv(balance * measure) @ (load - balance @ flat))).reshape(n, 3)
     residual = np.abs(balance @ force.ravel() - load).max()
     if residual > 1e-6 * weight:
         raise ConfigError(
             f"payload.anchors {np.round(anchors, 3).tolist()} cannot hold the payload level: place them around its "
             "centre of mass"
         )
-    if np.any(force[:, 2] < 0.02 * weight / n):
+    if np.any(force[:, 2] < 0.02 * weight / n * strength):
         raise ConfigError(
             f"payload.anchors: cable {int(force[:, 2].argmin())} would have to push; move the anchors around the "
             "centre of mass"
         )
     return force
+
+
+def mean(values: list[float]) -> float:
+    """Return the mean, exact where all values are equal."""
+    return values[0] + sum(value - values[0] for value in values) / len(values)
+
+
+def vector_per_drone(value: tuple, n: int, key: str) -> np.ndarray:
+    """Return one vector for each of n drones (n, 3); a ConfigError that names `key` if a list has another length."""
+    vectors = np.asarray(value, float)
+    if vectors.shape not in ((3,), (n, 3)):
+        raise ConfigError(
+            f"{key} lists {len(vectors)} vectors for env.num_drones={n}: give one vector or one for each drone"
+        )
+    return np.broadcast_to(vectors, (n, 3)).copy()
 
 
 def per_drone(value: float | tuple[float, ...], n: int, key: str) -> np.ndarray:

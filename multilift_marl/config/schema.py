@@ -44,6 +44,8 @@ Vector = tuple[Float, Float, Float]
 Positive = Annotated[Float, Field(gt=0)]
 NotNegative = Annotated[Float, Field(ge=0)]
 PerDrone = Positive | tuple[Positive, ...]
+NotNegativePerDrone = NotNegative | tuple[NotNegative, ...]
+VectorPerDrone = Vector | tuple[Vector, ...]
 Links = Annotated[Int, Field(ge=2, le=100)]
 
 
@@ -71,29 +73,34 @@ class SimConfig(Section):
 
 
 Four = tuple[Float, Float, Float, Float]
+FourPerDrone = Four | tuple[Four, ...]
+Moments = tuple[Positive, Positive, Positive]
+Drag = tuple[NotNegative, NotNegative, NotNegative]
 
 
 class VehicleConfig(Section):
-    """The quadrotor: a preset, and what differs from it (None: as the preset)."""
+    """The quadrotors: a preset, and what differs from it (None: as the preset); lists hold one for each drone."""
 
-    preset: str = Field("falcon", description="falcon, crazyflie, crazyflie_id, hummingbird or iris")
-    mass: Float | None = Field(None, gt=0, description="[kg] of the whole drone")
-    inertia: tuple[Positive, Positive, Positive] | None = Field(None, description="[kg m²] principal moments")
-    arm: Float | None = Field(None, gt=0, description="[m] from the centre of mass to a rotor axis")
-    rotor_azimuth: Four | None = Field(None, description="[deg] directions of the arms, counter-clockwise from body x")
-    rotor_spin: Four | None = Field(None, description="[-] 1 or -1, sign of each rotor's reaction torque about body z")
-    thrust_coefficient: Float | None = Field(None, gt=0, description="[N s²] b in thrust = b · speed²")
-    torque_ratio: Float | None = Field(None, gt=0, description="[m] reaction torque over thrust")
-    rotor_time_constant_up: Float | None = Field(None, gt=0, description="[s] lag of a rising rotor speed")
-    rotor_time_constant_down: Float | None = Field(None, gt=0, description="[s] lag of a falling rotor speed")
-    rotor_speed_min: Float | None = Field(None, ge=0, description="[rad/s] idle speed")
-    rotor_thrust_max: Float | None = Field(None, gt=0, description="[N] largest thrust of one rotor")
-    drag: tuple[NotNegative, NotNegative, NotNegative] | None = Field(
-        None, description="[kg/s] linear drag along the body axes"
+    preset: str | tuple[str, ...] = Field("falcon", description="falcon, crazyflie, crazyflie_id, hummingbird or iris")
+    mass: PerDrone | None = Field(None, description="[kg] of the whole drone")
+    inertia: Moments | tuple[Moments, ...] | None = Field(None, description="[kg m²] principal moments")
+    arm: PerDrone | None = Field(None, description="[m] from the centre of mass to a rotor axis")
+    rotor_azimuth: FourPerDrone | None = Field(
+        None, description="[deg] directions of the arms, counter-clockwise from body x"
     )
-    rotor_radius: Float | None = Field(None, gt=0, description="[m] for wash and ground effect")
-    rolling_moment: Float | None = Field(
-        None, ge=0, description="[kg m] moment of a rotor over its speed and that of the air across it"
+    rotor_spin: FourPerDrone | None = Field(
+        None, description="[-] 1 or -1, sign of each rotor's reaction torque about body z"
+    )
+    thrust_coefficient: PerDrone | None = Field(None, description="[N s²] b in thrust = b · speed²")
+    torque_ratio: PerDrone | None = Field(None, description="[m] reaction torque over thrust")
+    rotor_time_constant_up: PerDrone | None = Field(None, description="[s] lag of a rising rotor speed")
+    rotor_time_constant_down: PerDrone | None = Field(None, description="[s] lag of a falling rotor speed")
+    rotor_speed_min: NotNegativePerDrone | None = Field(None, description="[rad/s] idle speed")
+    rotor_thrust_max: PerDrone | None = Field(None, description="[N] largest thrust of one rotor")
+    drag: Drag | tuple[Drag, ...] | None = Field(None, description="[kg/s] linear drag along the body axes")
+    rotor_radius: PerDrone | None = Field(None, description="[m] for wash and ground effect")
+    rolling_moment: NotNegativePerDrone | None = Field(
+        None, description="[kg m] moment of a rotor over its speed and that of the air across it"
     )
 
 
@@ -136,6 +143,9 @@ class CableConfig(Section):
     bending_stiffness: Float = Field(0.0, ge=0, description="[N m/rad] between the links of a chain")
     bending_damping: Float | None = Field(
         None, ge=0, description="[N m s/rad] between the links of a chain; None: as little as is stable"
+    )
+    hook: VectorPerDrone = Field(
+        (0.0, 0.0, 0.0), description="[m] where the cable is tied to its drone, from its centre of mass, body frame"
     )
     angle: Float = Field(30.0, ge=0, lt=80, description="[deg] cables from the vertical in the resting formation")
 

@@ -7,24 +7,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from multilift_marl.config.feasibility import check_possible
 from multilift_marl.config.mesh import Mesh
 from multilift_marl.config.rig import (
     check_body,
     find_mesh,
     formation_forces,
+    mean,
     per_drone,
     place_anchors,
     standard_length,
     uniform_inertia,
+    vector_per_drone,
 )
-from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, check_rotors, resolve_vehicle
+from multilift_marl.config.teams import resolve_vehicles
+from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle
 from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import thrust_frame
 
 if TYPE_CHECKING:
     from multilift_marl.config.schema import Config, WindConfig
 
-MIN_THRUST_TO_WEIGHT = 1.18
-MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the vehicle's span
+MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the mean span
 _FALCON = PRESETS["falcon"]
 
 
@@ -33,7 +37,7 @@ class System:
     """Drones, cables and payload in numbers (SI units; N drones).
 
     Attributes:
-        vehicle: the quadrotor, the same for all drones.
+        vehicles: the quadrotor of each drone, N of them.
         payload_shape: "box", "cylinder", "mesh" or "point".
         payload_mesh: of a "mesh", else None.
         payload_size: edges of the payload's bounding box (3,) [m].
@@ -50,16 +54,18 @@ class System:
         cable_mass: (N,) [kg]; 0 if massless.
         bending_stiffness, bending_damping: between the links of a chain (N,) [N m/rad], [N m s/rad].
         formation_force: pull of each cable on the resting payload, in the payload frame (N, 3) [N].
-        slots: resting drones in the payload frame, cables stretched and sagging as they hang (N, 3) [m].
+        hooks: where each cable is tied to its drone, from its centre of mass, in its frame (N, 3) [m].
+        cable_ends: the hooks of resting drones in the payload frame, cables stretched and sagging (N, 3) [m].
+        slots: resting drones in the payload frame (N, 3) [m].
         slot_azimuth: direction of each slot from the payload, in its horizontal plane (N,) [rad].
-        min_separation: distance between drones that counts as a collision [m].
+        min_separation: distance between two drones that counts as a collision (N, N) [m].
         wind: mean wind (3,) [m/s].
         air: what else the air does.
         timestep: physics step [s].
         control_interval: physics steps for each control step.
     """
 
-    vehicle: Vehicle
+    vehicles: tuple[Vehicle, ...]
     payload_shape: str
     payload_mesh: Mesh | None
     payload_size: np.ndarray
@@ -79,9 +85,11 @@ class System:
     bending_stiffness: np.ndarray
     bending_damping: np.ndarray
     formation_force: np.ndarray
+    hooks: np.ndarray
+    cable_ends: np.ndarray
     slots: np.ndarray
     slot_azimuth: np.ndarray
-    min_separation: float
+    min_separation: np.ndarray
     wind: np.ndarray
     air: WindConfig
     timestep: float
@@ -93,9 +101,21 @@ class System:
         return len(self.anchors)
 
     @property
+    def vehicle(self) -> Vehicle:
+        """The quadrotor of a team whose drones are all alike; ValueError for others."""
+        if any(vehicle != self.vehicles[0] for vehicle in self.vehicles):
+            raise ValueError("the drones of this team are not alike: use system.vehicles")
+        return self.vehicles[0]
+
+    @property
+    def drone_mass(self) -> np.ndarray:
+        """Mass of each drone (N,) [kg]."""
+        return np.array([vehicle.mass for vehicle in self.vehicles])
+
+    @property
     def weight(self) -> float:
         """Weight of payload, drones and cables [N]."""
-        return GRAVITY * (self.payload_mass + self.num_drones * self.vehicle.mass + self.cable_mass.sum())
+        return GRAVITY * (self.payload_mass + self.drone_mass.sum() + self.cable_mass.sum())
 
     @property
     def drone_pull(self) -> np.ndarray:
@@ -108,6 +128,11 @@ class System:
         last = self.cable_mass * (1 - 1 / self.cable_segments)
         return np.linalg.norm(self.formation_force + GRAVITY * last[:, None] * [0, 0, 1], axis=1)
 
+    @property
+    def resting_rotation(self) -> np.ndarray:
+        """Attitude of each resting drone in the payload's frame (N, 3, 3)."""
+        return _resting_rotations(self.vehicles, self.drone_pull)
+
 
 def resolve_system(config: Config) -> System:
     """Return the system of `config`.
@@ -116,8 +141,9 @@ def resolve_system(config: Config) -> System:
         ConfigError: it cannot exist or cannot fly; the message says why and what to change.
     """
     n, payload, cable = config.env.num_drones, config.payload, config.cable
-    vehicle = resolve_vehicle(config.vehicle)
-    scale = vehicle.span / _FALCON.span
+    vehicles = resolve_vehicles(config.vehicle, n)
+    spans = np.array([vehicle.span for vehicle in vehicles])
+    scale = spans.max() / _FALCON.span
     length = per_drone(standard_length(config, scale) if cable.length is None else cable.length, n, "cable.length")
     mesh = find_mesh(payload)
     anchors, size = place_anchors(config, n, length, scale, mesh)
@@ -125,7 +151,8 @@ def resolve_system(config: Config) -> System:
     center_of_mass = uniform if payload.center_of_mass is None else np.array(payload.center_of_mass)
     check_body(payload.shape, size, center_of_mass, anchors)
     anchors = anchors - center_of_mass
-    standard = 0.35 * n * (vehicle.spare_lift / _FALCON.spare_lift)
+    spare = np.array([vehicle.spare_lift for vehicle in vehicles])
+    standard = 0.35 * n * mean(list(spare / _FALCON.spare_lift))
     mass = payload.mass if payload.mass is not None else standard
     axes = np.array([1.0, 0.0, 0.0, 0.0])
     if payload.inertia is not None:
@@ -139,23 +166,27 @@ def resolve_system(config: Config) -> System:
             f"payload.inertia {inertia.tolist()} is impossible: no moment may exceed the sum of the other two"
         )
     stiffness = per_drone(cable.stiffness, n, "cable.stiffness")
-    force = formation_forces(anchors, mass * GRAVITY, np.deg2rad(cable.angle), payload.shape == "point")
+    point, angle = payload.shape == "point", np.deg2rad(cable.angle)
+    force = formation_forces(anchors, mass * GRAVITY, angle, point, spare / mean(list(spare)))
     chain = cable.model == "chain"
     segments = per_drone(cable.segments if chain else 1, n, "cable.segments").astype(int)
     rope = per_drone(cable.density, n, "cable.density") * length if chain else np.zeros(n)
-    slots, bending = anchors.copy(), np.zeros(n)
+    ends, bending = anchors.copy(), np.zeros(n)
     for i, links in enumerate(segments):
         forces = _segment_forces(force[i], rope[i], links)
         tension = np.linalg.norm(forces, axis=1)
         reach = length[i] / links + tension / (links * stiffness[i])
-        slots[i] += (forces / tension[:, None] * reach[:, None]).sum(axis=0)
+        ends[i] += (forces / tension[:, None] * reach[:, None]).sum(axis=0)
         if chain:
             bending[i] = _steady_bending(tension[-1], rope[i], length[i], links, config.sim.timestep)
     if cable.bending_damping is not None:
         bending[:] = cable.bending_damping
+    hooks = vector_per_drone(cable.hook, n, "cable.hook")
+    resting = _resting_rotations(vehicles, force + GRAVITY * rope[:, None] * [0, 0, 1])
+    slots = ends - (resting * hooks[:, None, :]).sum(axis=-1)
     centred = np.hypot(slots[:, 0], slots[:, 1]) < 1e-9
     system = System(
-        vehicle=vehicle,
+        vehicles=vehicles,
         payload_shape=payload.shape,
         payload_mesh=mesh,
         payload_size=size,
@@ -177,9 +208,11 @@ def resolve_system(config: Config) -> System:
         bending_stiffness=np.full(n, cable.bending_stiffness),
         bending_damping=bending,
         formation_force=force,
+        hooks=hooks,
+        cable_ends=ends,
         slots=slots,
         slot_azimuth=np.where(centred, 0.0, np.arctan2(slots[:, 1], slots[:, 0])),
-        min_separation=MIN_SEPARATION * scale,
+        min_separation=MIN_SEPARATION * ((spans[:, None] + spans) / 2 / _FALCON.span),
         wind=np.asarray(config.wind.velocity, float),
         air=config.wind,
         timestep=config.sim.timestep,
@@ -187,8 +220,14 @@ def resolve_system(config: Config) -> System:
             1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"
         ),
     )
-    _check_possible(system, heaviest=1 + config.randomization.payload_mass)
+    check_possible(system, heaviest=1 + config.randomization.payload_mass)
     return system
+
+
+def _resting_rotations(vehicles: tuple[Vehicle, ...], pulls: np.ndarray) -> np.ndarray:
+    """Return the attitudes (N, 3, 3) in which drones at rest exert `pulls` (N, 3) [N] beside their own weight."""
+    forces = pulls + GRAVITY * np.array([[0, 0, vehicle.mass] for vehicle in vehicles])
+    return np.array([thrust_frame(tuple(force), 0.0) for force in forces]).reshape(-1, 3, 3)
 
 
 def _segment_forces(force: np.ndarray, mass: float, segments: int) -> np.ndarray:
@@ -209,42 +248,6 @@ def _steady_bending(tension: float, mass: float, length: float, n: int, h: float
     node, link = mass / n, length / n
     least = 2 * tension * link * h / (4 * modes) - node * link**2 / (h * modes**2)
     return max(tension * link * h, float(least.max()))
-
-
-def _check_possible(system: System, heaviest: float) -> None:
-    """Refuse what cannot fly, hovering under a payload `heaviest` times its nominal mass included."""
-    n, vehicle = system.num_drones, system.vehicle
-    if system.air.wash or system.air.ground_effect:
-        check_rotors(vehicle)
-    thrust = 4 * vehicle.rotor_thrust_max
-    if n * thrust < MIN_THRUST_TO_WEIGHT * system.weight:
-        lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"
-        raise ConfigError(
-            f"{n} × {vehicle.name} lift {n * thrust:.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of "
-            f"{lifted}, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
-        )
-    rope = system.drone_pull - system.formation_force
-    hover = np.linalg.norm(heaviest * system.formation_force + rope + [0, 0, vehicle.mass * GRAVITY], axis=1)
-    if np.any(hover > thrust):
-        i = int(hover.argmax())
-        raise ConfigError(
-            f"drone {i} would need {hover[i]:.1f} N of its {thrust:.1f} N to hover under the heaviest payload; lower "
-            "payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
-        )
-    tight = heaviest * system.resting_tension
-    if np.any(tight >= system.breaking_load):
-        i = int(np.argmax(tight - system.breaking_load))
-        raise ConfigError(
-            f"cable {i} would break at rest: {tight[i]:.1f} N under the heaviest payload, but cable.breaking_load is "
-            f"{system.breaking_load[i]:g} N; raise it or lower payload.mass"
-        )
-    if n > 1:
-        apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)
-        if apart.min() < system.min_separation:
-            raise ConfigError(
-                f"neighbouring drones would rest {apart.min():.2f} m apart, closer than the separation limit of "
-                f"{system.min_separation:.2f} m; spread payload.anchors or raise cable.length or cable.angle"
-            )
 
 
 def whole_ratio(fast: float, slow: float, slow_key: str, fast_key: str) -> int:

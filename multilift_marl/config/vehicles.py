@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
-
-from multilift_marl.errors import ConfigError, nearest
-
-if TYPE_CHECKING:
-    from multilift_marl.config.schema import VehicleConfig
-
 
 GRAVITY = 9.81  # [m/s²]
 
@@ -59,6 +52,12 @@ class Vehicle:
         """Rotor positions in the body frame (4, 3) [m]."""
         azimuth = np.asarray(self.rotor_azimuth)
         return self.arm * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
+
+    @property
+    def allocation(self) -> np.ndarray:
+        """A (4, 4) with (T, M_x, M_y, M_z) = A f for rotor thrusts f [N]; report eq 11 for any layout and spin."""
+        position = self.rotor_positions
+        return np.stack([np.ones(4), position[:, 1], -position[:, 0], self.torque_ratio * np.asarray(self.rotor_spin)])
 
     @property
     def rotor_time_constant(self) -> float:
@@ -196,64 +195,3 @@ _IRIS = Vehicle(
 PRESETS: dict[str, Vehicle] = {
     vehicle.name: vehicle for vehicle in (_FALCON, _CRAZYFLIE, _CRAZYFLIE_ID, _HUMMINGBIRD, _IRIS)
 }
-
-
-def check_rotors(vehicle: Vehicle) -> None:
-    """Refuse rotors that overlap, which the models of wash and ground effect know nothing of."""
-    rotors = vehicle.rotor_positions
-    apart = min(float(np.linalg.norm(a - b)) for i, a in enumerate(rotors) for b in rotors[:i])
-    if 2 * vehicle.rotor_radius > apart:
-        raise ConfigError(
-            f"rotors of vehicle.rotor_radius={vehicle.rotor_radius:g} m overlap, their axes {apart:.3g} m apart; "
-            "lower it or raise vehicle.arm, or switch wind.wash and wind.ground_effect off"
-        )
-
-
-def resolve_vehicle(config: VehicleConfig) -> Vehicle:
-    """Return the preset with the configured fields in place of its own.
-
-    Raises:
-        ConfigError: an unknown preset, or a vehicle that cannot be or cannot hover.
-    """
-    if config.preset not in PRESETS:
-        raise ConfigError(f"unknown vehicle.preset '{config.preset}'{nearest(config.preset, PRESETS)}")
-    changes = config.model_dump(exclude={"preset"}, exclude_none=True)
-    if "rotor_azimuth" in changes:
-        changes["rotor_azimuth"] = tuple(float(angle) for angle in np.deg2rad(changes["rotor_azimuth"]))
-    vehicle = replace(PRESETS[config.preset], **changes)
-    _check_vehicle(vehicle)
-    return vehicle
-
-
-def _check_vehicle(vehicle: Vehicle) -> None:
-    inertia, spin, position = np.array(vehicle.inertia), np.array(vehicle.rotor_spin), vehicle.rotor_positions
-    if 2 * inertia.max() > inertia.sum() * (1 + 1e-9):
-        raise ConfigError(
-            f"vehicle.inertia {inertia.tolist()} is impossible: no moment may exceed the sum of the other two"
-        )
-    if vehicle.rotor_speed_min >= vehicle.rotor_speed_max:
-        raise ConfigError(
-            f"vehicle.rotor_speed_min={vehicle.rotor_speed_min:g} rad/s must be less than the "
-            f"{vehicle.rotor_speed_max:g} rad/s that vehicle.rotor_thrust_max={vehicle.rotor_thrust_max:g} N takes"
-        )
-    if not np.all(np.abs(spin) == 1) or spin.sum() != 0:
-        raise ConfigError(
-            f"vehicle.rotor_spin {spin.tolist()} must hold 1 for two rotors and -1 for the other two, or yaw is out of "
-            "control"
-        )
-    if np.abs(position.sum(axis=0)).max() > 1e-6 * vehicle.arm:
-        raise ConfigError(
-            f"vehicle.rotor_azimuth {np.rad2deg(vehicle.rotor_azimuth).round(3).tolist()} does not balance: equal "
-            "thrusts must give no torque, so place the rotors in opposite pairs"
-        )
-    unit = np.stack([np.ones(4), position[:, 0] / vehicle.arm, position[:, 1] / vehicle.arm, spin])
-    if np.linalg.svd(unit, compute_uv=False).min() < 0.05:
-        raise ConfigError(
-            f"vehicle.rotor_azimuth {np.rad2deg(vehicle.rotor_azimuth).round(3).tolist()} with vehicle.rotor_spin "
-            f"{spin.tolist()} cannot turn the drone about each axis: let opposite rotors turn alike"
-        )
-    if vehicle.spare_lift <= 0:
-        raise ConfigError(
-            f"a {vehicle.name} of vehicle.mass={vehicle.mass:g} kg cannot lift itself with "
-            f"{4 * vehicle.rotor_thrust_max:g} N; raise vehicle.rotor_thrust_max"
-        )

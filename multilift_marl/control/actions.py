@@ -16,8 +16,10 @@ from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import GRAVITY
 from multilift_marl.control.formation import Goal, Reference, leave_goal, smooth, smooth_moving
-from multilift_marl.control.geometric import Gains, control, fly
+from multilift_marl.control.gains import Gains, drone_gains
+from multilift_marl.control.geometric import control, drive_rotors, fly, hook_moment
 from multilift_marl.control.setpoints import (
+    STILL,
     Setpoint,
     drift,
     drift_to_yaw,
@@ -27,7 +29,7 @@ from multilift_marl.control.setpoints import (
     fly_velocity,
     smooth_velocity,
 )
-from multilift_marl.math3d import add, norm, put, scale, turn, vec
+from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, turn, vec
 from multilift_marl.sim.state import SystemState
 
 Call = Callable[[], None]
@@ -191,11 +193,11 @@ class CtbrAction(Interface):
     def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
         """See `Interface.follow`."""
         rates, total = team.setpoint.rates, team.setpoint.thrust
-        return (bind(fly_rates, lo, hi, team.state, rates, total, team.thrust, team.gains),)
+        return (bind(fly_rates, lo, hi, team.state, rates, total, team.pull, team.thrust, team.gains),)
 
 
 class RotorAction(Interface):
-    """Thrust of each rotor, zero: a quarter of the hover thrust, ± 1: its limits. Nothing else holds the attitude."""
+    """Thrust of each rotor, zero: its own at hover, ± 1: its limits. Nothing else holds the attitude."""
 
     names = ("rotor_0", "rotor_1", "rotor_2", "rotor_3")
 
@@ -244,7 +246,7 @@ def _command_acc_rates(lo, hi, action, goal, reference, rates, max_acceleration,
 @kernel
 def _hover_thrust(e, n, pull, g):
     """Return the thrust [N] that carries a drone and its pull."""
-    return norm(add(vec(pull, e, n), (0.0, 0.0, g.mass * GRAVITY)))
+    return norm(add(vec(pull, e, n), (0.0, 0.0, g.mass[n] * GRAVITY)))
 
 
 @kernel
@@ -259,7 +261,7 @@ def _command_rates(lo, hi, action, state, reference, setpoint, pull, g, max_tilt
     for e in range(lo, hi):
         for n in range(action.shape[1]):
             hover = _hover_thrust(e, n, pull, g)
-            setpoint.thrust[e, n] = _between(action[e, n, 0], 4.0 * g.thrust_min, hover, 4.0 * g.thrust_max)
+            setpoint.thrust[e, n] = _between(action[e, n, 0], 4.0 * g.thrust_min[n], hover, 4.0 * g.thrust_max[n])
             tilting = scale(max_tilt_rate, (action[e, n, 1], action[e, n, 2], 0.0))
             put(setpoint.rates[e, n], (tilting[0], tilting[1], max_yaw_rate * action[e, n, 3]))
 
@@ -269,9 +271,15 @@ def _command_rotors(lo, hi, action, state, reference, pull, thrust, g):
     drift(lo, hi, state, reference, 0.0)
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            hover = 0.25 * _hover_thrust(e, n, pull, g)
+            rotors, hover = thrust[e, n], _hover_thrust(e, n, pull, g)
             for k in range(4):
-                thrust[e, n, k] = _between(action[e, n, k], g.thrust_min, hover, g.thrust_max)
+                rotors[k] = 0.25 * hover
+            if g.hooked:
+                d, yaw = drone_gains(g, n), heading(mat(state.drone_rotation, e, n))
+                rest = thrust_frame(add(vec(pull, e, n), (0.0, 0.0, g.mass[n] * GRAVITY)), yaw)
+                drive_rotors(hover, STILL, hook_moment(rest, vec(pull, e, n), STILL, d), rotors, d)
+            for k in range(4):
+                rotors[k] = _between(action[e, n, k], g.thrust_min[n], rotors[k], g.thrust_max[n])
 
 
 ACTIONS: dict[str, type[Interface]] = {

@@ -2,19 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from multilift_marl._jit import kernel
-from multilift_marl.config.vehicles import Vehicle
 from multilift_marl.math3d import clip
-
-
-def allocation_matrix(vehicle: Vehicle) -> np.ndarray:
-    """Return A (4, 4) with (T, M_x, M_y, M_z) = A f for rotor thrusts f [N]; eq 11 for any layout and spin."""
-    position = vehicle.rotor_positions
-    return np.stack(
-        [np.ones(4), position[:, 1], -position[:, 0], vehicle.torque_ratio * np.asarray(vehicle.rotor_spin)]
-    )
 
 
 @kernel
@@ -27,7 +16,7 @@ def allocate(thrust, torque, inverse, low, high):
     Args:
         thrust: total thrust [N].
         torque: body torque, a tuple of 3 [N m].
-        inverse: inverse of `allocation_matrix` (4, 4).
+        inverse: inverse of `Vehicle.allocation` (4, 4).
         low, high: limits of one rotor [N].
     """
     share = 1.0

@@ -6,7 +6,7 @@ whatever flies with the one flies with the other.
 
 from __future__ import annotations
 
-from math import exp, sqrt
+from math import exp
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +14,9 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.control.geometric import Gains
+from multilift_marl.control.gains import Gains
 from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale, sub, tmul, vec
+from multilift_marl.sim.standing import make_drones
 
 # Bandwidth over ω_p m/(m + m_L), at most: ω_p of the position loop, m and m_L the masses of a drone and of its load.
 # The share m_L/(m + m_L) of a thrust comes back as pull of the cable, which slows any loop around the drone. Faster,
@@ -44,25 +45,27 @@ class Rejection(NamedTuple):
 
     dt: float
     """Control step [s]."""
-    share: float
-    """Of the gap to the measured force that the filtered one closes in a step, 1 - exp(-ω dt)."""
-    gain: float
-    """Of the integral, m k_p ω [N/(m s)]."""
-    largest: float
-    """Limit of the estimate [N]."""
-    thrust_coefficient: float
+    share: np.ndarray
+    """(N,) of the gap to the measured force that the filtered one closes in a step, 1 - exp(-ω dt)."""
+    gain: np.ndarray
+    """(N,) of the integral, m k_p ω [N/(m s)]."""
+    largest: np.ndarray
+    """(N,) limit of the estimate [N]."""
+    thrust_coefficient: np.ndarray
+    """(N,) [N s²]."""
 
 
 def make_rejection(control: ControlConfig, system: System, g: Gains, dt: float) -> Rejection:
     """Return the numbers of `control.disturbance`, "integral" or "indi", for control steps of dt [s]."""
     own_share = g.mass / (g.mass + max(g.load_share.max(), 0.0))
-    frequency = min(control.disturbance_frequency, BANDWIDTH[control.disturbance] * sqrt(g.k_p) * own_share)
+    slowest = BANDWIDTH[control.disturbance] * np.sqrt(g.k_p) * own_share
+    frequency = np.minimum(control.disturbance_frequency, slowest)
     return Rejection(
         dt=dt,
-        share=1 - exp(-frequency * dt),
+        share=np.array([1 - exp(-each * dt) for each in frequency]),
         gain=g.mass * g.k_p * frequency,
         largest=control.disturbance_limit * g.mass * GRAVITY,
-        thrust_coefficient=system.vehicle.thrust_coefficient,
+        thrust_coefficient=make_drones(system).thrust_coefficient,
     )
 
 
@@ -96,16 +99,15 @@ def integrate_error(lo, hi, state, reference, pull, disturbance, g, c):
         disturbance: Disturbance, written.
         g, c: Gains, Rejection.
     """
-    margin = 0.01 * g.thrust_max
     for e in range(lo, hi):
         for n in range(pull.shape[1]):
-            saturated = False
+            saturated, low, high = False, g.thrust_min[n], g.thrust_max[n]
             for k in range(4):
-                thrust = c.thrust_coefficient * state.rotor_speed[e, n, k] ** 2
-                saturated = saturated or thrust > g.thrust_max - margin or thrust < g.thrust_min + margin
+                thrust = c.thrust_coefficient[n] * state.rotor_speed[e, n, k] ** 2
+                saturated = saturated or thrust > high - 0.01 * high or thrust < low + 0.01 * high
             error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
             before = vec(disturbance.force, e, n)
-            force = limit(sub(before, scale(c.gain * c.dt, error)), c.largest)
+            force = limit(sub(before, scale(c.gain[n] * c.dt, error)), c.largest[n])
             if saturated and norm(force) > norm(before):
                 force = before
             put(disturbance.force[e, n], force)
@@ -123,16 +125,16 @@ def estimate_force(lo, hi, state, reference, pull, disturbance, g, c):
     """
     for e in range(lo, hi):
         for n in range(pull.shape[1]):
-            velocity, rotors = vec(state.drone_velocity, e, n), rotor_force(e, n, state, c.thrust_coefficient)
+            velocity, rotors = vec(state.drone_velocity, e, n), rotor_force(e, n, state, c.thrust_coefficient[n])
             nominal, attitude = vec(pull, e, n), mat(state.drone_rotation, e, n)
             air = tmul(attitude, vec(reference.velocity, e, n))
-            drag = mul(attitude, (g.drag[0] * air[0], g.drag[1] * air[1], g.drag[2] * air[2]))
+            drag = mul(attitude, (g.drag[n, 0] * air[0], g.drag[n, 1] * air[1], g.drag[n, 2] * air[2]))
             told = add(add(nominal, drag), scale(g.load_share[n], vec(reference.acceleration, e, n)))
-            moved = scale(g.mass / c.dt, sub(velocity, vec(disturbance.velocity, e, n)))
-            used = add(moved, (0.0, 0.0, g.mass * GRAVITY))
+            moved = scale(g.mass[n] / c.dt, sub(velocity, vec(disturbance.velocity, e, n)))
+            used = add(moved, (0.0, 0.0, g.mass[n] * GRAVITY))
             before = vec(disturbance.force, e, n)
             gap = sub(sub(sub(rotors, used), told), before)
-            force = limit(add(before, scale(c.share, gap)), c.largest)
+            force = limit(add(before, scale(c.share[n], gap)), c.largest[n])
             put(disturbance.force[e, n], force)
             put(disturbance.velocity[e, n], velocity)
             put(disturbance.pull[e, n], add(nominal, force))

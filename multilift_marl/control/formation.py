@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.math3d import add, clip, heading, limit, matrow, mul, put, row, scale, sub, turn, vec
+from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.math3d import add, clip, heading, limit, matrow, mul, put, row, scale, sub, thrust_frame, turn, vec
+from multilift_marl.sim.standing import Drones, make_drones
 
 
 class Goal(NamedTuple):
@@ -56,6 +58,12 @@ class Rig(NamedTuple):
     """(N,) [rad]."""
     force: np.ndarray
     """(N, 3) [N]."""
+    drones: Drones
+
+
+def make_rig(system: System) -> Rig:
+    """Return the formation of `system`."""
+    return Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull, make_drones(system))
 
 
 class Reference(NamedTuple):
@@ -100,6 +108,30 @@ def place_formation(e, goal, rig):
         put(goal.pull[e, n], turn(c, s, (rig.force[n, 0], rig.force[n, 1], rig.force[n, 2])))
         goal.slot_frame[e, n, 0] = cos(yaw + rig.azimuth[n])
         goal.slot_frame[e, n, 1] = sin(yaw + rig.azimuth[n])
+
+
+@kernel
+def _goal_arm(e, n, goal, rig, yaw):
+    """Return where the hook of drone n is from its centre as it rests at the target with heading `yaw`, world frame."""
+    force = add(vec(goal.pull, e, n), (0.0, 0.0, rig.drones.mass[n] * GRAVITY))
+    return mul(thrust_frame(force, yaw), row(rig.drones.hooks, n))
+
+
+@kernel
+def goal_hook(e, n, goal, rig):
+    """Return where the hook of drone n is at the target, world frame [m]."""
+    slot = vec(goal.slots, e, n)
+    return add(slot, _goal_arm(e, n, goal, rig, goal.drone_yaw[e])) if rig.drones.hooked else slot
+
+
+@kernel
+def face(e, yaw, goal, rig):
+    """Give the drones of environment e another heading than the target's; their hooks stay where they are."""
+    if rig.drones.hooked:
+        for n in range(rig.slots.shape[0]):
+            turned = sub(_goal_arm(e, n, goal, rig, goal.drone_yaw[e]), _goal_arm(e, n, goal, rig, yaw))
+            put(goal.slots[e, n], add(vec(goal.slots, e, n), turned))
+    goal.drone_yaw[e] = yaw
 
 
 @kernel

@@ -8,15 +8,12 @@ in `setpoints`.
 from __future__ import annotations
 
 from math import cos, sin
-from typing import NamedTuple
-
-import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.schema import ControlConfig
-from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.control.allocation import allocate, allocation_matrix
+from multilift_marl.config.system import GRAVITY
+from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import smooth
+from multilift_marl.control.gains import drone_gains
 from multilift_marl.math3d import (
     add,
     column,
@@ -34,56 +31,6 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-
-POSITION_RATIO = 5.0  # attitude's natural frequency over position's, at least
-
-
-class Gains(NamedTuple):
-    """Nominal parameters and gains; the plant may differ."""
-
-    mass: float
-    inertia: tuple[float, float, float]
-    k_p: float
-    """Position gain [1/s²]."""
-    k_v: float
-    """Velocity gain [1/s]."""
-    k_R: tuple[float, float, float]
-    """Attitude gains for unit inertia [1/s²]."""
-    k_w: tuple[float, float, float]
-    """Rate gains for unit inertia [1/s]."""
-    allocation: np.ndarray
-    """Inverse allocation matrix (4, 4)."""
-    thrust_min: float
-    """Of one rotor [N]."""
-    thrust_max: float
-    load_share: np.ndarray
-    """(N,) mass of payload and cable that each drone carries [kg]."""
-    drag: tuple[float, float, float]
-    """Linear drag along the body axes that is fed forward [kg/s]."""
-
-
-def make_gains(control: ControlConfig, system: System) -> Gains:
-    """Return gains for natural frequencies and damping ratios.
-
-    Attitude is no faster than the motors allow (0.7/τ of the slower lag), position no faster than attitude allows.
-    """
-    vehicle = system.vehicle
-    tilt = min(control.attitude_frequency, 0.7 / vehicle.rotor_time_constant)
-    position = min(control.position_frequency, tilt / POSITION_RATIO)
-    frequency = np.array([tilt, tilt, min(control.yaw_frequency, tilt)])
-    return Gains(
-        mass=vehicle.mass,
-        inertia=tuple(float(moment) for moment in vehicle.inertia),
-        k_p=position**2,
-        k_v=2 * control.position_damping * position,
-        k_R=tuple(frequency**2),
-        k_w=tuple(2 * control.attitude_damping * frequency),
-        allocation=np.ascontiguousarray(np.linalg.inv(allocation_matrix(vehicle))),
-        thrust_min=vehicle.thrust_coefficient * vehicle.rotor_speed_min**2,
-        thrust_max=vehicle.rotor_thrust_max,
-        load_share=system.drone_pull[:, 2] / GRAVITY,
-        drag=tuple(float(c) * control.drag_feedforward for c in vehicle.drag),
-    )
 
 
 @kernel
@@ -114,7 +61,7 @@ def attitude_torque(attitude, rates, desired, desired_rate, g):
     Args:
         attitude, desired: R and R_d, 9 numbers each.
         rates, desired_rate: Ω and Ω_d in their own frames [rad/s].
-        g: Gains.
+        g: DroneGains.
     """
     error = matmul(transpose(desired), attitude)
     e_r = (0.5 * (error[7] - error[5]), 0.5 * (error[2] - error[6]), 0.5 * (error[3] - error[1]))
@@ -143,7 +90,22 @@ def rate_torque(rates, desired, g):
 
 
 @kernel
-def wanted_force(feedback, acceleration, velocity, pull, attitude, g, share):
+def hook_moment(attitude, pull, acceleration, g):
+    """Return the moment of the cable about the drone's centre of mass that its rotors are to hold [N m].
+
+    Args:
+        attitude: R, 9 numbers.
+        pull: force that the drone exerts on its cable, at the hook [N].
+        acceleration: of the set-point, which the load follows [m/s²].
+        g: DroneGains.
+    """
+    if not g.hooked:
+        return (0.0, 0.0, 0.0)
+    return cross(g.hook, tmul(attitude, add(pull, scale(g.load_share, acceleration))))
+
+
+@kernel
+def wanted_force(feedback, acceleration, velocity, pull, attitude, g):
     """Return the force [N] that a drone's rotors are to exert, world frame.
 
     The nominal pull of the cable, the inertia of the load that hangs on it and the drag are fed forward.
@@ -154,10 +116,9 @@ def wanted_force(feedback, acceleration, velocity, pull, attitude, g, share):
         velocity: of the set-point, for the drag [m/s].
         pull: force that the drone exerts on its cable [N].
         attitude: R, 9 numbers.
-        g: Gains.
-        share: mass of the load that moves with this drone [kg].
+        g: DroneGains.
     """
-    force = sub(scale(g.mass + share, acceleration), scale(g.mass, feedback))
+    force = sub(scale(g.mass + g.load_share, acceleration), scale(g.mass, feedback))
     force = add(force, pull)
     air = tmul(attitude, velocity)
     force = add(force, mul(attitude, (g.drag[0] * air[0], g.drag[1] * air[1], g.drag[2] * air[2])))
@@ -165,21 +126,23 @@ def wanted_force(feedback, acceleration, velocity, pull, attitude, g, share):
 
 
 @kernel
-def drive_rotors(total, torque, rotors, g):
-    """Write the rotor thrusts (4,) [N] of a total thrust [N] and a torque [N m]."""
+def drive_rotors(total, torque, moment, rotors, g):
+    """Write the rotor thrusts (4,) [N] of a total thrust [N], a torque and a `hook_moment` to hold beside it [N m]."""
+    if g.hooked:
+        torque = add(torque, moment)
     allocated = allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
     for k in range(4):
         rotors[k] = allocated[k]
 
 
 @kernel
-def follow_attitude(attitude, rates, desired, desired_rate, total, rotors, g):
+def follow_attitude(attitude, rates, desired, desired_rate, total, moment, rotors, g):
     """Write the rotor thrusts (4,) [N] that turn attitude R to R_d (see `attitude_torque`) at total thrust [N]."""
-    drive_rotors(total, attitude_torque(attitude, rates, desired, desired_rate, g), rotors, g)
+    drive_rotors(total, attitude_torque(attitude, rates, desired, desired_rate, g), moment, rotors, g)
 
 
 @kernel
-def follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, rotors, g):
+def follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, rotors, g):
     """Write the rotor thrusts (4,) [N] that exert force F, which changes by Ḟ [N/s], at heading ψ.
 
     Thrust is the desired force along the actual body z axis, F · R e3 (Lee 2010), in place of eq 27's |a_d|.
@@ -187,7 +150,7 @@ def follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, rotors, g):
     desired = thrust_frame(force, yaw)
     desired_rate = desired_rates(desired, force, force_rate, yaw, yaw_rate)
     total = max(dot(force, unit(column(attitude, 2))), 0.0)
-    follow_attitude(attitude, rates, desired, desired_rate, total, rotors, g)
+    follow_attitude(attitude, rates, desired, desired_rate, total, moment, rotors, g)
 
 
 @kernel
@@ -211,13 +174,14 @@ def fly(lo, hi, state, reference, pull, thrust, g):
     """
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
+            d = drone_gains(g, n)
             position_error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
             velocity = vec(reference.velocity, e, n)
             velocity_error = sub(vec(state.drone_velocity, e, n), velocity)
-            feedback = add(scale(g.k_p, position_error), scale(g.k_v, velocity_error))
+            feedback = add(scale(d.k_p, position_error), scale(d.k_v, velocity_error))
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
-            share = g.load_share[n]
-            force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, g, share)
-            force_rate = scale(g.mass + share, vec(reference.jerk, e, n))
+            force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, d)
+            moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
+            force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
-            follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, thrust[e, n], g)
+            follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, thrust[e, n], d)

@@ -9,7 +9,7 @@ from multilift_marl.config.schema import Config
 from multilift_marl.control.actions import ACTIONS, Call, Team
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
 from multilift_marl.control.formation import Goal, Reference, start_reference
-from multilift_marl.control.geometric import make_gains
+from multilift_marl.control.gains import make_gains
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.errors import ConfigError
 from multilift_marl.sim.world import World

@@ -11,11 +11,13 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.control.formation import smooth_yaw
+from multilift_marl.control.gains import drone_gains
 from multilift_marl.control.geometric import (
     desired_rates,
     drive_rotors,
     follow_attitude,
     follow_force,
+    hook_moment,
     rate_torque,
     wanted_force,
 )
@@ -69,13 +71,14 @@ def fly_velocity(lo, hi, state, reference, pull, thrust, g):
     """
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
-            velocity, share = vec(reference.velocity, e, n), g.load_share[n]
-            feedback = scale(g.k_v, sub(vec(state.drone_velocity, e, n), velocity))
+            velocity, d = vec(reference.velocity, e, n), drone_gains(g, n)
+            feedback = scale(d.k_v, sub(vec(state.drone_velocity, e, n), velocity))
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
-            force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, g, share)
-            force_rate = scale(g.mass + share, vec(reference.jerk, e, n))
+            force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, d)
+            moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
+            force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
-            follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, thrust[e, n], g)
+            follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, thrust[e, n], d)
 
 
 @kernel
@@ -94,10 +97,11 @@ def fly_acceleration(lo, hi, state, reference, pull, thrust, g):
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
-            velocity = vec(reference.velocity, e, n)
-            force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, g, g.load_share[n])
+            velocity, d = vec(reference.velocity, e, n), drone_gains(g, n)
+            force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, d)
+            moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
-            follow_force(attitude, rates, force, STILL, yaw, yaw_rate, thrust[e, n], g)
+            follow_force(attitude, rates, force, STILL, yaw, yaw_rate, moment, thrust[e, n], d)
 
 
 @kernel
@@ -118,39 +122,47 @@ def fly_acc_rates(lo, hi, state, reference, rates, pull, thrust, g):
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
-            velocity = vec(reference.velocity, e, n)
-            force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, g, g.load_share[n])
+            velocity, d = vec(reference.velocity, e, n), drone_gains(g, n)
+            force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, d)
+            moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
             yaw, yaw_rate = reference.yaw[e, n], reference.yaw_rate[e, n]
             desired = thrust_frame(force, yaw)
             turning = desired_rates(desired, force, STILL, yaw, yaw_rate)
             desired_rate = (rates[e, n, 0], rates[e, n, 1], turning[2])
             total = max(dot(force, unit(column(attitude, 2))), 0.0)
             own = vec(state.drone_body_rates, e, n)
-            follow_attitude(attitude, own, desired, desired_rate, total, thrust[e, n], g)
+            follow_attitude(attitude, own, desired, desired_rate, total, moment, thrust[e, n], d)
 
 
 @kernel
-def fly_attitude(lo, hi, state, attitude, rates, total, thrust, g):
+def fly_attitude(lo, hi, state, attitude, rates, total, pull, thrust, g):
     """Compute the rotor thrusts that turn drones to attitudes (E, N, 3, 3), which turn at body rates (E, N, 3) [rad/s].
 
     Args:
         lo, hi, state: the environments, SystemState.
         attitude, rates: desired.
         total: total thrust of each drone (E, N) [N].
+        pull: force that each drone exerts on its cable (E, N, 3) [N].
         thrust: written, (E, N, 4) [N].
         g: Gains.
     """
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
             own, own_rates = mat(state.drone_rotation, e, n), vec(state.drone_body_rates, e, n)
-            desired, desired_rate = mat(attitude, e, n), vec(rates, e, n)
-            follow_attitude(own, own_rates, desired, desired_rate, total[e, n], thrust[e, n], g)
+            desired, desired_rate, d = mat(attitude, e, n), vec(rates, e, n), drone_gains(g, n)
+            moment = hook_moment(own, vec(pull, e, n), STILL, d)
+            follow_attitude(own, own_rates, desired, desired_rate, total[e, n], moment, thrust[e, n], d)
 
 
 @kernel
-def fly_rates(lo, hi, state, rates, total, thrust, g):
-    """Compute the rotor thrusts that turn drones at body rates (E, N, 3) [rad/s], at total thrusts (E, N) [N]."""
+def fly_rates(lo, hi, state, rates, total, pull, thrust, g):
+    """Compute the rotor thrusts that turn drones at body rates (E, N, 3) [rad/s], at total thrusts (E, N) [N].
+
+    The moment of the pulls (E, N, 3) [N] at the hooks is held beside.
+    """
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
-            torque = rate_torque(vec(state.drone_body_rates, e, n), vec(rates, e, n), g)
-            drive_rotors(total[e, n], torque, thrust[e, n], g)
+            d = drone_gains(g, n)
+            torque = rate_torque(vec(state.drone_body_rates, e, n), vec(rates, e, n), d)
+            moment = hook_moment(mat(state.drone_rotation, e, n), vec(pull, e, n), STILL, d)
+            drive_rotors(total[e, n], torque, moment, thrust[e, n], d)

@@ -32,23 +32,27 @@ class AirConstants(NamedTuple):
     gust_rise: float
     gust_hold: float
     wash: bool
-    rotor_radius: float
+    rotor_radius: np.ndarray
+    """(N,) [m]."""
     rotor_positions: np.ndarray
-    """(4, 3) [m]."""
-    arm: float
+    """(N, 4, 3) [m]."""
+    arm: np.ndarray
+    """(N,) [m]."""
     payload_breadth: float
     """Radius of a disc as large as the payload's C_d A [m]."""
-    thrust_coefficient: float
+    thrust_coefficient: np.ndarray
+    """(N,) [N s²]."""
     ground_effect: bool
     images: np.ndarray
-    """(M, 2) squared distances between rotor axes [m²], each with its share of the 16 pairs of rotor and image."""
+    """(N, M, 2) squared distances between rotor axes [m²], each with its share of the 16 pairs of rotor and image."""
     moments: bool
     """Whether the air turns drones about their horizontal axes."""
     roll_moment: float
     """[N s] about body x, for each m/s through the air along body y."""
-    rolling_moment: float
-    """[kg m] of each rotor."""
+    rolling_moment: np.ndarray
+    """(N,) of each drone's rotors [kg m]."""
     rotor_spin: np.ndarray
+    """(N, 4)."""
 
     @property
     def still(self) -> bool:
@@ -58,10 +62,7 @@ class AirConstants(NamedTuple):
 
 def make_air(system: System) -> AirConstants:
     """Return the air of `system`."""
-    air, vehicle = system.air, system.vehicle
-    rotors = vehicle.rotor_positions
-    squares = ((rotors[:, None] - rotors[None]) ** 2).sum(axis=-1)
-    distances, counts = np.unique(squares.round(12), return_counts=True)
+    air, vehicles = system.air, system.vehicles
     hold = float("inf") if air.gust_hold is None else air.gust_hold
     return AirConstants(
         gusts=bool(air.turbulence or any(air.gust)),
@@ -71,18 +72,32 @@ def make_air(system: System) -> AirConstants:
         gust_rise=float(air.gust_rise),
         gust_hold=float(hold),
         wash=air.wash,
-        rotor_radius=float(vehicle.rotor_radius),
-        rotor_positions=rotors,
-        arm=float(vehicle.arm),
+        rotor_radius=np.array([vehicle.rotor_radius for vehicle in vehicles]),
+        rotor_positions=np.array([vehicle.rotor_positions for vehicle in vehicles]),
+        arm=np.array([vehicle.arm for vehicle in vehicles]),
         payload_breadth=sqrt(system.payload_drag_area / pi),
-        thrust_coefficient=float(vehicle.thrust_coefficient),
+        thrust_coefficient=np.array([vehicle.thrust_coefficient for vehicle in vehicles]),
         ground_effect=air.ground_effect,
-        images=np.stack([distances, counts / 16], axis=1),
-        moments=bool(air.roll_moment or vehicle.rolling_moment),
+        images=_images(system),
+        moments=bool(air.roll_moment or any(vehicle.rolling_moment for vehicle in vehicles)),
         roll_moment=float(air.roll_moment),
-        rolling_moment=float(vehicle.rolling_moment),
-        rotor_spin=np.asarray(vehicle.rotor_spin, float),
+        rolling_moment=np.array([vehicle.rolling_moment for vehicle in vehicles], float),
+        rotor_spin=np.array([vehicle.rotor_spin for vehicle in vehicles], float),
     )
+
+
+def _images(system: System) -> np.ndarray:
+    """Return `AirConstants.images`; rows that a drone does not need have a share of zero."""
+    tables = []
+    for vehicle in system.vehicles:
+        rotors = vehicle.rotor_positions
+        squares = ((rotors[:, None] - rotors[None]) ** 2).sum(axis=-1)
+        distances, counts = np.unique(squares.round(12), return_counts=True)
+        tables.append(np.stack([distances, counts / 16], axis=1))
+    images = np.zeros((len(tables), max(map(len, tables)), 2))
+    for own, table in zip(images, tables, strict=True):
+        own[: len(table)] = table
+    return images
 
 
 @kernel
@@ -98,7 +113,7 @@ def spread_wash(e, state, air, c):
             if i == n:
                 continue
             away = sub(vec(state.drone_position, e, i) if i < count else payload, here)
-            flux = jet_flux(away, c.arm if i < count else c.payload_breadth, attitude, speed, c)
+            flux = jet_flux(n, away, c.arm[i] if i < count else c.payload_breadth, attitude, speed, c)
             if flux > 0.0:
                 put(felt[i], sub(row(felt, i), scale(flux, column(attitude, 2))))
     for i in range(count + 1):
@@ -112,7 +127,7 @@ def wash_at(e, point, breadth, state, c):
     for n in range(state.drone_position.shape[1]):
         attitude, away = mat(state.drone_rotation, e, n), sub(point, vec(state.drone_position, e, n))
         speed = _four(state.rotor_speed, e, n)
-        felt = sub(felt, scale(jet_flux(away, breadth, attitude, speed, c), column(attitude, 2)))
+        felt = sub(felt, scale(jet_flux(n, away, breadth, attitude, speed, c), column(attitude, 2)))
     return _velocity(felt)
 
 
@@ -130,8 +145,8 @@ def _velocity(flux):
 
 
 @kernel
-def jet_flux(away, breadth, attitude, speed, c):
-    """Return the momentum flux over density of a drone's wash, against its thrust [m²/s²].
+def jet_flux(n, away, breadth, attitude, speed, c):
+    """Return the momentum flux over density of the wash of drone n, against its thrust [m²/s²].
 
     Every rotor blows a round turbulent jet against its thrust f: the momentum flux ρ w² is Gaussian across it and
     adds up to f at any distance, the width grows in proportion to the distance once it exceeds that of the contracted
@@ -139,6 +154,7 @@ def jet_flux(away, breadth, attitude, speed, c):
     its breadth, with a Gaussian weight, so that no drag exceeds the momentum that there is.
 
     Args:
+        n: the drone that blows.
         away: middle of the body from the drone, world frame [m].
         breadth: radius of the body [m]; 0 for the flux at a point.
         attitude: of the drone.
@@ -148,19 +164,19 @@ def jet_flux(away, breadth, attitude, speed, c):
     x, y, z = tmul(attitude, away)
     if z >= 0.0:
         return 0.0
-    square = max(c.rotor_radius / sqrt(2.0), -GROWTH * z) ** 2 + breadth * breadth
-    if x * x + y * y > (c.arm + _REACH * sqrt(square)) ** 2:
+    square = max(c.rotor_radius[n] / sqrt(2.0), -GROWTH * z) ** 2 + breadth * breadth
+    if x * x + y * y > (c.arm[n] + _REACH * sqrt(square)) ** 2:
         return 0.0
     thrust = 0.0
     for k in range(4):
-        dx, dy = x - c.rotor_positions[k, 0], y - c.rotor_positions[k, 1]
-        thrust += c.thrust_coefficient * speed[k] * speed[k] * exp(-(dx * dx + dy * dy) / square)
+        dx, dy = x - c.rotor_positions[n, k, 0], y - c.rotor_positions[n, k, 1]
+        thrust += c.thrust_coefficient[n] * speed[k] * speed[k] * exp(-(dx * dx + dy * dy) / square)
     return thrust / (AIR_DENSITY * pi * square)
 
 
 @kernel
-def ground_gain(height, c):
-    """Return thrust near the ground over thrust far from it, at the same rotor speeds.
+def ground_gain(height, n, c):
+    """Return thrust of drone n near the ground over thrust far from it, at the same rotor speeds.
 
     A rotor feels the images of all four as sources below the ground: 1/(1 - Σ R² z/(2 (d² + 4 z²)^1.5)) with d the
     distances between axes. For one rotor that is 1/(1 - (R/4z)²) (Cheeseman and Bennett, ARC R&M 3021, 1955), for a
@@ -168,13 +184,15 @@ def ground_gain(height, c):
 
     Args:
         height: of the rotors [m]; at least R/2 is taken, where potential flow ends.
+        n: the drone.
         c: AirConstants.
     """
-    z, total = max(height, 0.5 * c.rotor_radius), 0.0
-    for i in range(c.images.shape[0]):
-        square = c.images[i, 0] + 4.0 * z * z
-        total += c.images[i, 1] * z / (square * sqrt(square))
-    return 1.0 / (1.0 - 2.0 * c.rotor_radius * c.rotor_radius * total)
+    radius, total = c.rotor_radius[n], 0.0
+    z = max(height, 0.5 * radius)
+    for i in range(c.images.shape[1]):
+        square = c.images[n, i, 0] + 4.0 * z * z
+        total += c.images[n, i, 1] * z / (square * sqrt(square))
+    return 1.0 / (1.0 - 2.0 * radius * radius * total)
 
 
 @kernel
@@ -192,6 +210,6 @@ def air_moment(e, n, through, state, c):
     """
     turning = 0.0
     for k in range(4):
-        turning += c.rotor_spin[k] * state.rotor_speed[e, n, k]
-    turning *= c.rolling_moment
+        turning += c.rotor_spin[n, k] * state.rotor_speed[e, n, k]
+    turning *= c.rolling_moment[n]
     return turning * through[0] + c.roll_moment * through[1], turning * through[1]

@@ -171,9 +171,13 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
             n = chain.segments[i]
             at, v = c.qpos + c.payload_nq + chain.coordinates[i], c.qvel + c.payload_nv + chain.velocities[i]
             anchor = mul(attitude, (c.anchors[i, 0], c.anchors[i, 1], c.anchors[i, 2]))
-            chord = sub(vec(state.drone_position, e, i), add(row(state.payload_position, e), anchor))
+            drone = mat(state.drone_rotation, e, i)
+            arm = mul(drone, row(c.hooks, i))
+            chord = sub(add(vec(state.drone_position, e, i), arm), add(row(state.payload_position, e), anchor))
             hang(chord, chain.length[i], chain.stiffness[i], chain.weight[i], links[:n])
-            opening = sub(vec(state.drone_velocity, e, i), add(row(state.payload_velocity, e), cross(spin, anchor)))
+            turning = mul(drone, vec(state.drone_body_rates, e, i))
+            end = add(vec(state.drone_velocity, e, i), cross(turning, arm))
+            opening = sub(end, add(row(state.payload_velocity, e), cross(spin, anchor)))
             frame, rate = matmul(attitude, matrow(chain.frames, i)), spin
             for j in range(n):
                 direction, stretch = row(links, j), links[j, 3]
@@ -182,7 +186,6 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
                     scale(1.0 / n, opening),
                 )  # fmt: skip
             at, v = at + 5 * n, v + 4 * n
-            drone = mat(state.drone_rotation, e, i)
             q = mat_to_quat(matmul(transpose(frame), drone))
             line[at], line[at + 1], line[at + 2], line[at + 3] = q
             put(line[v : v + 3], sub(vec(state.drone_body_rates, e, i), tmul(drone, rate)))

@@ -26,20 +26,23 @@ class Constants(NamedTuple):
     payload_drag: float
     """½ ρ C_d A [kg/m]."""
     rotor_positions: np.ndarray
-    """(4, 3) [m]."""
+    """(N, 4, 3) [m]."""
     rotor_spin: np.ndarray
-    """(4,) sign of the reaction torque."""
-    thrust_coefficient: float
-    torque_ratio: float
-    speed_min: float
-    speed_max: float
-    rising: tuple[float, float, float]
-    """Of a rotor whose speed rises: exp(-timestep/τ), and the means of exp(-t/τ) and exp(-2t/τ) over a step."""
-    falling: tuple[float, float, float]
-    """The same of one whose speed falls."""
+    """(N, 4) sign of the reaction torque."""
+    thrust_coefficient: np.ndarray
+    """(N,), likewise the next ones."""
+    torque_ratio: np.ndarray
+    speed_min: np.ndarray
+    speed_max: np.ndarray
+    rising: np.ndarray
+    """(N, 3) of rotors whose speed rises: exp(-timestep/τ), and the means of exp(-t/τ) and exp(-2t/τ) over a step."""
+    falling: np.ndarray
+    """(N, 3) the same of those whose speed falls."""
     drag: np.ndarray
-    """(3,) linear drag of a drone along its axes [kg/s]."""
+    """(N, 3) linear drag of a drone along its axes [kg/s]."""
     anchors: np.ndarray
+    """(N, 3) [m]."""
+    hooks: np.ndarray
     """(N, 3) [m]."""
     cable_length: np.ndarray
     cable_stiffness: np.ndarray
@@ -64,20 +67,21 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         cartesian + 6 * body if chain else force + layout.payload_nv + 6 * n
         for n, body in enumerate(layout.drone_bodies)
     ]
-    vehicle = system.vehicle
+    vehicles, h = system.vehicles, system.timestep
     return Constants(
         timestep=system.timestep,
         payload_drag=0.5 * AIR_DENSITY * system.payload_drag_area,
-        rotor_positions=vehicle.rotor_positions,
-        rotor_spin=np.asarray(vehicle.rotor_spin, float),
-        thrust_coefficient=vehicle.thrust_coefficient,
-        torque_ratio=vehicle.torque_ratio,
-        speed_min=vehicle.rotor_speed_min,
-        speed_max=vehicle.rotor_speed_max,
-        rising=_lag(system.timestep / vehicle.rotor_time_constant_up),
-        falling=_lag(system.timestep / vehicle.rotor_time_constant_down),
-        drag=np.asarray(vehicle.drag, float),
+        rotor_positions=np.array([vehicle.rotor_positions for vehicle in vehicles]),
+        rotor_spin=np.array([vehicle.rotor_spin for vehicle in vehicles], float),
+        thrust_coefficient=np.array([vehicle.thrust_coefficient for vehicle in vehicles]),
+        torque_ratio=np.array([vehicle.torque_ratio for vehicle in vehicles]),
+        speed_min=np.array([vehicle.rotor_speed_min for vehicle in vehicles], float),
+        speed_max=np.array([vehicle.rotor_speed_max for vehicle in vehicles]),
+        rising=np.array([_lag(h / vehicle.rotor_time_constant_up) for vehicle in vehicles]),
+        falling=np.array([_lag(h / vehicle.rotor_time_constant_down) for vehicle in vehicles]),
+        drag=np.array([vehicle.drag for vehicle in vehicles], float),
         anchors=np.ascontiguousarray(system.anchors),
+        hooks=np.ascontiguousarray(system.hooks),
         cable_length=system.cable_length,
         cable_stiffness=system.cable_stiffness,
         breaking_load=system.breaking_load,
@@ -123,21 +127,24 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
                 spread_wash(e, state, air, flow)
         for n in range(thrust.shape[1]):
             total, mx, my, mz, power = 0.0, 0.0, 0.0, 0.0, 0.0
+            b, kappa = c.thrust_coefficient[n], c.torque_ratio[n]
+            slowest, fastest = c.speed_min[n], c.speed_max[n]
+            rising, falling, drag = row(c.rising, n), row(c.falling, n), row(c.drag, n)
             for k in range(4):
                 before = state.rotor_speed[e, n, k]
-                target = sqrt(max(thrust[e, n, k], 0.0) / c.thrust_coefficient)
-                target = 0.0 if plant.motors_off[e, n] else clip(target, c.speed_min, c.speed_max)
+                target = sqrt(max(thrust[e, n, k], 0.0) / b)
+                target = 0.0 if plant.motors_off[e, n] else clip(target, slowest, fastest)
                 gap = before - target
-                decay, mean_first, mean_second = c.falling if gap > 0.0 else c.rising
+                decay, mean_first, mean_second = falling if gap > 0.0 else rising
                 after = target + gap * decay
                 square = target * target + 2.0 * target * gap * mean_first + gap * gap * mean_second
-                f = c.thrust_coefficient * square
+                f = b * square
                 state.rotor_speed[e, n, k] = after
                 total += f
-                mx += c.rotor_positions[k, 1] * f
-                my -= c.rotor_positions[k, 0] * f
-                mz += c.rotor_spin[k] * c.torque_ratio * f
-                power += c.torque_ratio * f * 0.5 * (before + after)
+                mx += c.rotor_positions[n, k, 1] * f
+                my -= c.rotor_positions[n, k, 0] * f
+                mz += c.rotor_spin[n, k] * kappa * f
+                power += kappa * f * 0.5 * (before + after)
             attitude = mat(state.drone_rotation, e, n)
             here = wind
             if flow is not None:
@@ -145,12 +152,12 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
             through = tmul(attitude, sub(vec(state.drone_velocity, e, n), here))
             if flow is not None:
                 if flow.ground_effect:
-                    gain = ground_gain(state.drone_position[e, n, 2], flow)
+                    gain = ground_gain(state.drone_position[e, n, 2], n, flow)
                     total, mx, my = gain * total, gain * mx, gain * my
                 if flow.moments:
                     more = air_moment(e, n, through, state, flow)
                     mx, my = mx + more[0], my + more[1]
-            body = (-c.drag[0] * through[0], -c.drag[1] * through[1], total - c.drag[2] * through[2])
+            body = (-drag[0] * through[0], -drag[1] * through[1], total - drag[2] * through[2])
             torque = (mx, my, mz)
             if c.world_torque:
                 torque = mul(attitude, torque)

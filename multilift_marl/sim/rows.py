@@ -5,7 +5,6 @@ from __future__ import annotations
 from math import isfinite, sqrt
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY
 from multilift_marl.math3d import (
     add,
     dot,
@@ -13,15 +12,14 @@ from multilift_marl.math3d import (
     mat_to_quat,
     matrow,
     mul,
-    norm,
     put,
     putmat,
     quat_to_mat,
     row,
     sub,
-    thrust_frame,
     vec,
 )
+from multilift_marl.sim.standing import hook_place
 
 MAX_SPEED = 100.0  # [m/s] beyond this a simulation has diverged
 MAX_RATE = 500.0  # [rad/s]
@@ -111,15 +109,6 @@ def _sound(line, tension, c):
 
 
 @kernel
-def hover_drone(e, n, state, pull, yaw, mass, thrust_coefficient):
-    """Let drone n of environment e hold still: attitude and rotor speeds that pull its cable by `pull` [N]."""
-    force = add(pull, (0.0, 0.0, mass * GRAVITY))
-    putmat(state.drone_rotation[e, n], thrust_frame(force, yaw))
-    for k in range(4):
-        state.rotor_speed[e, n, k] = sqrt(norm(force) / (4.0 * thrust_coefficient))
-
-
-@kernel
 def write_rows(rows, lo, hi, mask, state, record, c):
     """Write the state of the environments in `mask` into `batch.state`; tensions follow from the stretch."""
     for e in range(lo, hi):
@@ -131,8 +120,7 @@ def write_rows(rows, lo, hi, mask, state, record, c):
         attitude = matrow(state.payload_rotation, e)
         at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
         for n in range(state.drone_position.shape[1]):
-            position = vec(state.drone_position, e, n)
-            put(line[at : at + 3], position)
+            put(line[at : at + 3], vec(state.drone_position, e, n))
             q = mat_to_quat(mat(state.drone_rotation, e, n))
             line[at + 3], line[at + 4], line[at + 5], line[at + 6] = q
             put(line[v : v + 3], vec(state.drone_velocity, e, n))
@@ -140,7 +128,7 @@ def write_rows(rows, lo, hi, mask, state, record, c):
             at += 7
             v += 6
             anchor = (c.anchors[n, 0], c.anchors[n, 1], c.anchors[n, 2])
-            cable = sub(position, add(row(state.payload_position, e), mul(attitude, anchor)))
+            cable = sub(hook_place(e, n, state, c.hooks), add(row(state.payload_position, e), mul(attitude, anchor)))
             pull = c.cable_stiffness[n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[n])
             keep_tension(e, n, pull, state, record, c)
 

@@ -57,8 +57,9 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
     for i in range(system.num_drones):
         if chain:
             link = _add_chain(spec.body("payload"), system, i, visuals)
-            body = link.add_body(name=f"drone_{i}", pos=[0, 0, system.cable_length[i] / system.cable_segments[i]])
-            body.add_joint(name=f"drone_{i}", type=mujoco.mjtJoint.mjJNT_BALL)
+            end = np.array([0, 0, system.cable_length[i] / system.cable_segments[i]])
+            body = link.add_body(name=f"drone_{i}", pos=end - system.hooks[i])
+            body.add_joint(name=f"drone_{i}", type=mujoco.mjtJoint.mjJNT_BALL, pos=system.hooks[i])
             _add_drone(body, system, i, visuals)
             _add_drone_sensors(spec, i)
         else:
@@ -169,7 +170,7 @@ def _payload_form(system: System, margin: float = 0.0) -> dict[str, Any]:
 
 
 def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> None:
-    vehicle, name = system.vehicle, f"drone_{i}"
+    vehicle, name = system.vehicles[i], f"drone_{i}"
     body.mass, body.explicitinertial = vehicle.mass, True
     body.inertia, body.ipos = vehicle.inertia, [0, 0, 0]
     colour = DRONE_COLOURS[i % len(DRONE_COLOURS)]
@@ -177,7 +178,7 @@ def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> N
         name=name, type=_GEOM.mjGEOM_BOX, size=drone_half_size(vehicle),
         rgba=[*colour[:3], 0.0 if visuals else 1.0],
     )  # fmt: skip
-    body.add_site(name=f"{name}/hook", pos=[0, 0, 0], size=[0.008, 0, 0], rgba=[0.2, 0.2, 0.2, 1])
+    body.add_site(name=f"{name}/hook", pos=system.hooks[i], size=[0.008, 0, 0], rgba=[0.2, 0.2, 0.2, 1])
     for r, position in enumerate(vehicle.rotor_positions):
         body.add_site(name=f"{name}/rotor_{r}", pos=position, size=[0.008, 0, 0], group=4)
     if visuals:

@@ -21,8 +21,9 @@ from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.chain import make_chain, read_chains, write_chains
 from multilift_marl.sim.dynamics import apply_loads, make_constants
 from multilift_marl.sim.gusts import start_turbulence
-from multilift_marl.sim.rows import hover_drone, read_rows, write_rows
+from multilift_marl.sim.rows import read_rows, write_rows
 from multilift_marl.sim.scene import build_model
+from multilift_marl.sim.standing import hover_drone, make_drones
 from multilift_marl.sim.state import Air, Plant, Record, SystemState
 
 _log = logging.getLogger("multilift_marl.mujoco")
@@ -60,6 +61,7 @@ class World:
         state: SystemState of all environments; live arrays, E first.
         thrust: commanded thrust of each rotor (E, N, 4) [N].
         plant: true parameters and loads; write `wind` and `payload_force` freely, the mass by `set_payload_mass`.
+        drones: numbers of each drone.
         air: what blows beside the mean wind.
         record: what accumulated since the reset.
         diverged: (E,) bool, until reset.
@@ -74,6 +76,7 @@ class World:
         _quiet_mujoco()
         self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
         self.model, self.layout = build_model(system)
+        self.drones = make_drones(system)
         self.thrust = np.zeros((num_envs, self.num_drones, 4))
         self.state = SystemState.zeros(num_envs, self.num_drones)
         self.plant = Plant(
@@ -99,10 +102,9 @@ class World:
         state.payload_velocity[mask] = state.payload_body_rates[mask] = 0
         state.drone_position[mask] = system.slots + [0, 0, REST_HEIGHT]
         state.drone_velocity[mask] = state.drone_body_rates[mask] = 0
-        vehicle = system.vehicle
         for e in np.flatnonzero(mask):
             for n, pull in enumerate(system.drone_pull):
-                hover_drone(e, n, state, tuple(pull), 0.0, vehicle.mass, vehicle.thrust_coefficient)
+                hover_drone(e, n, state, tuple(pull), 0.0, self.drones)
         self.set_payload_mass(mask, np.full(self.num_envs, system.payload_mass))
         self.plant.payload_force[mask] = 0
         self.plant.wind[mask] = system.wind

@@ -10,7 +10,7 @@ import numpy as np
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Section
 from multilift_marl.config.validate import validate
-from multilift_marl.control.formation import Goal, Reference, Rig
+from multilift_marl.control.formation import Goal, Reference, make_rig
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.failures import Watch, find_failures, make_limits
@@ -69,7 +69,7 @@ class Task:
         self.weights = self._weights(config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
-        self.rig = Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull)
+        self.rig = make_rig(system)
         self.limits, self.hanging = make_limits(system), make_hanging(system)
         tension = system.resting_tension
         self._nominal = np.append(np.stack([system.cable_length, tension], axis=1), [[system.payload_mass, 0]], axis=0)

@@ -11,6 +11,7 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.system import MIN_SEPARATION, System
 from multilift_marl.math3d import add, column, dot, mat, matrow, mul, norm, row, segment_distance, sub, unit, vec
 from multilift_marl.sim.scene import drone_half_size
+from multilift_marl.sim.standing import hook_place
 
 CAUSES = (
     "none",
@@ -49,13 +50,15 @@ class Watch(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Lengths of the failures, scaled to the vehicle."""
+    """Lengths of the failures, scaled to the vehicles."""
 
-    separation: float
-    """Between drones [m]."""
+    separation: np.ndarray
+    """(N, N) between drones [m]."""
     cables: np.ndarray
     """(N, N) between cables [m]: 0.1 m for a falcon, at most half their distance at rest."""
     anchors: np.ndarray
+    """(N, 3) [m]."""
+    hooks: np.ndarray
     """(N, 3) [m]."""
     payload_half: np.ndarray
     """(3,) half edges of the payload [m]."""
@@ -64,26 +67,27 @@ class Limits(NamedTuple):
     payload_round: bool
     """Whether it is a cylinder."""
     drone_half: np.ndarray
-    """(3,) half edges of a drone [m]."""
+    """(N, 3) half edges of a drone [m]."""
 
 
 def make_limits(system: System) -> Limits:
     """Return the limits of `system`."""
-    n, anchors, slots = system.num_drones, system.anchors, system.slots
+    n, anchors, ends = system.num_drones, system.anchors, system.cable_ends
     cables = np.zeros((n, n))
     for i in range(n):
         for j in range(n):
             if i != j:
-                rest = segment_distance(tuple(anchors[i]), tuple(slots[i]), tuple(anchors[j]), tuple(slots[j]))
-                cables[i, j] = min(_CABLE_DISTANCE * system.min_separation / MIN_SEPARATION, 0.5 * rest)
+                rest = segment_distance(tuple(anchors[i]), tuple(ends[i]), tuple(anchors[j]), tuple(ends[j]))
+                cables[i, j] = min(_CABLE_DISTANCE * system.min_separation[i, j] / MIN_SEPARATION, 0.5 * rest)
     return Limits(
         separation=system.min_separation,
         cables=cables,
         anchors=np.ascontiguousarray(anchors),
+        hooks=np.ascontiguousarray(system.hooks),
         payload_half=system.payload_size / 2,
         payload_center=tuple(float(x) for x in system.payload_center),
         payload_round=system.payload_shape == "cylinder",
-        drone_half=drone_half_size(system.vehicle),
+        drone_half=np.array([drone_half_size(vehicle) for vehicle in system.vehicles]),
     )
 
 
@@ -122,8 +126,9 @@ def _cause(e, state, errors, limits, watch, min_separation):
             continue
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
         anchor = add(payload, mul(attitude, (limits.anchors[n, 0], limits.anchors[n, 1], limits.anchors[n, 2])))
-        cable = unit(sub(drone, anchor))
-        if drone[2] - _extent(frame, limits.drone_half) < _TOUCH and _counts(GROUND, forgiven):
+        end = hook_place(e, n, state, limits.hooks)
+        cable = unit(sub(end, anchor))
+        if drone[2] - _extent(frame, limits.drone_half[n]) < _TOUCH and _counts(GROUND, forgiven):
             return GROUND
         if state.cable_broken[e, n] and _counts(BROKEN, forgiven):
             return BROKEN
@@ -137,13 +142,13 @@ def _cause(e, state, errors, limits, watch, min_separation):
         for m in range(n):
             if watch.lost[e, m]:
                 continue
-            other = vec(state.drone_position, e, m)
-            apart = norm(sub(drone, other))
+            apart = norm(sub(drone, vec(state.drone_position, e, m)))
             min_separation[e] = min(min_separation[e], apart)
-            if apart < limits.separation and _counts(COLLISION, forgiven):
+            if apart < limits.separation[n, m] and _counts(COLLISION, forgiven):
                 return COLLISION
             foot = add(payload, mul(attitude, (limits.anchors[m, 0], limits.anchors[m, 1], limits.anchors[m, 2])))
-            if segment_distance(anchor, drone, foot, other) < limits.cables[n, m] and _counts(CROSSING, forgiven):
+            other = hook_place(e, m, state, limits.hooks)
+            if segment_distance(anchor, end, foot, other) < limits.cables[n, m] and _counts(CROSSING, forgiven):
                 return CROSSING
     return 0
 

@@ -116,7 +116,7 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
             anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
             at_payload = add(payload, mul(attitude, anchor))
             anchor_error = sub(at_payload, add(target, mul(target_attitude, anchor)))
-            cable = sub(position, at_payload)
+            cable = sub(add(position, mul(frame, row(rig.drones.hooks, n))), at_payload)
             own = observation[e, n]
             i = _write(own, 0, turn(cn, sn, slot_error))
             i = _write(own, i, turn(cn, sn, velocity))

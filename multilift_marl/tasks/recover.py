@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import atan2, cos, pi, radians, sin, sqrt
+from math import atan2, cos, pi, radians, sin
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
+from multilift_marl.sim.standing import hold_hook, hook_place
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, forgive
@@ -90,12 +91,12 @@ class Recover(Task):
         if option.start == "slack":
             _throw(env, rng, state, goal, self.rig, self.hanging, throw)
         else:
-            _throw_as_crazymarl(env, rng, state, goal, self.hanging)
+            _throw_as_crazymarl(env, rng, state, goal, self.rig.drones, self.hanging)
         if not self.rig.anchors.any():
             _turn_formation(env, state, goal, self.rig)
-        carried = self.hanging.drone_mass + mass / self.world.num_drones
-        hover = sqrt(carried * GRAVITY / 4 / self.hanging.thrust_coefficient)
-        state.rotor_speed[env] = hover
+        drones = self.rig.drones
+        carried = drones.mass + mass / self.world.num_drones
+        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / drones.thrust_coefficient)[:, None]
         state.payload_body_rates[env] = 0.0
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
@@ -150,14 +151,14 @@ def _throw(e, rng, state, goal, rig, hanging, throw):
         towards = unit(sub(vec(goal.slots, e, n), at_rest))
         towards = unit(add(towards, in_ball(rng, 0.5)))  # within 30° of the slot's
         span = hanging.length[n] * rng.uniform(throw.slack, 1.0)
-        put(state.drone_position[e, n], add(add(payload, anchor), scale(span, towards)))
         put(state.drone_velocity[e, n], in_ball(rng, throw.speed))
         putmat(state.drone_rotation[e, n], _tilted(rng, throw.tilt, goal.drone_yaw[e]))
+        hold_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.drones.hooks)
         state.drone_body_rates[e, n] = 0.0
 
 
 @kernel
-def _throw_as_crazymarl(e, rng, state, goal, hanging):
+def _throw_as_crazymarl(e, rng, state, goal, drones, hanging):
     """Write a team as CrazyMARL's sampler draws it (viktorlorentz/crazyMARL, crazymarl/utils/multi_quad_sampling.py,
     commit 8723b9a, and the reset of crazymarl/envs/multi_quad_env.py, commit 02d5761).
 
@@ -194,6 +195,7 @@ def _throw_as_crazymarl(e, rng, state, goal, hanging):
             roll, pitch = 0.0, 0.0
         level = matmul(axis_angle((0.0, 1.0, 0.0), pitch), axis_angle((1.0, 0.0, 0.0), roll))
         putmat(state.drone_rotation[e, n], matmul(rot_z(rng.uniform(-pi, pi)), level))
+        hold_hook(e, n, state, vec(state.drone_position, e, n), drones.hooks)
         for k in range(3):
             state.drone_velocity[e, n, k] = rng.normal(0.0, 0.2)
             state.drone_body_rates[e, n, k] = rng.normal(0.0, radians(20.0))
@@ -228,7 +230,7 @@ def _tell(lo, hi, time, grace, state, rig, hanging, observation, critic):
         attitude = matrow(state.payload_rotation, e)
         for n in range(observation.shape[1]):
             anchor = add(row(state.payload_position, e), mul(attitude, row(rig.anchors, n)))
-            span = norm(sub(vec(state.drone_position, e, n), anchor))
+            span = norm(sub(hook_place(e, n, state, rig.drones.hooks), anchor))
             own = observation[e, n, observation.shape[2] - 2 :]
             own[0], own[1] = left, 1.0 - span / hanging.length[n]
 

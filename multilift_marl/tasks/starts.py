@@ -9,10 +9,10 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.control.formation import place_formation
+from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
 from multilift_marl.sim.cables import cable_end
-from multilift_marl.sim.rows import hover_drone
+from multilift_marl.sim.standing import hold_hook, hover_drone
 
 
 class Hanging(NamedTuple):
@@ -24,8 +24,6 @@ class Hanging(NamedTuple):
     weight: np.ndarray
     segments: np.ndarray
     payload_mass: float
-    drone_mass: float
-    thrust_coefficient: float
 
 
 def make_hanging(system: System) -> Hanging:
@@ -36,8 +34,6 @@ def make_hanging(system: System) -> Hanging:
         weight=system.cable_mass * GRAVITY,
         segments=system.cable_segments,
         payload_mass=system.payload_mass,
-        drone_mass=system.vehicle.mass,
-        thrust_coefficient=system.vehicle.thrust_coefficient,
     )
 
 
@@ -71,18 +67,18 @@ def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, m
     load = mass / hanging.payload_mass
     for n in range(rig.slots.shape[0]):
         anchor = add(payload, mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
-        cable = sub(add(vec(goal.slots, e, n), moved), anchor)
+        cable = sub(add(goal_hook(e, n, goal, rig), moved), anchor)
         direction = scale(1.0 / norm(cable), cable)
         half = (0.0, 0.0, 0.5 * hanging.weight[n])
         tension = load * norm(sub(vec(goal.pull, e, n), half))  # in the middle, whose direction is the cable's
         end = cable_end(
             direction, tension, hanging.length[n], hanging.stiffness[n], hanging.segments[n], hanging.weight[n]
         )
-        put(state.drone_position[e, n], add(anchor, end))
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
         pull = add(scale(tension, direction), half)
-        hover_drone(e, n, state, pull, goal.drone_yaw[e], hanging.drone_mass, hanging.thrust_coefficient)
+        hover_drone(e, n, state, pull, goal.drone_yaw[e], rig.drones)
+        hold_hook(e, n, state, add(anchor, end), rig.drones.hooks)
 
 
 class StartRanges(NamedTuple):

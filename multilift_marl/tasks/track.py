@@ -11,7 +11,7 @@ from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section, Vector
-from multilift_marl.control.formation import Reference, place_formation
+from multilift_marl.control.formation import Reference, face, place_formation
 from multilift_marl.math3d import add, matrow, norm, put, putmat, rot_z, row, sub, turn
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
@@ -142,7 +142,7 @@ def _aim(e, t, path, goal, rig):
     put(goal.jerk[e], jerk)
     place_formation(e, goal, rig)
     if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
-        goal.drone_yaw[e] = path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi
+        face(e, path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi, goal, rig)
         goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
 
 

@@ -225,7 +225,7 @@ def ground_effect(fast: bool) -> Result:
         quantity = f"thrust over thrust far away at {ratio:g} rotor radii, relative error"
         result.rows.append(Row("ground effect", quantity, expected, gain, relative(gain, expected), 1e-6))
     single = 1 / (1 - (1 / 4) ** 2)
-    lone = ground_gain(radius, make_air(replace(system, vehicle=replace(vehicle, arm=1e3))))
+    lone = ground_gain(radius, 0, make_air(replace(system, vehicles=(replace(vehicle, arm=1e3),))))
     quantity = "one rotor alone at one radius, Cheeseman and Bennett, relative error"
     result.rows.append(Row("ground effect", quantity, single, lone, relative(lone, single), 1e-9))
     heights = np.linspace(0.5, 8, 200)
@@ -234,7 +234,7 @@ def ground_effect(fast: bool) -> Result:
         "ground_effect", "thrust of a falcon near the ground", "height over rotor radius", "thrust over far thrust"
     )
     plot.curves = [
-        Curve("four rotors", heights, np.array([ground_gain(z * radius, c) for z in heights])),
+        Curve("four rotors", heights, np.array([ground_gain(z * radius, 0, c) for z in heights])),
         Curve("one rotor, Cheeseman and Bennett 1955", heights, 1 / (1 - (1 / (4 * heights)) ** 2), theory=True),
     ]
     result.plots.append(plot)

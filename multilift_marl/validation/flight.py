@@ -12,7 +12,8 @@ from multilift_marl.config.schema import Config
 from multilift_marl.config.system import System
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection
 from multilift_marl.control.formation import Reference
-from multilift_marl.control.geometric import Gains, fly, make_gains
+from multilift_marl.control.gains import Gains, make_gains
+from multilift_marl.control.geometric import fly
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row
 from multilift_marl.validation.trajectory import (

@@ -9,8 +9,9 @@ import numpy as np
 
 from multilift_marl.config.load import load_config
 from multilift_marl.config.schema import Config
-from multilift_marl.control.formation import Goal, Reference, Rig, place_formation, start_reference
-from multilift_marl.control.geometric import control, make_gains
+from multilift_marl.control.formation import Goal, Reference, make_rig, place_formation, start_reference
+from multilift_marl.control.gains import make_gains
+from multilift_marl.control.geometric import control
 from multilift_marl.sim.world import World
 
 CONTROL_HZ = 250.0
@@ -128,7 +129,7 @@ def pilot(config: Config, world: World, target: np.ndarray, yaw: float = 0.0) ->
     system, option = config.system, config.control
     goal, reference = Goal.zeros(1, system.num_drones), Reference.zeros(1, system.num_drones)
     goal.position[0], goal.rotation[0] = target, about_z(yaw)
-    place_formation(0, goal, Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull))
+    place_formation(0, goal, make_rig(system))
     start_reference(0, world.state, reference)
     reference.command[:], reference.command_yaw[:] = goal.slots, yaw
     gains = make_gains(option, system)

@@ -1,0 +1,72 @@
+"""What a system must be able to do before anything is simulated: hover, hold, keep apart."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from multilift_marl.config.teams import check_rotors, describe_team
+from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from multilift_marl.config.system import System
+
+MIN_THRUST_TO_WEIGHT = 1.18
+
+
+def check_possible(system: System, heaviest: float) -> None:
+    """Refuse what cannot fly, hovering under a payload `heaviest` times its nominal mass included."""
+    n, vehicles = system.num_drones, system.vehicles
+    if system.air.wash or system.air.ground_effect:
+        for vehicle in vehicles:
+            check_rotors(vehicle)
+    thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in vehicles])
+    if thrust.sum() < MIN_THRUST_TO_WEIGHT * system.weight:
+        lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"
+        raise ConfigError(
+            f"{describe_team(vehicles)} lift {thrust.sum():.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of "
+            f"{lifted}, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
+        )
+    rope = system.drone_pull - system.formation_force
+    own = GRAVITY * system.drone_mass[:, None] * [0, 0, 1]
+    hover = np.linalg.norm(heaviest * system.formation_force + rope + own, axis=1)
+    if np.any(hover > thrust):
+        i = int(np.argmax(hover - thrust))
+        raise ConfigError(
+            f"drone {i} would need {hover[i]:.1f} N of its {thrust[i]:.1f} N to hover under the heaviest payload; "
+            "lower payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
+        )
+    if system.hooks.any():
+        _check_hooks(system, heaviest)
+    tight = heaviest * system.resting_tension
+    if np.any(tight >= system.breaking_load):
+        i = int(np.argmax(tight - system.breaking_load))
+        raise ConfigError(
+            f"cable {i} would break at rest: {tight[i]:.1f} N under the heaviest payload, but cable.breaking_load is "
+            f"{system.breaking_load[i]:g} N; raise it or lower payload.mass"
+        )
+    if n > 1:
+        apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)
+        i, j = np.unravel_index(np.argmin(apart - system.min_separation), apart.shape)
+        if apart[i, j] < system.min_separation[i, j]:
+            raise ConfigError(
+                f"neighbouring drones {i} and {j} would rest {apart[i, j]:.2f} m apart, closer than the separation "
+                f"limit of {system.min_separation[i, j]:.2f} m; spread payload.anchors or raise cable.length or cable.angle"
+            )
+
+
+def _check_hooks(system: System, heaviest: float) -> None:
+    """Refuse hooks so far from a drone's centre that its rotors could not hold their moment."""
+    pulls = heaviest * system.formation_force + system.drone_pull - system.formation_force
+    for i, (vehicle, rotation) in enumerate(zip(system.vehicles, system.resting_rotation, strict=True)):
+        own = rotation.T @ (pulls[i] + [0, 0, vehicle.mass * GRAVITY])
+        rotors = np.linalg.solve(vehicle.allocation, [own[2], *np.cross(system.hooks[i], rotation.T @ pulls[i])])
+        least = vehicle.thrust_coefficient * vehicle.rotor_speed_min**2
+        if rotors.min() < least or rotors.max() > vehicle.rotor_thrust_max:
+            raise ConfigError(
+                f"drone {i} would need {rotors.min():.2f} to {rotors.max():.2f} N of its rotors to hold the pull at "
+                f"cable.hook {system.hooks[i].tolist()}, but they give {least:.2f} to "
+                f"{vehicle.rotor_thrust_max:.2f} N; move the hook nearer to the centre of mass"
+            )

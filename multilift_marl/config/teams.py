@@ -1,0 +1,108 @@
+"""From `vehicle.<field>` to the quadrotors of a team, alike or not, each refused in one sentence if it cannot be."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from multilift_marl.config.vehicles import PRESETS, Vehicle
+from multilift_marl.errors import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from multilift_marl.config.schema import VehicleConfig
+
+_VECTORS = ("inertia", "rotor_azimuth", "rotor_spin", "drag")
+
+
+def resolve_vehicles(config: VehicleConfig, n: int) -> tuple[Vehicle, ...]:
+    """Return the vehicle of each of n drones: its preset with the configured fields in place of the preset's own.
+
+    Raises:
+        ConfigError: a list of another length, an unknown preset, or a vehicle that cannot be or cannot hover.
+    """
+    fields = config.model_dump(exclude_none=True)
+    values = {key: _one_each(value, n, key) for key, value in fields.items()}
+    alike = all(len(set(each)) == 1 for each in values.values())
+    vehicles = []
+    for i in range(n):
+        try:
+            vehicles.append(_resolve({key: each[i] for key, each in values.items()}))
+        except ConfigError as error:
+            raise error if alike else ConfigError(f"drone {i}: {error}") from None
+    return tuple(vehicles)
+
+
+def describe_team(vehicles: tuple[Vehicle, ...]) -> str:
+    """Return how many of which vehicles, such as "2 × falcon, 1 × iris"."""
+    return ", ".join(f"{count} × {name}" for name, count in Counter(vehicle.name for vehicle in vehicles).items())
+
+
+def _one_each(value: Any, n: int, key: str) -> tuple[Any, ...]:
+    """Return the value of each of n drones, of one for all or a list with one for each."""
+    vector = key in _VECTORS and value and not isinstance(value[0], tuple)
+    if vector or not isinstance(value, tuple):
+        return (value,) * n
+    if len(value) != n:
+        raise ConfigError(
+            f"vehicle.{key} lists {len(value)} values for env.num_drones={n}: give one value or one for each drone"
+        )
+    return value
+
+
+def _resolve(fields: dict[str, Any]) -> Vehicle:
+    preset = fields.pop("preset")
+    if preset not in PRESETS:
+        raise ConfigError(f"unknown vehicle.preset '{preset}'{nearest(preset, PRESETS)}")
+    if "rotor_azimuth" in fields:
+        fields["rotor_azimuth"] = tuple(float(angle) for angle in np.deg2rad(fields["rotor_azimuth"]))
+    vehicle = replace(PRESETS[preset], **fields)
+    _check_vehicle(vehicle)
+    return vehicle
+
+
+def check_rotors(vehicle: Vehicle) -> None:
+    """Refuse rotors that overlap, which the models of wash and ground effect know nothing of."""
+    rotors = vehicle.rotor_positions
+    apart = min(float(np.linalg.norm(a - b)) for i, a in enumerate(rotors) for b in rotors[:i])
+    if 2 * vehicle.rotor_radius > apart:
+        raise ConfigError(
+            f"rotors of vehicle.rotor_radius={vehicle.rotor_radius:g} m overlap, their axes {apart:.3g} m apart; "
+            "lower it or raise vehicle.arm, or switch wind.wash and wind.ground_effect off"
+        )
+
+
+def _check_vehicle(vehicle: Vehicle) -> None:
+    inertia, spin, position = np.array(vehicle.inertia), np.array(vehicle.rotor_spin), vehicle.rotor_positions
+    if 2 * inertia.max() > inertia.sum() * (1 + 1e-9):
+        raise ConfigError(
+            f"vehicle.inertia {inertia.tolist()} is impossible: no moment may exceed the sum of the other two"
+        )
+    if vehicle.rotor_speed_min >= vehicle.rotor_speed_max:
+        raise ConfigError(
+            f"vehicle.rotor_speed_min={vehicle.rotor_speed_min:g} rad/s must be less than the "
+            f"{vehicle.rotor_speed_max:g} rad/s that vehicle.rotor_thrust_max={vehicle.rotor_thrust_max:g} N takes"
+        )
+    if not np.all(np.abs(spin) == 1) or spin.sum() != 0:
+        raise ConfigError(
+            f"vehicle.rotor_spin {spin.tolist()} must hold 1 for two rotors and -1 for the other two, or yaw is out of "
+            "control"
+        )
+    if np.abs(position.sum(axis=0)).max() > 1e-6 * vehicle.arm:
+        raise ConfigError(
+            f"vehicle.rotor_azimuth {np.rad2deg(vehicle.rotor_azimuth).round(3).tolist()} does not balance: equal "
+            "thrusts must give no torque, so place the rotors in opposite pairs"
+        )
+    unit = np.stack([np.ones(4), position[:, 0] / vehicle.arm, position[:, 1] / vehicle.arm, spin])
+    if np.linalg.svd(unit, compute_uv=False).min() < 0.05:
+        raise ConfigError(
+            f"vehicle.rotor_azimuth {np.rad2deg(vehicle.rotor_azimuth).round(3).tolist()} with vehicle.rotor_spin "
+            f"{spin.tolist()} cannot turn the drone about each axis: let opposite rotors turn alike"
+        )
+    if vehicle.spare_lift <= 0:
+        raise ConfigError(
+            f"a {vehicle.name} of vehicle.mass={vehicle.mass:g} kg cannot lift itself with "
+            f"{4 * vehicle.rotor_thrust_max:g} N; raise vehicle.rotor_thrust_max"
+        )

@@ -1,0 +1,100 @@
+"""Nominal parameters and gains of a team's controllers, and those of one drone as its levels take them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.schema import ControlConfig
+from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.math3d import row
+from multilift_marl.sim.standing import make_drones
+
+POSITION_RATIO = 5.0  # attitude's natural frequency over position's, at least
+
+
+class Gains(NamedTuple):
+    """Nominal parameters and gains of each drone in a team; the plant may differ."""
+
+    mass: np.ndarray
+    """(N,) [kg]."""
+    inertia: np.ndarray
+    """(N, 3) [kg m²]."""
+    k_p: np.ndarray
+    """(N,) position gain [1/s²]."""
+    k_v: np.ndarray
+    """(N,) velocity gain [1/s]."""
+    k_R: np.ndarray
+    """(N, 3) attitude gains for unit inertia [1/s²]."""
+    k_w: np.ndarray
+    """(N, 3) rate gains for unit inertia [1/s]."""
+    allocation: np.ndarray
+    """(N, 4, 4) inverse allocation matrices."""
+    thrust_min: np.ndarray
+    """(N,) of one rotor [N]."""
+    thrust_max: np.ndarray
+    """(N,) [N]."""
+    load_share: np.ndarray
+    """(N,) mass of payload and cable that each drone carries [kg]."""
+    drag: np.ndarray
+    """(N, 3) linear drag along the body axes that is fed forward [kg/s]."""
+    hooks: np.ndarray
+    """(N, 3) where the cable is tied, from the centre of mass, body frame [m]."""
+    hooked: bool
+    """Whether any hook is off its centre of mass."""
+
+
+class DroneGains(NamedTuple):
+    """The same of one drone: numbers, and tuples of 3."""
+
+    mass: float
+    inertia: tuple[float, float, float]
+    k_p: float
+    k_v: float
+    k_R: tuple[float, float, float]
+    k_w: tuple[float, float, float]
+    allocation: np.ndarray
+    """(4, 4)."""
+    thrust_min: float
+    thrust_max: float
+    load_share: float
+    drag: tuple[float, float, float]
+    hook: tuple[float, float, float]
+    hooked: bool
+
+
+@kernel
+def drone_gains(g, n):
+    """Return the DroneGains of drone n."""
+    return DroneGains(
+        g.mass[n], row(g.inertia, n), g.k_p[n], g.k_v[n], row(g.k_R, n), row(g.k_w, n), g.allocation[n],
+        g.thrust_min[n], g.thrust_max[n], g.load_share[n], row(g.drag, n), row(g.hooks, n), g.hooked,
+    )  # fmt: skip
+
+
+def make_gains(control: ControlConfig, system: System) -> Gains:
+    """Return gains for natural frequencies and damping ratios.
+
+    Attitude is no faster than the motors allow (0.7/τ of the slower lag), position no faster than attitude allows.
+    """
+    vehicles, drones = system.vehicles, make_drones(system)
+    tilt = [min(control.attitude_frequency, 0.7 / vehicle.rotor_time_constant) for vehicle in vehicles]
+    position = np.array([min(control.position_frequency, fastest / POSITION_RATIO) for fastest in tilt])
+    frequency = np.array([[fastest, fastest, min(control.yaw_frequency, fastest)] for fastest in tilt])
+    return Gains(
+        mass=drones.mass,
+        inertia=np.array([vehicle.inertia for vehicle in vehicles], float),
+        k_p=position**2,
+        k_v=2 * control.position_damping * position,
+        k_R=frequency**2,
+        k_w=2 * control.attitude_damping * frequency,
+        allocation=drones.allocation,
+        thrust_min=np.array([vehicle.thrust_coefficient * vehicle.rotor_speed_min**2 for vehicle in vehicles]),
+        thrust_max=np.array([vehicle.rotor_thrust_max for vehicle in vehicles], float),
+        load_share=system.drone_pull[:, 2] / GRAVITY,
+        drag=np.array([vehicle.drag for vehicle in vehicles], float) * control.drag_feedforward,
+        hooks=drones.hooks,
+        hooked=drones.hooked,
+    )
