@@ -53,7 +53,8 @@ def check_possible(system: System, heaviest: float) -> None:
         if apart[i, j] < system.min_separation[i, j]:
             raise ConfigError(
                 f"neighbouring drones {i} and {j} would rest {apart[i, j]:.2f} m apart, closer than the separation "
-                f"limit of {system.min_separation[i, j]:.2f} m; spread payload.anchors or raise cable.length or cable.angle"
+                f"limit of {system.min_separation[i, j]:.2f} m; spread payload.anchors or raise cable.length or "
+                "cable.angle"
             )
 
 

@@ -143,7 +143,7 @@ def resolve_system(config: Config) -> System:
     n, payload, cable = config.env.num_drones, config.payload, config.cable
     vehicles = resolve_vehicles(config.vehicle, n)
     spans = np.array([vehicle.span for vehicle in vehicles])
-    scale = spans.max() / _FALCON.span
+    scale = mean(list(spans)) / _FALCON.span
     length = per_drone(standard_length(config, scale) if cable.length is None else cable.length, n, "cable.length")
     mesh = find_mesh(payload)
     anchors, size = place_anchors(config, n, length, scale, mesh)
