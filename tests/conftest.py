@@ -97,9 +97,14 @@ def level(vec: MultiliftVec) -> None:
     world.reset(mask(vec.num_envs, 0))
 
 
+def with_vehicle(system: System, **fields) -> System:
+    """Return the system with other numbers of all its vehicles."""
+    return replace(system, vehicles=tuple(replace(vehicle, **fields) for vehicle in system.vehicles))
+
+
 def without_drag(system: System, **vehicle) -> System:
     """Return the system without any drag; other properties of the vehicle by name."""
-    return replace(system, vehicle=replace(system.vehicle, drag=(0.0, 0.0, 0.0), **vehicle), payload_drag_area=0.0)
+    return replace(with_vehicle(system, drag=(0.0, 0.0, 0.0), **vehicle), payload_drag_area=0.0)
 
 
 def free_world(num_envs: int = 1, drag: bool = False, vehicle: dict | None = None, **overrides) -> World:

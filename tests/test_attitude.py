@@ -7,12 +7,13 @@ from math import pi
 
 import numpy as np
 import pytest
-from conftest import floats, make_system
+from conftest import floats, make_system, with_vehicle
 
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.vehicles import PRESETS, Vehicle
-from multilift_marl.control.allocation import allocate, allocation_matrix
-from multilift_marl.control.geometric import attitude_torque, desired_rates, make_gains
+from multilift_marl.control.allocation import allocate
+from multilift_marl.control.gains import drone_gains, make_gains
+from multilift_marl.control.geometric import attitude_torque, desired_rates
 from multilift_marl.math3d import axis_angle, thrust_frame
 from multilift_marl.sim import World
 
@@ -40,11 +41,11 @@ def random_rotation(rng, angle=2.5):
 def test_allocation_of_a_plus_quadrotor_is_equation_11():
     arm, ratio = PLUS.arm, PLUS.torque_ratio
     expected = [[1, 1, 1, 1], [0, arm, 0, -arm], [-arm, 0, arm, 0], [ratio, -ratio, ratio, -ratio]]
-    np.testing.assert_allclose(allocation_matrix(PLUS), expected, atol=1e-15)
+    np.testing.assert_allclose(PLUS.allocation, expected, atol=1e-15)
 
 
 def allocated(vehicle: Vehicle, thrust: float, torque, low: float = 0.0, high: float = 5.0) -> np.ndarray:
-    inverse = np.ascontiguousarray(np.linalg.inv(allocation_matrix(vehicle)))
+    inverse = np.ascontiguousarray(np.linalg.inv(vehicle.allocation))
     return np.array(allocate(float(thrust), floats(torque), inverse, low, high))
 
 
@@ -52,7 +53,7 @@ def allocated(vehicle: Vehicle, thrust: float, torque, low: float = 0.0, high: f
 @pytest.mark.parametrize("seed", SEEDS)
 def test_allocation_inverts_the_matrix_within_the_limits(vehicle, seed):
     rotors = np.random.default_rng(seed).uniform(0.1, 4.9, 4)
-    thrust, *torque = allocation_matrix(vehicle) @ rotors
+    thrust, *torque = vehicle.allocation @ rotors
     np.testing.assert_allclose(allocated(vehicle, thrust, torque), rotors, rtol=1e-9)
 
 
@@ -61,10 +62,10 @@ def test_allocation_inverts_the_matrix_within_the_limits(vehicle, seed):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_yaw_is_given_up_first_and_no_more_than_needed(vehicle, sign, seed):
     rotors = np.random.default_rng(seed).uniform(1.0, 4.0, 4)
-    thrust, roll, pitch, _ = allocation_matrix(vehicle) @ rotors
+    thrust, roll, pitch, _ = vehicle.allocation @ rotors
     asked = sign * 10.0
     given = allocated(vehicle, thrust, (roll, pitch, asked))
-    wrench = allocation_matrix(vehicle) @ given
+    wrench = vehicle.allocation @ given
     np.testing.assert_allclose(wrench[:3], [thrust, roll, pitch], rtol=1e-9, atol=1e-12)
     assert 0 <= wrench[3] / asked < 1
     assert np.isclose(given, 0.0).any() or np.isclose(given, 5.0).any()
@@ -116,7 +117,7 @@ def test_desired_rates_are_those_of_the_turning_thrust_frame(seed):
 
 @pytest.fixture(scope="module")
 def gains():
-    return make_gains(ControlConfig(), make_system(4))
+    return drone_gains(make_gains(ControlConfig(), make_system(4)), 0)
 
 
 def torque(rotation, rates, desired, desired_rate, gains) -> np.ndarray:
@@ -168,8 +169,8 @@ def test_attitude_torque_descends_the_error_function(gains, seed):
 @pytest.mark.parametrize("tau, expected", [(0.01, 20.0), (0.033, 20.0), (0.07, 10.0)])
 def test_attitude_is_no_faster_than_the_motors_allow(tau, expected):
     system = make_system(4)
-    system = replace(system, vehicle=replace(system.vehicle, rotor_time_constant_up=tau, rotor_time_constant_down=tau))
-    gains = make_gains(ControlConfig(attitude_frequency=20.0, attitude_damping=0.8), system)
+    system = with_vehicle(system, rotor_time_constant_up=tau, rotor_time_constant_down=tau)
+    gains = drone_gains(make_gains(ControlConfig(attitude_frequency=20.0, attitude_damping=0.8), system), 3)
     np.testing.assert_allclose(gains.k_R[:2], expected**2)
     np.testing.assert_allclose(gains.k_w[:2], 2 * 0.8 * expected)
 

@@ -12,7 +12,7 @@ from conftest import GRAVITY, make, refusal, same, zeros
 
 import multilift_marl as ml
 from multilift_marl.control.disturbance import Disturbance, make_rejection
-from multilift_marl.control.geometric import make_gains
+from multilift_marl.control.gains import make_gains
 
 KINDS = ("integral", "indi")
 RIGS = ("falcon4", "report4", "crazyflie2", "auto6")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import GRAVITY, make, make_system
 
-from multilift_marl.control.formation import Goal, Rig, place_formation
+from multilift_marl.control.formation import Goal, make_rig, place_formation
 from multilift_marl.control.scripted import INTEGRAL_GAIN, SCRIPTED, make_scripted
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import axis_angle, rot_z
@@ -18,7 +18,7 @@ def placed(system, yaw=0.0, tilt=None, position=(0.3, -0.2, 1.5)) -> Goal:
     goal = Goal.zeros(1, system.num_drones)
     rotation = np.reshape(rot_z(yaw), (3, 3))
     goal.position[0], goal.rotation[0] = position, rotation if tilt is None else tilt @ rotation
-    place_formation(0, goal, Rig(system.anchors, system.slots, system.slot_azimuth, system.formation_force))
+    place_formation(0, goal, make_rig(system))
     return goal
 
 

@@ -13,10 +13,12 @@ import multilift_marl as ml
 
 HOVER = """
 from multilift_marl.config.system import GRAVITY
-from multilift_marl.sim.rows import hover_drone
+import numpy as np
+from multilift_marl.sim.standing import Drones, hover_drone
 from multilift_marl.sim.state import SystemState
 state = SystemState.zeros(1, 1)
-hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, 1.0, 1.0)
+one = np.ones(1)
+hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, Drones(one, one, np.ones((1, 4, 4)), np.zeros((1, 3)), False))
 print((state.rotor_speed**2).sum() / GRAVITY)
 """
 
@@ -30,6 +32,8 @@ def test_no_compiled_kernel_outlives_a_constant_it_was_compiled_with(tmp_path):
         return float(told.stdout)
 
     assert weights_lifted() == pytest.approx(1)
-    constants = package / "config" / "system.py"
-    constants.write_text(constants.read_text(encoding="utf-8").replace("GRAVITY = 9.81", "GRAVITY = 3.71"))
+    constants = package / "config" / "vehicles.py"
+    source = constants.read_text(encoding="utf-8")
+    assert "GRAVITY = 9.81" in source
+    constants.write_text(source.replace("GRAVITY = 9.81", "GRAVITY = 3.71"))
     assert weights_lifted() == pytest.approx(1)

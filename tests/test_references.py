@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import pi
 
 import numpy as np
 import pytest
-from conftest import floats, make, make_system
+from conftest import floats, make, make_system, with_vehicle
 
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.formation import Reference, smooth, start_reference, wrap
-from multilift_marl.control.geometric import fly, make_gains
+from multilift_marl.control.gains import make_gains
+from multilift_marl.control.geometric import fly
 from multilift_marl.math3d import heading
 from multilift_marl.sim import World
 
@@ -87,7 +87,7 @@ def test_wrap(angle, expected):
 
 def test_a_free_drone_follows_its_reference_to_the_centimetre():
     system = make_system(1, **{"cable.length": 20.0})
-    system = replace(system, vehicle=replace(system.vehicle, drag=(0.0, 0.0, 0.0)))
+    system = with_vehicle(system, drag=(0.0, 0.0, 0.0))
     world, reference = World(system, 1, 1), Reference.zeros(1, 1)
     world.state.payload_position[:] = [0, 0, 0.075]
     world.state.drone_position[:] = [0, 0, 2.0]

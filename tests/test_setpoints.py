@@ -7,9 +7,9 @@ import pytest
 from conftest import GRAVITY, floats, free_world, load, make_system
 
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.control.allocation import allocation_matrix
 from multilift_marl.control.formation import Reference
-from multilift_marl.control.geometric import Gains, make_gains, rate_torque
+from multilift_marl.control.gains import Gains, drone_gains, make_gains
+from multilift_marl.control.geometric import rate_torque
 from multilift_marl.control.setpoints import (
     Setpoint,
     drift,
@@ -51,7 +51,10 @@ def fly_for(world: World, seconds: float, step, read) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_at_the_desired_rates_only_the_gyroscopic_torque_is_left(seed):
-    rates, gains = np.random.default_rng(seed).normal(size=3), make_gains(ControlConfig(), make_system(1))
+    rates, gains = (
+        np.random.default_rng(seed).normal(size=3),
+        drone_gains(make_gains(ControlConfig(), make_system(1)), 0),
+    )
     expected = np.cross(rates, gains.inertia * rates)
     assert np.abs(expected).max() > 1e-5
     np.testing.assert_allclose(rate_torque(floats(rates), floats(rates), gains), expected, atol=1e-15)
@@ -63,22 +66,22 @@ def test_a_step_of_the_body_rate_is_first_order(axis):
     rates, total = np.zeros((1, 1, 3)), np.full((1, 1), gains.mass * GRAVITY)
     rates[0, 0, axis] = 0.1
     seen = fly_for(
-        world, 0.3, lambda: fly_rates(0, 1, world.state, rates, total, world.thrust, gains),
+        world, 0.3, lambda: fly_rates(0, 1, world.state, rates, total, NO_PULL, world.thrust, gains),
         lambda: world.state.drone_body_rates[0, 0].copy(),
     )  # fmt: skip
     t = DT * np.arange(1, len(seen) + 1)
-    np.testing.assert_allclose(seen[:, axis], 0.1 * (1 - np.exp(-gains.k_w[axis] * t)), atol=0.03 * 0.1)
+    np.testing.assert_allclose(seen[:, axis], 0.1 * (1 - np.exp(-gains.k_w[0, axis] * t)), atol=0.03 * 0.1)
     assert np.abs(np.delete(seen, axis, axis=1)).max() < 1e-4
 
 
 def test_a_step_of_the_body_rate_with_motor_lag_is_second_order():
     tau = 0.033
     world, gains = quick_drone(rotor_time_constant_up=tau, rotor_time_constant_down=tau)
-    k = gains.k_w[0]
+    k = gains.k_w[0, 0]
     rates, total = np.zeros((1, 1, 3)), np.full((1, 1), gains.mass * GRAVITY)
     rates[0, 0, 0] = 0.05
     seen = fly_for(
-        world, 0.4, lambda: fly_rates(0, 1, world.state, rates, total, world.thrust, gains),
+        world, 0.4, lambda: fly_rates(0, 1, world.state, rates, total, NO_PULL, world.thrust, gains),
         lambda: world.state.drone_body_rates[0, 0, 0],
     )  # fmt: skip
     t, decay = DT * np.arange(1, len(seen) + 1), 0.5 / tau
@@ -90,9 +93,9 @@ def test_a_step_of_the_body_rate_with_motor_lag_is_second_order():
 def test_rates_and_thrust_give_up_yaw_first():
     world, gains = quick_drone()
     rates, total = np.array([[[1.0, -0.5, 30.0]]]), np.full((1, 1), gains.mass * GRAVITY)
-    fly_rates(0, 1, world.state, rates, total, world.thrust, gains)
-    given = allocation_matrix(world.system.vehicle) @ world.thrust[0, 0]
-    asked = np.array(rate_torque((0.0, 0.0, 0.0), floats(rates), gains))
+    fly_rates(0, 1, world.state, rates, total, NO_PULL, world.thrust, gains)
+    given = world.system.vehicle.allocation @ world.thrust[0, 0]
+    asked = np.array(rate_torque((0.0, 0.0, 0.0), floats(rates), drone_gains(gains, 0)))
     np.testing.assert_allclose(given[:3], [total[0, 0], *asked[:2]], rtol=1e-9)
     assert 0 < given[3] < 0.9 * asked[2]
     assert np.isclose(world.thrust, gains.thrust_max).any() or np.isclose(world.thrust, gains.thrust_min).any()
@@ -115,7 +118,10 @@ def test_a_step_of_the_attitude_is_second_order_with_the_configured_frequency_an
         return 0.5 * (r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1])[axis]
 
     seen = fly_for(
-        world, 8 / frequency, lambda: fly_attitude(0, 1, world.state, desired, rates, total, world.thrust, gains), angle
+        world,
+        8 / frequency,
+        lambda: fly_attitude(0, 1, world.state, desired, rates, total, NO_PULL, world.thrust, gains),
+        angle,
     )
     t, decay = DT * np.arange(1, len(seen) + 1), damping * frequency
     w = frequency * np.sqrt(1 - damping**2)
@@ -132,7 +138,7 @@ def test_a_turning_attitude_is_followed_without_lag():
 
     def step():
         desired[0, 0] = np.reshape(axis_angle((0.0, 0.0, 1.0), 0.4 * time[0]), (3, 3))
-        fly_attitude(0, 1, world.state, desired, rates, total, world.thrust, gains)
+        fly_attitude(0, 1, world.state, desired, rates, total, NO_PULL, world.thrust, gains)
         time[0] += DT
 
     turned = fly_for(world, 1.0, step, lambda: world.state.drone_rotation[0, 0].copy())

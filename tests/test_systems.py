@@ -9,8 +9,8 @@ import pytest
 from conftest import GRAVITY, make_system, refusal, refuse_system, refuse_task
 
 import multilift_marl as ml
+from multilift_marl.config.feasibility import MIN_THRUST_TO_WEIGHT
 from multilift_marl.config.rig import formation_forces
-from multilift_marl.config.system import MIN_THRUST_TO_WEIGHT
 from multilift_marl.config.vehicles import PRESETS
 
 # What is refused
@@ -46,7 +46,8 @@ def test_anchors_on_one_side_would_need_a_cable_that_pushes():
 def test_neighbours_too_close_at_rest(overrides):
     message = refuse_system(**overrides)
     assert re.match(
-        r"neighbouring drones would rest 0\.\d\d m apart, closer than .*0\.35 m; spread payload\.anchors", message
+        r"neighbouring drones \d+ and \d+ would rest 0\.\d\d m apart, closer than .*0\.35 m; spread payload\.anchors",
+        message,
     )
 
 
@@ -146,6 +147,6 @@ def test_formation_forces_balance_weight_and_moments_of_any_anchors(seed):
     rng = np.random.default_rng(seed)
     around = np.linspace(0, 2 * np.pi, 5, endpoint=False) + rng.uniform(-0.2, 0.2, 5)
     anchors = np.stack([0.4 * np.cos(around), 0.3 * np.sin(around), rng.uniform(-0.1, 0.1, 5)], axis=1)
-    force = formation_forces(anchors, 20.0, np.deg2rad(30), point=False)
+    force = formation_forces(anchors, 20.0, np.deg2rad(30), point=False, strength=np.ones(5))
     np.testing.assert_allclose(force.sum(axis=0), [0, 0, 20], atol=1e-9)
     np.testing.assert_allclose(np.cross(anchors, force).sum(axis=0), 0, atol=1e-9)

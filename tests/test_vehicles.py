@@ -11,9 +11,11 @@ import pytest
 from conftest import GRAVITY, floats, free_world, load, make_system, refuse_system
 
 from multilift_marl.config.schema import ControlConfig, VehicleConfig
-from multilift_marl.config.vehicles import PRESETS, resolve_vehicle
-from multilift_marl.control.allocation import allocate, allocation_matrix
-from multilift_marl.control.geometric import Gains, attitude_torque, make_gains
+from multilift_marl.config.teams import resolve_vehicles
+from multilift_marl.config.vehicles import PRESETS
+from multilift_marl.control.allocation import allocate
+from multilift_marl.control.gains import DroneGains, drone_gains, make_gains
+from multilift_marl.control.geometric import attitude_torque
 from multilift_marl.math3d import axis_angle
 
 NAMES = sorted(PRESETS)
@@ -21,8 +23,8 @@ LEVEL = floats(np.eye(3))
 STILL = (0.0, 0.0, 0.0)
 
 
-def gains_of(preset: str, **control) -> Gains:
-    return make_gains(ControlConfig(**control), make_system(1, **{"vehicle.preset": preset}))
+def gains_of(preset: str, **control) -> DroneGains:
+    return drone_gains(make_gains(ControlConfig(**control), make_system(1, **{"vehicle.preset": preset})), 0)
 
 
 # Presets
@@ -30,7 +32,7 @@ def gains_of(preset: str, **control) -> Gains:
 
 @pytest.mark.parametrize("preset", NAMES)
 def test_preset_passes_the_checks_of_ones_own_vehicle(preset):
-    assert resolve_vehicle(VehicleConfig(preset=preset)) == PRESETS[preset]
+    assert resolve_vehicles(VehicleConfig(preset=preset), 2) == (PRESETS[preset],) * 2
 
 
 @pytest.mark.parametrize(
@@ -187,7 +189,7 @@ def test_attitude_returns_from_20_degrees(preset, axis):
     world = free_world(**{"vehicle.preset": preset, "cable.length": 90.0})
     vehicle = world.system.vehicle
     gains = gains_of(preset)
-    inverse = np.ascontiguousarray(np.linalg.inv(allocation_matrix(vehicle)))
+    inverse = np.ascontiguousarray(np.linalg.inv(vehicle.allocation))
     tilt = np.deg2rad(20)
     world.state.drone_rotation[0, 0] = np.reshape(axis_angle(floats(np.eye(3)[axis]), tilt), (3, 3))
     load(world)

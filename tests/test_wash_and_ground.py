@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import log, pi, sqrt
 
 import numpy as np
 import pytest
-from conftest import GRAVITY, free_world, hover_thrust, load, make_system, refuse_system, same, steady, weightless
+from conftest import (
+    GRAVITY,
+    free_world,
+    hover_thrust,
+    load,
+    make_system,
+    refuse_system,
+    same,
+    steady,
+    weightless,
+    with_vehicle,
+)
 
 from multilift_marl.math3d import rot_z
 from multilift_marl.sim import World
@@ -147,25 +157,25 @@ def test_a_team_in_formation_hardly_blows_on_its_payload():
 @pytest.mark.parametrize("ratio", [0.6, 1.0, 3.0])
 def test_one_rotor_feels_the_ground_as_cheeseman_and_bennett_say(ratio):
     system = make_system(1)
-    c = make_air(replace(system, vehicle=replace(system.vehicle, arm=1e4)))
-    assert ground_gain(ratio * c.rotor_radius, c) == pytest.approx(1 / (1 - (1 / (4 * ratio)) ** 2), rel=1e-9)
+    c = make_air(with_vehicle(system, arm=1e4))
+    assert ground_gain(ratio * c.rotor_radius[0], 0, c) == pytest.approx(1 / (1 - (1 / (4 * ratio)) ** 2), rel=1e-9)
 
 
 @pytest.mark.parametrize("preset", ["falcon", "hummingbird"])
 def test_four_rotors_in_a_square_feel_the_ground_as_sanchez_cuevas_says(preset):
     c = make_air(make_system(1, **{"vehicle.preset": preset}))
-    r, d = c.rotor_radius, sqrt(2) * c.arm
+    r, d = c.rotor_radius[0], sqrt(2) * c.arm[0]
     for z in (r, 2 * r, 5 * r):
         images = (r / (4 * z)) ** 2 + r**2 * z / (d**2 + 4 * z**2) ** 1.5 + r**2 / 2 * z / (2 * d**2 + 4 * z**2) ** 1.5
-        assert ground_gain(z, c) == pytest.approx(1 / (1 - images), rel=1e-12)
+        assert ground_gain(z, 0, c) == pytest.approx(1 / (1 - images), rel=1e-12)
 
 
 def test_ground_effect_vanishes_with_height_and_is_bounded_below():
     for preset in ("falcon", "crazyflie", "crazyflie_id", "hummingbird", "iris"):
         c = make_air(make_system(1, **{"vehicle.preset": preset}))
-        gains = [ground_gain(z * c.rotor_radius, c) for z in (0.5, 1, 2, 4, 8, 16, 1000)]
+        gains = [ground_gain(z * c.rotor_radius[0], 0, c) for z in (0.5, 1, 2, 4, 8, 16, 1000)]
         assert gains == sorted(gains, reverse=True) and 1 < gains[-2] < 1.002 and abs(gains[-1] - 1) < 1e-6
-        assert gains[0] < 1.5 and ground_gain(-1.0, c) == ground_gain(0.0, c) == gains[0]
+        assert gains[0] < 1.5 and ground_gain(-1.0, 0, c) == ground_gain(0.0, 0, c) == gains[0]
 
 
 def test_ground_effect_lifts_and_strengthens_roll_but_not_yaw():
@@ -175,7 +185,7 @@ def test_ground_effect_lifts_and_strengthens_roll_but_not_yaw():
     load(world)
     thrust = np.array([1.4, 1.6, 1.5, 1.3])
     world.step(steady(world, thrust))
-    gain = ground_gain(height, make_air(world.system))
+    gain = ground_gain(height, 0, make_air(world.system))
     rise = gain * thrust.sum() / vehicle.mass - GRAVITY
     assert world.state.drone_velocity[0, 0, 2] == pytest.approx(0.004 * rise, rel=1e-6)
     lever = vehicle.arm / sqrt(2)

@@ -156,8 +156,8 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
         )
     if np.any(force[:, 2] < 0.02 * weight / n * strength):
         raise ConfigError(
-            f"payload.anchors: cable {int(force[:, 2].argmin())} would have to push; move the anchors around the "
-            "centre of mass"
+            f"payload.anchors: cable {int((force[:, 2] / strength).argmin())} would have to push; move the anchors "
+            f"around the centre of mass{'' if np.all(strength == 1) else ', or take drones of more equal lift'}"
         )
     return force
 

@@ -36,6 +36,7 @@ def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) 
     """Return one sentence for the first key that pydantic complains about."""
     section, path = _find_key(errors[0]["loc"], model)
     about = [error for error in errors if _find_key(error["loc"], model)[1] == path]
+    about = [error for error in about if error["type"] != "tuple_type"] or about  # those: a list of lists was tried
     error = max(about, key=lambda error: len(error["loc"]))  # the deepest: an element rather than its list
     key = ".".join(([prefix] if prefix else []) + path)
     source = f" (in {where})" if where.endswith((".yaml", ".yml")) else ""
