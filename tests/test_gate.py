@@ -45,7 +45,7 @@ def test_the_formation_hits_the_wall_where_it_stands():
     vec = reset(num_envs=8)
     seen = {}
     for _ in range(500):
-        _, _, terminated, truncated, info = vec.step(zeros(vec))
+        _, _, terminated, _, info = vec.step(zeros(vec))
         for e in np.flatnonzero(terminated):
             seen[e] = (vec.failure_causes[info["failure_cause"][e]], vec.world.state.drone_position[e].copy())
         if terminated.any():
