@@ -15,9 +15,10 @@ import numpy as np
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import GRAVITY
+from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import Goal, Reference, leave_goal, smooth, smooth_moving
 from multilift_marl.control.gains import Gains, drone_gains
-from multilift_marl.control.geometric import control, drive_rotors, fly, hook_moment
+from multilift_marl.control.geometric import control, fly, hook_moment
 from multilift_marl.control.setpoints import (
     STILL,
     Setpoint,
@@ -271,15 +272,14 @@ def _command_rotors(lo, hi, action, state, reference, pull, thrust, g):
     drift(lo, hi, state, reference, 0.0)
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            rotors, hover = thrust[e, n], _hover_thrust(e, n, pull, g)
-            for k in range(4):
-                rotors[k] = 0.25 * hover
+            total, yaw = _hover_thrust(e, n, pull, g), heading(mat(state.drone_rotation, e, n))
+            rotors = (0.25 * total, 0.25 * total, 0.25 * total, 0.25 * total)
             if g.hooked:
-                d, yaw = drone_gains(g, n), heading(mat(state.drone_rotation, e, n))
-                rest = thrust_frame(add(vec(pull, e, n), (0.0, 0.0, g.mass[n] * GRAVITY)), yaw)
-                drive_rotors(hover, STILL, hook_moment(rest, vec(pull, e, n), STILL, d), rotors, d)
+                d, rest = drone_gains(g, n), thrust_frame(add(vec(pull, e, n), (0.0, 0.0, g.mass[n] * GRAVITY)), yaw)
+                moment = hook_moment(rest, vec(pull, e, n), STILL, d)
+                rotors = allocate(total, moment, d.allocation, d.thrust_min, d.thrust_max)
             for k in range(4):
-                rotors[k] = _between(action[e, n, k], g.thrust_min[n], rotors[k], g.thrust_max[n])
+                thrust[e, n, k] = _between(action[e, n, k], g.thrust_min[n], rotors[k], g.thrust_max[n])
 
 
 ACTIONS: dict[str, type[Interface]] = {

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
+from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import smooth_yaw
 from multilift_marl.control.gains import drone_gains
 from multilift_marl.control.geometric import (
     desired_rates,
-    drive_rotors,
     follow_attitude,
     follow_force,
     hook_moment,
@@ -78,7 +78,9 @@ def fly_velocity(lo, hi, state, reference, pull, thrust, g):
             moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
             force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
-            follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, thrust[e, n], d)
+            rotors = follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, d)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
 
 
 @kernel
@@ -101,7 +103,9 @@ def fly_acceleration(lo, hi, state, reference, pull, thrust, g):
             force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, d)
             moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
-            follow_force(attitude, rates, force, STILL, yaw, yaw_rate, moment, thrust[e, n], d)
+            rotors = follow_force(attitude, rates, force, STILL, yaw, yaw_rate, moment, d)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
 
 
 @kernel
@@ -131,7 +135,9 @@ def fly_acc_rates(lo, hi, state, reference, rates, pull, thrust, g):
             desired_rate = (rates[e, n, 0], rates[e, n, 1], turning[2])
             total = max(dot(force, unit(column(attitude, 2))), 0.0)
             own = vec(state.drone_body_rates, e, n)
-            follow_attitude(attitude, own, desired, desired_rate, total, moment, thrust[e, n], d)
+            rotors = follow_attitude(attitude, own, desired, desired_rate, total, moment, d)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
 
 
 @kernel
@@ -151,7 +157,9 @@ def fly_attitude(lo, hi, state, attitude, rates, total, pull, thrust, g):
             own, own_rates = mat(state.drone_rotation, e, n), vec(state.drone_body_rates, e, n)
             desired, desired_rate, d = mat(attitude, e, n), vec(rates, e, n), drone_gains(g, n)
             moment = hook_moment(own, vec(pull, e, n), STILL, d)
-            follow_attitude(own, own_rates, desired, desired_rate, total[e, n], moment, thrust[e, n], d)
+            rotors = follow_attitude(own, own_rates, desired, desired_rate, total[e, n], moment, d)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
 
 
 @kernel
@@ -164,5 +172,8 @@ def fly_rates(lo, hi, state, rates, total, pull, thrust, g):
         for n in range(thrust.shape[1]):
             d = drone_gains(g, n)
             torque = rate_torque(vec(state.drone_body_rates, e, n), vec(rates, e, n), d)
-            moment = hook_moment(mat(state.drone_rotation, e, n), vec(pull, e, n), STILL, d)
-            drive_rotors(total[e, n], torque, moment, thrust[e, n], d)
+            if d.hooked:
+                torque = add(torque, hook_moment(mat(state.drone_rotation, e, n), vec(pull, e, n), STILL, d))
+            rotors = allocate(total[e, n], torque, d.allocation, d.thrust_min, d.thrust_max)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
