@@ -276,7 +276,7 @@ def _command_rotors(lo, hi, action, state, reference, pull, thrust, g):
             rotors = (0.25 * total, 0.25 * total, 0.25 * total, 0.25 * total)
             if g.hooked:
                 d, rest = drone_gains(g, n), thrust_frame(add(vec(pull, e, n), (0.0, 0.0, g.mass[n] * GRAVITY)), yaw)
-                moment = hook_moment(rest, vec(pull, e, n), STILL, d)
+                moment = hook_moment(n, rest, vec(pull, e, n), STILL, g)
                 rotors = allocate(total, moment, d.allocation, d.thrust_min, d.thrust_max)
             for k in range(4):
                 thrust[e, n, k] = _between(action[e, n, k], g.thrust_min[n], rotors[k], g.thrust_max[n])

@@ -61,8 +61,6 @@ class DroneGains(NamedTuple):
     thrust_max: float
     load_share: float
     drag: tuple[float, float, float]
-    hook: tuple[float, float, float]
-    hooked: bool
 
 
 @kernel
@@ -70,7 +68,7 @@ def drone_gains(g, n):
     """Return the DroneGains of drone n."""
     return DroneGains(
         g.mass[n], row(g.inertia, n), g.k_p[n], g.k_v[n], row(g.k_R, n), row(g.k_w, n), g.allocation[n],
-        g.thrust_min[n], g.thrust_max[n], g.load_share[n], row(g.drag, n), row(g.hooks, n), g.hooked,
+        g.thrust_min[n], g.thrust_max[n], g.load_share[n], row(g.drag, n),
     )  # fmt: skip
 
 

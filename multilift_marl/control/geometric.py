@@ -23,6 +23,7 @@ from multilift_marl.math3d import (
     matmul,
     mul,
     norm,
+    row,
     scale,
     sub,
     thrust_frame,
@@ -90,18 +91,19 @@ def rate_torque(rates, desired, g):
 
 
 @kernel
-def hook_moment(attitude, pull, acceleration, g):
+def hook_moment(n, attitude, pull, acceleration, g):
     """Return the moment of the cable about the drone's centre of mass that its rotors are to hold [N m].
 
     Args:
+        n: the drone.
         attitude: R, 9 numbers.
         pull: force that the drone exerts on its cable, at the hook [N].
         acceleration: of the set-point, which the load follows [m/s²].
-        g: DroneGains.
+        g: Gains.
     """
     if not g.hooked:
         return (0.0, 0.0, 0.0)
-    return cross(g.hook, tmul(attitude, add(pull, scale(g.load_share, acceleration))))
+    return cross(row(g.hooks, n), tmul(attitude, add(pull, scale(g.load_share[n], acceleration))))
 
 
 @kernel
@@ -129,8 +131,7 @@ def wanted_force(feedback, acceleration, velocity, pull, attitude, g):
 def follow_attitude(attitude, rates, desired, desired_rate, total, moment, g):
     """Return the four rotor thrusts [N] that turn R to R_d (see `attitude_torque`) and hold a `hook_moment` [N m]."""
     torque = attitude_torque(attitude, rates, desired, desired_rate, g)
-    if g.hooked:
-        torque = add(torque, moment)
+    torque = add(torque, moment)
     return allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
 
 
@@ -146,8 +147,7 @@ def follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, g):
     desired_rate = desired_rates(desired, force, force_rate, yaw, yaw_rate)
     total = max(dot(force, unit(column(attitude, 2))), 0.0)
     torque = attitude_torque(attitude, rates, desired, desired_rate, g)
-    if g.hooked:
-        torque = add(torque, moment)
+    torque = add(torque, moment)
     return allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
 
 
@@ -179,7 +179,7 @@ def fly(lo, hi, state, reference, pull, thrust, g):
             feedback = add(scale(d.k_p, position_error), scale(d.k_v, velocity_error))
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
             force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, d)
-            moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
+            moment = hook_moment(n, attitude, vec(pull, e, n), acceleration, g)
             force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
             rotors = follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, d)

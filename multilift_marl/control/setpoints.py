@@ -75,7 +75,7 @@ def fly_velocity(lo, hi, state, reference, pull, thrust, g):
             feedback = scale(d.k_v, sub(vec(state.drone_velocity, e, n), velocity))
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
             force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, d)
-            moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
+            moment = hook_moment(n, attitude, vec(pull, e, n), acceleration, g)
             force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
             rotors = follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, d)
@@ -101,7 +101,7 @@ def fly_acceleration(lo, hi, state, reference, pull, thrust, g):
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
             velocity, d = vec(reference.velocity, e, n), drone_gains(g, n)
             force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, d)
-            moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
+            moment = hook_moment(n, attitude, vec(pull, e, n), acceleration, g)
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
             rotors = follow_force(attitude, rates, force, STILL, yaw, yaw_rate, moment, d)
             for k in range(4):
@@ -128,7 +128,7 @@ def fly_acc_rates(lo, hi, state, reference, rates, pull, thrust, g):
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
             velocity, d = vec(reference.velocity, e, n), drone_gains(g, n)
             force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, d)
-            moment = hook_moment(attitude, vec(pull, e, n), acceleration, d)
+            moment = hook_moment(n, attitude, vec(pull, e, n), acceleration, g)
             yaw, yaw_rate = reference.yaw[e, n], reference.yaw_rate[e, n]
             desired = thrust_frame(force, yaw)
             turning = desired_rates(desired, force, STILL, yaw, yaw_rate)
@@ -156,7 +156,7 @@ def fly_attitude(lo, hi, state, attitude, rates, total, pull, thrust, g):
         for n in range(thrust.shape[1]):
             own, own_rates = mat(state.drone_rotation, e, n), vec(state.drone_body_rates, e, n)
             desired, desired_rate, d = mat(attitude, e, n), vec(rates, e, n), drone_gains(g, n)
-            moment = hook_moment(own, vec(pull, e, n), STILL, d)
+            moment = hook_moment(n, own, vec(pull, e, n), STILL, g)
             rotors = follow_attitude(own, own_rates, desired, desired_rate, total[e, n], moment, d)
             for k in range(4):
                 thrust[e, n, k] = rotors[k]
@@ -172,8 +172,8 @@ def fly_rates(lo, hi, state, rates, total, pull, thrust, g):
         for n in range(thrust.shape[1]):
             d = drone_gains(g, n)
             torque = rate_torque(vec(state.drone_body_rates, e, n), vec(rates, e, n), d)
-            if d.hooked:
-                torque = add(torque, hook_moment(mat(state.drone_rotation, e, n), vec(pull, e, n), STILL, d))
+            moment = hook_moment(n, mat(state.drone_rotation, e, n), vec(pull, e, n), STILL, g)
+            torque = add(torque, moment)
             rotors = allocate(total[e, n], torque, d.allocation, d.thrust_min, d.thrust_max)
             for k in range(4):
                 thrust[e, n, k] = rotors[k]
