@@ -109,7 +109,8 @@ def test_each_drone_of_a_mixed_team_moves_as_it_does_alone():
         system = make_system(len(names), **{"vehicle.preset": names}, **APART)
         world = World(system, 1, 1)
         world.state.payload_position[0] = [6, 40, 1]
-        world.state.drone_position[0] = places[chosen]
+        world.state.drone_position[0], world.state.drone_rotation[:] = places[chosen], np.eye(3)
+        world.state.rotor_speed[:] = 500.0
         load(world)
         world.step(thrust[chosen][None], 25)
         return world.state.drone_position[0], world.state.drone_rotation[0], world.state.rotor_speed[0]
@@ -128,7 +129,7 @@ def test_each_drone_blows_its_own_wash():
         world = World(system, 1, 1)
         world.state.drone_position[0] = [[50.0 * i, 0.0, 20.0] for i in range(len(names))]
         c, place = make_air(world.system), (50.0 * n + offset, 0.0, 19.0)
-        world.state.rotor_speed[:] = 700.0
+        world.state.rotor_speed[:], world.state.drone_rotation[:] = 700.0, np.eye(3)
         return wash_at(0, place, 0.05, world.state, c)
 
     for n, name in enumerate(names):
@@ -223,14 +224,17 @@ def test_each_vehicle_is_drawn_in_its_own_size():
         ({"vehicle.mass": [0.6, 3, 0.6, 0.6]}, r"drone 1: a falcon of vehicle\.mass=3 kg cannot lift itself"),
         ({"vehicle.preset": MIX, "payload.mass": 6}, r"2 × falcon, 1 × hummingbird, 1 × iris lift 92\.3 N, less than"),
         (
-            {"vehicle.preset": MIX, "payload.mass": 3.9},
+            {"vehicle.preset": MIX, "payload.mass": 4.2},
             r"drone \d would need \d+\.\d N of its \d+\.\d N to hover under",
         ),
         (
             {"vehicle.preset": ["crazyflie", *MIX[1:]]},
-            r"payload\.anchors: cable 0 .*, or take drones of more equal lift",
+            r"payload\.anchors: cable \d .*, or take drones of more equal lift",
         ),
-        ({"vehicle.preset": MIX, "cable.length": 0.4, "cable.angle": 0}, r"neighbouring drones \d and \d would rest"),
+        (
+            {"vehicle.preset": MIX, "cable.angle": 5, "payload.size": [0.3, 0.2, 0.1]},
+            r"neighbouring drones 2 and 3 would rest 0\.\d\d m apart, closer than the separation limit of 0\.69 m",
+        ),
     ],
 )
 def test_an_impossible_team_is_refused_by_name(overrides, complaint):
