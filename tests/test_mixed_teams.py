@@ -21,7 +21,7 @@ from multilift_marl.sim.scene import build_model, drone_half_size
 
 MIX = ["falcon", "falcon", "hummingbird", "iris"]
 ALL = sorted(PRESETS)
-POINT = {"payload.shape": "point", "payload.mass": 0.01, "cable.length": 90.0}
+POINT = {"payload.shape": "point", "payload.mass": 0.005, "cable.length": 90.0}
 APART = POINT | {"vehicle.rolling_moment": 1e-6, "wind.ground_effect": True}
 MODELS = ("massless", "chain")
 
@@ -233,7 +233,7 @@ def test_each_vehicle_is_drawn_in_its_own_size():
         ),
         (
             {"vehicle.preset": MIX, "cable.angle": 5, "payload.size": [0.3, 0.2, 0.1]},
-            r"neighbouring drones 2 and 3 would rest 0\.\d\d m apart, closer than the separation limit of 0\.69 m",
+            r"neighbouring drones 0 and 3 would rest 0\.\d\d m apart, closer than the separation limit of 0\.58 m",
         ),
     ],
 )
