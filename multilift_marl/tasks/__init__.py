@@ -5,8 +5,9 @@ from __future__ import annotations
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.hover import Hover
+from multilift_marl.tasks.pose import Pose
 
-TASKS: dict[str, type[Task]] = {"hover": Hover}
+TASKS: dict[str, type[Task]] = {"hover": Hover, "pose": Pose}
 
 
 def list_tasks() -> list[str]:
