@@ -24,7 +24,6 @@ from multilift_marl.math3d import (
     matrow,
     mul,
     put,
-    quat_to_mat,
     rotation_vector,
     row,
     scale,
@@ -39,47 +38,44 @@ if TYPE_CHECKING:
 
 
 class PayloadGains(NamedTuple):
-    """Gains of the payload's controller: accelerations that correct its errors."""
+    """Gains of the payload's controller: accelerations that correct its errors, and a lead.
 
-    position: tuple[float, float, float]
+    Those of attitude and rates are negative: what is commanded arrives about a third of a swing late, through the
+    smoothed reference and the drone, so that a push along an error comes as one against its rate (docs/control.md).
+    """
+
+    position: tuple[float, float, float] = (2.5, 2.5, 6.0)
     """k_x of each axis [1/s²]."""
-    velocity: tuple[float, float, float]
+    velocity: tuple[float, float, float] = (2.5, 2.5, 0.0)
     """k_v [1/s]."""
-    integral: tuple[float, float, float]
+    integral: tuple[float, float, float] = (8.5, 8.5, 20.0)
     """k_i [1/s³]."""
-    attitude: float
+    attitude: float = -15.0
     """k_R [1/s²]."""
-    rates: float
+    rates: float = -0.7
     """k_Ω [1/s]."""
-    attitude_integral: float
+    attitude_integral: float = 2.0
     """k_I [1/s³]."""
-    lead: float
-    """Of the commanded offsets, over 3/ω: 1 makes up for the delay of the smoothed reference, to first order [-]."""
+    lead: float = 0.6
+    """Of the offsets, over 3/ω: 1 makes up for the delay of the smoothed reference, to first order [-]."""
 
 
-GAINS = PayloadGains((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (3.6, 3.6, 14.0), 0.0, 0.0, 38.0, 1.0)
 MAX_FORCE = 0.5  # of the payload's weight, that corrects errors
 
 
 class PayloadGeometric:
     """Centralised: it reads the true state of payload and goal in `vec`, but neither masses nor forces that are hidden.
 
-    It has no memory: the integrals are the task's.
+    It flies about `task.way`, and remembers only its last offsets, for the lead: the integrals are the task's.
     """
 
-    def __init__(self, vec: MultiliftVec, gains: PayloadGains = GAINS):
-        self._vec, system = vec, vec.world.system
-        drone = make_gains(vec.config.control, system)
-        control = vec.config.control
-        self._numbers = (
-            drone.mass * drone.k_p,
-            gains.lead * 3.0 / control.reference_frequency / vec.task.dt,
-            control.max_offset,
-        )
-        w, x, y, z = (float(q) for q in system.payload_axes)
-        axes = np.reshape(quat_to_mat(w, x, y, z), (3, 3))
-        self._inertia = tuple(float(i) for i in ((axes * system.payload_inertia) @ axes.T).ravel())
-        self._gains = gains
+    def __init__(self, vec: MultiliftVec, gains: PayloadGains | None = None):
+        self._vec, system, control = vec, vec.world.system, vec.config.control
+        self._gains = PayloadGains() if gains is None else gains
+        drone = make_gains(control, system)
+        ahead = self._gains.lead * 3.0 / control.reference_frequency / vec.task.dt
+        self._numbers = (drone.mass * drone.k_p, ahead, control.max_offset)
+        self._inertia = system.inertia_matrix
         self._action = np.zeros((vec.num_envs, vec.num_drones, vec.action_size))
         self._pull, self._last = np.zeros((2, vec.num_envs, vec.num_drones, 3))
         self._fresh = np.ones(vec.num_envs, bool)
@@ -128,8 +124,11 @@ def _steer(
         inertia: of the payload in its frame, 9 numbers [kg m²].
         g: PayloadGains.
         stiffness: force of a drone for each metre from its reference [N/m].
+        ahead: lead of the offsets [policy steps].
         max_offset: of a full action [m].
         pull: (E, N, 3) written with the pulls that are wanted [N].
+        last: (E, N, 3) the last offsets, written [m].
+        fresh: (E,) bool, environments that have none; written.
         action: written.
     """
     mass = hanging.payload_mass

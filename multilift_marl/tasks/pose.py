@@ -13,7 +13,7 @@ from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import matmul, matrow, norm, put, quat_to_mat, rotation_vector, row, sub, transpose, turn
+from multilift_marl.math3d import matmul, matrow, norm, put, rotation_vector, row, sub, transpose, turn
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.observations import Component
@@ -76,9 +76,6 @@ class Pose(Task):
         way = Goal.zeros(e, world.num_drones)
         self.way = way._replace(slot_frame=self.goal.slot_frame)  # actions point as the observations do
         self._bounds = make_bounds(system, self.limits, 1 + config.randomization.payload_mass)
-        w, x, y, z = system.payload_axes
-        axes = np.reshape(quat_to_mat(float(w), float(x), float(y), float(z)), (3, 3))
-        self._inertia = tuple(float(i) for i in ((axes * system.payload_inertia) @ axes.T).ravel())
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw a level pose to start from and the targets; the team hangs there at rest; see `Task.start`."""
@@ -97,7 +94,7 @@ class Pose(Task):
         """Lead the way to each target in turn; see `Task.planner`."""
         return bind(
             lead, lo, hi, self.time, self.control_dt, self.plan, self.goal, self.way, self.rig, self.hanging,
-            self._inertia, self.world.state.payload_rotation, self._hold, self.options.way_seconds,
+            self.world.system.inertia_matrix, self.world.state.payload_rotation, self._hold, self.options.way_seconds,
         )  # fmt: skip
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
