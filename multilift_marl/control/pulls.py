@@ -37,13 +37,14 @@ def solve_pulls(force, moment, attitude, anchors, least, pull):
         What is left of F and M, the largest component [N], [N m]; of a moment that these cables cannot exert, most.
     """
     linear, angular = _STILL, _STILL
-    imbalance = np.inf
+    imbalance, exact = np.inf, 1e-13 * max(_largest(force), 1.0)
     for _ in range(_ITERATIONS):
         lacking, twisting, a, b, c = _balance(force, moment, attitude, anchors, least, pull, linear, angular)
         left = max(_largest(lacking), _largest(twisting))
-        if left >= 0.5 * imbalance and left <= imbalance:  # as good as it gets
-            break
+        stalled = abs(left - imbalance) < 0.01 * imbalance
         imbalance = left
+        if stalled or left <= exact:
+            break
         inverse = _inverse(a, _DAMPING * (a[0] + a[4] + a[8]))
         # a symmetric system in blocks: a Δλ + b Δμ = lacking, bᵀ Δλ + c Δμ = twisting
         through = matmul(transpose(b), inverse)
