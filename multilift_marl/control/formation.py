@@ -30,6 +30,10 @@ class Goal(NamedTuple):
     """(E,) heading that the drones are to have, the target's where a task does not say otherwise [rad]."""
     velocity: np.ndarray
     """(E, 3) of a target that moves, and of its slots [m/s]; zero otherwise, like the next ones."""
+    slot_velocity: np.ndarray
+    """(E, N, 3) of slots that move about their target [m/s]."""
+    slot_acceleration: np.ndarray
+    """(E, N, 3) likewise [m/s²]."""
     acceleration: np.ndarray
     """(E, 3) [m/s²]."""
     jerk: np.ndarray
@@ -42,7 +46,7 @@ class Goal(NamedTuple):
         """Return empty goals."""
         e, n = num_envs, num_drones
         placed = ((e, 3), (e, 3, 3), (e,), (e, n, 3), (e, n, 2), (e, n, 3), (e,))
-        return cls(*(np.zeros(shape) for shape in (*placed, (e, 3), (e, 3), (e, 3), (e,))))
+        return cls(*(np.zeros(shape) for shape in (*placed, (e, 3), (e, n, 3), (e, n, 3), (e, 3), (e, 3), (e,))))
 
 
 class Rig(NamedTuple):
@@ -154,8 +158,10 @@ def leave_goal(lo, hi, reference, goal):
         velocity, acceleration = row(goal.velocity, e), row(goal.acceleration, e)
         for n in range(reference.yaw.shape[1]):
             put(reference.position[e, n], sub(vec(reference.position, e, n), vec(goal.slots, e, n)))
-            put(reference.velocity[e, n], sub(vec(reference.velocity, e, n), velocity))
-            put(reference.acceleration[e, n], sub(vec(reference.acceleration, e, n), acceleration))
+            own = add(velocity, vec(goal.slot_velocity, e, n))
+            put(reference.velocity[e, n], sub(vec(reference.velocity, e, n), own))
+            own = add(acceleration, vec(goal.slot_acceleration, e, n))
+            put(reference.acceleration[e, n], sub(vec(reference.acceleration, e, n), own))
             reference.yaw[e, n] -= goal.drone_yaw[e]
             reference.yaw_rate[e, n] -= goal.drone_yaw_rate[e]
 
@@ -171,8 +177,10 @@ def smooth_moving(lo, hi, reference, goal, frequency, speed, dt):
     for e in range(lo, hi):
         velocity, acceleration, jerk = row(goal.velocity, e), row(goal.acceleration, e), row(goal.jerk, e)
         for n in range(reference.yaw.shape[1]):
-            put(reference.velocity[e, n], add(vec(reference.velocity, e, n), velocity))
-            put(reference.acceleration[e, n], add(vec(reference.acceleration, e, n), acceleration))
+            own = add(velocity, vec(goal.slot_velocity, e, n))
+            put(reference.velocity[e, n], add(vec(reference.velocity, e, n), own))
+            own = add(acceleration, vec(goal.slot_acceleration, e, n))
+            put(reference.acceleration[e, n], add(vec(reference.acceleration, e, n), own))
             put(reference.jerk[e, n], add(vec(reference.jerk, e, n), jerk))
             reference.yaw_rate[e, n] += goal.drone_yaw_rate[e]
 

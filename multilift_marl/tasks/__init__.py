@@ -5,8 +5,10 @@ from __future__ import annotations
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.hover import Hover
+from multilift_marl.tasks.land import Land
+from multilift_marl.tasks.takeoff import Takeoff
 
-TASKS: dict[str, type[Task]] = {"hover": Hover}
+TASKS: dict[str, type[Task]] = {"hover": Hover, "land": Land, "takeoff": Takeoff}
 
 
 def list_tasks() -> list[str]:

@@ -27,7 +27,7 @@ from multilift_marl.math3d import (
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.starts import hang_team, in_ball
-from multilift_marl.tasks.terms import tolerance
+from multilift_marl.tasks.terms import mean_change, pay_pose
 
 
 class HoverOptions(Section):
@@ -77,7 +77,7 @@ class Hover(Task):
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
         success = (self.options.success_distance, radians(self.options.success_angle))
         return bind(
-            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights, success, self.dt,
+            _score, lo, hi, self.world.state, self.goal, self.errors, action, previous, self.weights, success, self.dt,
             self.terms, self.good_time,
         )  # fmt: skip
 
@@ -116,20 +116,9 @@ def _start(e, rng, state, goal, rig, ranges, hanging, mass):
 
 
 @kernel
-def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms, good_time):
+def _score(lo, hi, state, goal, errors, action, previous, weights, success, dt, terms, good_time):
     for e in range(lo, hi):
-        distance, angle = errors.distance[e], errors.angle[e]
-        speed = norm((state.payload_velocity[e, 0], state.payload_velocity[e, 1], state.payload_velocity[e, 2]))
-        spin = norm((state.payload_body_rates[e, 0], state.payload_body_rates[e, 1], state.payload_body_rates[e, 2]))
-        change, count = 0.0, action.shape[1] * action.shape[2]
-        for n in range(action.shape[1]):
-            for k in range(action.shape[2]):
-                change += (action[e, n, k] - previous[e, n, k]) ** 2
-        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
-        terms[e, 1] = weights[1] * tolerance(distance, 0.01)
-        terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
-        terms[e, 3] = weights[3] * tolerance(angle, radians(1.0))
-        terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
-        terms[e, 5] = weights[5] * change / count
-        good = distance <= success[0] and angle <= success[1]
+        pay_pose(e, state, goal, errors, 1.0, weights, terms)
+        terms[e, 5] = weights[5] * mean_change(e, action, previous)
+        good = errors.distance[e] <= success[0] and errors.angle[e] <= success[1]
         good_time[e] = good_time[e] + dt if good else 0.0

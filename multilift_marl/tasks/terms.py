@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import radians
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,16 @@ from multilift_marl.math3d import clip, matmul, matrow, norm, put, rotation_vect
 def tolerance(value, margin):
     """Return 1 at value 0, falling with a long tail: 1/2 at `margin`, 1/10 at three times the margin."""
     return 1.0 / (1.0 + (value / margin) ** 2)
+
+
+@kernel
+def mean_change(e, action, previous):
+    """Return the mean square of how an action (E, N, A) of environment e differs from the last one."""
+    change, count = 0.0, action.shape[1] * action.shape[2]
+    for n in range(action.shape[1]):
+        for k in range(action.shape[2]):
+            change += (action[e, n, k] - previous[e, n, k]) ** 2
+    return change / count
 
 
 class Errors(NamedTuple):
@@ -53,3 +64,19 @@ def measure(lo, hi, state, goal, errors, dt, largest):
             errors.position_integral[e, j] = clip(moved, -largest, largest)
             moved = errors.rotation_integral[e, j] + dt * errors.rotation[e, j]
             errors.rotation_integral[e, j] = clip(moved, -largest, largest)
+
+
+@kernel
+def pay_pose(e, state, goal, errors, share, weights, terms):
+    """Write the first five reward terms of environment e, those of a payload that is to be at its target.
+
+    They are position, precision, attitude, level and stillness, each times its weight and `share`.
+    """
+    distance, angle = errors.distance[e], errors.angle[e]
+    speed = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
+    spin = norm(row(state.payload_body_rates, e))
+    terms[e, 0] = weights[0] * tolerance(distance, 0.25) * share
+    terms[e, 1] = weights[1] * tolerance(distance, 0.01) * share
+    terms[e, 2] = weights[2] * tolerance(angle, radians(6.0)) * share
+    terms[e, 3] = weights[3] * tolerance(angle, radians(1.0)) * share
+    terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3) * share
