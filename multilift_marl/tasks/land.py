@@ -94,11 +94,11 @@ class Land(Task):
         super().__init__(config, world, reference)
         e, system, option = world.num_envs, world.system, self.options
         self._ground = make_ground(system)
-        size, weight = self._ground.size, self._ground.rope
-        half = float(norm(tuple(drone_half_size(system.vehicle))))
+        size, rope, half = self._ground.size, self._ground.rope, drone_half_size(system.vehicle)
         self._down = Down(
-            option.pad_radius, option.touch_speed, option.clearance * size, half, weight, system.resting_tension
-        )
+            option.pad_radius, option.touch_speed, option.clearance * size, float(np.linalg.norm(half)), rope,
+            system.resting_tension,
+        )  # fmt: skip
         self.way, self.touch = np.zeros((e, 3)), np.zeros(e, np.int64)
         self.speed, self.share = np.zeros(e), np.zeros(e)
 

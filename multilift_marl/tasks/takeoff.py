@@ -31,9 +31,9 @@ from multilift_marl.tasks.ground import (
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.terms import mean_change, pay_pose
 
-RISE, TIGHTEN, PULL, LIFT = (0.1, 1.7), (1.8, 1.0), (2.8, 1.2), (4.0, 2.6)  # begin and length of each phase [s]
+RISE, TIGHTEN, PULL, LIFT = (0.1, 1.6), (1.7, 1.2), (2.9, 1.2), (4.1, 2.5)  # begin and length of each phase [s]
 ARRIVED = LIFT[0] + LIFT[1]  # [s] from when on the target stays
-SLACK, TAUT = 0.008, 0.004  # of a cable's length: short of taut after the rise, beyond taut before the pull
+SLACK, TAUT = 0.006, 0.002  # of a cable's length: short of taut after the rise, beyond taut before the pull
 STANDING, FLYING, LIFTED = range(3)
 FORGIVEN = (forgive(GROUND, LOAD_GROUND, BELOW, CABLE), forgive(LOAD_GROUND), 0)
 _CLEAR = 0.1  # [m] of every drone above its anchor that counts as flying, for the span of a falcon
@@ -146,18 +146,18 @@ def _plan(lo, hi, dt, time, place, stand, stage, share, peak, state, goal, rig, 
         rest_goal(e, goal, row(place, e))
         move_goal(e, goal, (0.0, 0.0, climb), ease(t, LIFT[0], LIFT[1]))
         place_formation(e, goal, rig)
-        pull, risen, tight = ease(t, PULL[0], PULL[1])[0], ease(t, RISE[0], RISE[1]), ease(t, TIGHTEN[0], TIGHTEN[1])
-        share[e] = pull
+        pull, risen, tight = ease(t, PULL[0], PULL[1]), ease(t, RISE[0], RISE[1]), ease(t, TIGHTEN[0], TIGHTEN[1])
+        share[e] = pull[0]
         for n in range(rig.slots.shape[0]):
             chord = cable_chord(e, n, goal, rig)
-            reach = -SLACK + (SLACK + TAUT) * tight[0] - TAUT * pull
+            reach = -SLACK + (SLACK + TAUT) * tight[0] - TAUT * pull[0]
             slot = add(vec(goal.slots, e, n), scale(reach, chord))
             under = sub(vec(stand, e, n), add(vec(goal.slots, e, n), scale(-SLACK, chord)))
             put(goal.slots[e, n], add(slot, _way(under, 1.0 - risen[0] ** 2, 1.0 - risen[0])))
             put(goal.slot_velocity[e, n], _way(under, -2.0 * risen[0] * risen[1], -risen[1]))
             curved = risen[1] ** 2 + risen[0] * risen[2]
             put(goal.slot_acceleration[e, n], _way(under, -2.0 * curved, -risen[2]))
-            share_pull(e, n, goal, pull, rig, ground.rope[n])
+            share_pull(e, n, goal, share[e], rig, ground.rope[n])
             peak[e] = max(peak[e], state.cable_tension[e, n] / static[n])
         stage[e] = _stage(e, stage[e], state, rig, limits, ground.size)
         watch.forgiven[e] = FORGIVEN[stage[e]]
