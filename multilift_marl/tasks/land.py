@@ -238,7 +238,8 @@ def _score(
     lo, hi, state, goal, errors, way, share, limits, down, action, previous, weights, dt, terms, good_time
 ):  # fmt: skip
     for e in range(lo, hi):
-        pay_pose(e, state, goal, errors, share[e], weights, terms)
+        near = tolerance(errors.distance[e], 0.5)  # a payload that lies still elsewhere earns little
+        pay_pose(e, state, goal, errors, share[e] * near, weights, terms)
         loose, good, count = 0.0, off_pad(e, way, state) <= down.radius, goal.slots.shape[1]
         for n in range(count):
             excess = max(state.cable_tension[e, n] - down.slack[n], 0.0)

@@ -29,15 +29,15 @@ from multilift_marl.tasks.ground import (
     standing_distance,
 )
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.terms import mean_change, pay_pose
+from multilift_marl.tasks.terms import mean_change, pay_pose, tolerance
 
 RISE, TIGHTEN, PULL, LIFT = (0.1, 1.6), (1.7, 1.2), (2.9, 1.2), (4.1, 2.5)  # begin and length of each phase [s]
 ARRIVED = LIFT[0] + LIFT[1]  # [s] from when on the target stays
 SLACK, TAUT = 0.006, 0.002  # of a cable's length: short of taut after the rise, beyond taut before the pull
 STANDING, FLYING, LIFTED = range(3)
-FORGIVEN = (forgive(GROUND, LOAD_GROUND, BELOW, CABLE), forgive(LOAD_GROUND), 0)
-_CLEAR = 0.1  # [m] of every drone above its anchor that counts as flying, for the span of a falcon
-_LIFTED = 0.02  # [m] of the payload's lowest point, likewise
+FORGIVEN = (forgive(GROUND, LOAD_GROUND, BELOW, CABLE), forgive(LOAD_GROUND, CABLE), 0)
+_HALF_WAY = 0.5  # of the formation's height: every drone that far above its anchor, and the team counts as flying
+_LIFTED = 0.02  # [m] of the payload's lowest point above the ground, for the span of a falcon
 _HARMLESS = 1.5  # times the resting tension that costs nothing
 
 
@@ -175,7 +175,7 @@ def _stage(e, stage, state, rig, limits, size):
     payload, attitude = row(state.payload_position, e), matrow(state.payload_rotation, e)
     if stage == STANDING:
         for n in range(rig.slots.shape[0]):
-            if cable_rise(e, n, state, rig) < _CLEAR * size:
+            if cable_rise(e, n, state, rig) < _HALF_WAY * (rig.slots[n, 2] - rig.anchors[n, 2]):
                 return STANDING
         return FLYING
     if stage == FLYING and payload_height(payload, attitude, limits) > _LIFTED * size:
@@ -197,7 +197,8 @@ def _score(
     lo, hi, state, goal, errors, time, share, peak, action, previous, weights, success, dt, terms, good_time
 ):  # fmt: skip
     for e in range(lo, hi):
-        pay_pose(e, state, goal, errors, share[e], weights, terms)
+        near = tolerance(errors.distance[e], 0.5)  # a payload that lies still elsewhere earns little
+        pay_pose(e, state, goal, errors, share[e] * near, weights, terms)
         terms[e, 5] = weights[5] * (1.0 - share[e]) * mean_slot_tolerance(e, state, goal, 0.1)
         terms[e, 6] = weights[6] * clip(peak[e] - _HARMLESS, 0.0, 1.0)
         terms[e, 7] = weights[7] * mean_change(e, action, previous)
