@@ -11,11 +11,8 @@ import pytest
 from conftest import GRAVITY, make, refusal, same, zeros
 
 import multilift_marl as ml
-from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
-from multilift_marl.control.formation import Reference
-from multilift_marl.control.geometric import fly, make_gains
-from multilift_marl.sim import World
-from multilift_marl.sim.world import REST_HEIGHT
+from multilift_marl.control.disturbance import Disturbance, make_rejection
+from multilift_marl.control.geometric import make_gains
 
 KINDS = ("integral", "indi")
 RIGS = ("falcon4", "report4", "crazyflie2", "auto6")
@@ -29,42 +26,14 @@ def load_bench():
     return module
 
 
-class Flight:
-    """Teams of a rig that are to hold their formation, or to follow `reference`."""
-
-    def __init__(self, config: str, kind: str, num_envs: int = 1, **overrides):
-        settings = ml.load_config(config, {"control.disturbance": kind, **overrides})
-        self.system, self.dt = settings.system, 1 / settings.sim.control_hz
-        e, n = num_envs, self.system.num_drones
-        self.world, self.reference = World(self.system, e, 1), Reference.zeros(e, n)
-        self.gains = make_gains(settings.control, self.system)
-        self.rejection = make_rejection(settings.control, self.system, self.gains, self.dt)
-        self.disturbance = Disturbance.zeros(e, n)
-        self.pull = np.broadcast_to(self.system.drone_pull, (e, n, 3)).copy()
-        self.reference.position[:] = self.system.slots + [0, 0, REST_HEIGHT]
-        self.begin()
-        self.kind = kind
-
-    def reject(self):
-        known, own = (self.world.state, self.reference, self.pull), (self.disturbance, self.gains, self.rejection)
-        REJECTIONS[self.kind](0, self.world.num_envs, *known, *own)
-
-    def begin(self):
-        self.world.load(np.ones(self.world.num_envs, bool))
-        for e in range(self.world.num_envs):
-            forget(e, self.world.state, self.disturbance, self.rejection.thrust_coefficient)
-
-    def step(self):
-        self.reject()
-        pull, thrust = self.disturbance.pull, self.world.thrust
-        fly(0, self.world.num_envs, self.world.state, self.reference, pull, thrust, self.gains)
-        self.world.step(thrust, self.system.control_interval)
+bench = load_bench()
 
 
-def windy(kind: str, wind: float = 3.0, **overrides) -> Flight:
+def windy(kind: str, wind: float = 3.0, **overrides) -> bench.Flight:
     """Return one falcon with a payload of 1 g, in wind: all that pushes it is its own drag."""
     light = {"env.num_drones": 1, "payload.shape": "point", "payload.mass": 1e-3, "payload.drag_area": 0.0}
-    flight = Flight("hover", kind, **light, **overrides)
+    config = ml.load_config("hover", light | {"control.disturbance": kind} | overrides)
+    flight = bench.Flight(config, np.ones(1))
     flight.world.plant.wind[:] = [wind, 0, 0]
     return flight
 
@@ -98,7 +67,7 @@ def test_indi_sees_a_force_through_a_first_order_filter_however_the_drone_moves(
         error = np.linalg.norm(flight.disturbance.force[0, 0] - filtered)
         largest = max(largest, error)
     assert np.linalg.norm(filtered) > 0.9
-    assert largest < 0.04 * np.linalg.norm(filtered)
+    assert largest < 0.02 * np.linalg.norm(filtered)
 
 
 def test_what_is_fed_forward_is_no_disturbance():
@@ -113,6 +82,19 @@ def test_what_is_fed_forward_is_no_disturbance():
         largest = max(largest, np.abs(flight.disturbance.force).max())
     assert flight.world.state.drone_velocity[0, 0, 0] > 0.8
     assert largest < 0.1 * flight.gains.mass  # of the 1 m/s² flown
+
+
+def test_a_nominal_load_that_is_lifted_is_no_disturbance():
+    flight = bench.Flight(ml.load_config("rigs/falcon4", {"control.disturbance": "indi"}), np.ones(1))
+    reference, largest = flight.reference, 0.0
+    for k in range(500):
+        t = k * flight.dt
+        reference.position[..., 2] = flight.slots[:, 2] + 1 - np.cos(t)  # accelerates by cos t
+        reference.velocity[..., 2], reference.acceleration[..., 2] = np.sin(t), np.cos(t)
+        reference.jerk[..., 2] = -np.sin(t)
+        flight.step()
+        largest = max(largest, np.abs(flight.disturbance.force[..., 2]).max())
+    assert largest < 0.15 * flight.gains.load_share.max()  # of the 1 m/s² flown
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -156,35 +138,13 @@ def test_the_bandwidth_leaves_room_for_load_and_position_loop(kind):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("rig", RIGS)
 def test_a_swinging_payload_of_another_mass_comes_to_rest(rig, kind):
-    flight = Flight(f"rigs/{rig}", kind, num_envs=6)
-    state, system = flight.world.state, flight.system
-    mass = system.payload_mass * np.array([0.8, 1.0, 1.2, 0.8, 1.0, 1.2])
-    flight.world.set_payload_mass(np.ones(6, bool), mass)
-    state.payload_velocity[:3, 0] = state.payload_velocity[3:, 1] = 0.3
-    if system.payload_shape != "point":
-        state.payload_body_rates[:3, 2] = state.payload_body_rates[3:, 0] = 0.3
-    flight.begin()
-
-    def motion(seconds):
-        most = np.zeros(6)
-        for _ in range(round(seconds / flight.dt)):
-            flight.step()
-            speed = np.linalg.norm(state.payload_velocity, axis=1) + np.linalg.norm(state.drone_velocity, axis=2).max(1)
-            most = np.maximum(most, speed)
-        return most
-
-    motion(4.0)
-    early = motion(3.0)
-    motion(8.0)
-    assert (motion(3.0) < np.maximum(0.5 * early, 1e-3)).all()
-    error = np.linalg.norm(state.drone_position - flight.reference.position, axis=2)
-    assert error.max() < 0.01
+    decay = bench.swing_decay(ml.load_config(f"rigs/{rig}", {"control.disturbance": kind}), seconds=10.0)
+    assert decay.min() > 0.07  # report4 damps its swing by no more without any rejection
 
 
 @pytest.mark.parametrize("rate", [0.2, 0.4])
 @pytest.mark.parametrize("rig", ["falcon4", "report4"])
 def test_drones_stay_within_3_cm_on_the_circle_in_wind_and_gusts(rig, rate):
-    bench = load_bench()
     config = ml.load_config(f"rigs/{rig}", {"control.drag_feedforward": True, "control.disturbance": "indi"})
     drones, _ = bench.fly_cases(config, rate, seconds=6.0)
     assert drones.max() < 0.03

@@ -9,7 +9,7 @@ import pytest
 from conftest import free_world, hover_thrust, make, make_system, mask, same, weightless, zeros
 
 from multilift_marl.sim import Air, World
-from multilift_marl.sim.air import advance_turbulence, dryden, gust_share, start_turbulence, turbulence
+from multilift_marl.sim.gusts import advance_turbulence, dryden, gust_share, start_turbulence, turbulence
 from multilift_marl.validation.air import COMPONENTS, correlation, sample_turbulence, spectrum
 
 WINDY = {"wind.velocity": [4.0, -3.0, 0.0], "wind.turbulence": True}
@@ -129,6 +129,11 @@ def test_a_reset_world_starts_its_turbulence_anew_and_a_seed_changes_it():
     other.reset()
     other.seed_turbulence(1, np.random.SeedSequence(7))
     assert not same(other.air.filter[1], World(system, 3, 1, seed=1).air.filter[1])
+
+
+def test_a_negative_seed_is_refused():
+    with pytest.raises(ValueError, match="seed=-1 must be at least 0"):
+        World(make_system(1), 1, 1, seed=-1)
 
 
 # Episodes

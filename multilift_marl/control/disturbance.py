@@ -30,8 +30,6 @@ class Disturbance(NamedTuple):
     """(E, N, 3) estimated force that the drone has to overcome beside the nominal ones, world frame [N]."""
     velocity: np.ndarray
     """(E, N, 3) of the drone one control step ago [m/s]."""
-    rotors: np.ndarray
-    """(E, N, 3) force of its rotors then, world frame [N]."""
     pull: np.ndarray
     """(E, N, 3) nominal pull and estimate: what the drone flies with [N]."""
 
@@ -78,12 +76,11 @@ def rotor_force(e, n, state, thrust_coefficient):
 
 
 @kernel
-def forget(e, state, disturbance, thrust_coefficient):
+def forget(e, state, disturbance):
     """Let the estimates of environment e start anew."""
     for n in range(disturbance.force.shape[1]):
         disturbance.force[e, n] = 0.0
         put(disturbance.velocity[e, n], vec(state.drone_velocity, e, n))
-        put(disturbance.rotors[e, n], rotor_force(e, n, state, thrust_coefficient))
 
 
 @kernel
@@ -133,13 +130,11 @@ def estimate_force(lo, hi, state, reference, pull, disturbance, g, c):
             told = add(add(nominal, drag), scale(g.load_share[n], vec(reference.acceleration, e, n)))
             moved = scale(g.mass / c.dt, sub(velocity, vec(disturbance.velocity, e, n)))
             used = add(moved, (0.0, 0.0, g.mass * GRAVITY))
-            mean = scale(0.5, add(rotors, vec(disturbance.rotors, e, n)))
             before = vec(disturbance.force, e, n)
-            gap = sub(sub(sub(mean, used), told), before)
+            gap = sub(sub(sub(rotors, used), told), before)
             force = limit(add(before, scale(c.share, gap)), c.largest)
             put(disturbance.force[e, n], force)
             put(disturbance.velocity[e, n], velocity)
-            put(disturbance.rotors[e, n], rotors)
             put(disturbance.pull[e, n], add(nominal, force))
 
 

@@ -41,6 +41,7 @@ class Task:
         REWARD: default weight of every reward term; `reward.<term>` overrides.
         EXTRA: what its observations have beside the common components.
         EXTRA_STATE: how many numbers it adds to the global state.
+        RMSE_AFTER: time from which `payload_rmse_m` counts [s].
         KEPT: names of further arrays, environment first, that outlive a step.
 
     Attributes:
@@ -58,6 +59,7 @@ class Task:
     REWARD: ClassVar[dict[str, float]] = {}
     EXTRA: ClassVar[tuple[Component, ...]] = ()
     EXTRA_STATE: ClassVar[int] = 0
+    RMSE_AFTER: ClassVar[float] = 0.0
     KEPT: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: Config, world: World, reference: Reference):

@@ -4,29 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import radians
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section
-from multilift_marl.control.formation import Reference, place_formation
+from multilift_marl.control.formation import Reference
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import (
-    add,
-    axis_angle,
-    matmul,
-    matrow,
-    norm,
-    put,
-    putmat,
-    rot_z,
-    scale,
-)
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.starts import hang_team, in_ball
+from multilift_marl.tasks.starts import StartRanges, start_near_target
 from multilift_marl.tasks.terms import mean_change, pay_pose
 
 
@@ -71,7 +60,7 @@ class Hover(Task):
             option.target_xy, *option.target_height, radians(option.target_yaw),
             option.start_radius, radians(option.start_tilt), option.start_speed,
         )  # fmt: skip
-        _start(env, rng, self.world.state, self.goal, self.rig, ranges, self.hanging, mass)
+        start_near_target(env, rng, self.world.state, self.goal, self.rig, ranges, self.hanging, mass)
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
@@ -84,35 +73,6 @@ class Hover(Task):
     def succeeded(self) -> np.ndarray:
         """Within the success region throughout the last seconds."""
         return self.good_time >= self._success_seconds - 1e-9
-
-
-class StartRanges(NamedTuple):
-    """HoverOptions of the start, in SI units."""
-
-    xy: float
-    low: float
-    high: float
-    yaw: float
-    radius: float
-    tilt: float
-    speed: float
-
-
-@kernel
-def _start(e, rng, state, goal, rig, ranges, hanging, mass):
-    x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
-    put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))
-    putmat(goal.rotation[e], rot_z(rng.uniform(-ranges.yaw, ranges.yaw)))
-    place_formation(e, goal, rig)
-    moved = in_ball(rng, ranges.radius)
-    axis = in_ball(rng, 1.0)
-    tilt = axis_angle(scale(1.0 / max(norm(axis), 1e-9), axis), rng.uniform(0.0, ranges.tilt))
-    velocity = in_ball(rng, ranges.speed)
-    payload = add((goal.position[e, 0], goal.position[e, 1], goal.position[e, 2]), moved)
-    attitude = matrow(goal.rotation, e)
-    if np.any(rig.anchors != 0.0):  # a point has no attitude: it counts as aligned
-        attitude = matmul(tilt, attitude)
-    hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, moved)
 
 
 @kernel

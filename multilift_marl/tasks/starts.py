@@ -9,7 +9,8 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.math3d import add, heading, matrow, mul, norm, put, putmat, scale, sub, vec
+from multilift_marl.control.formation import place_formation
+from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
 from multilift_marl.sim.cables import cable_end
 from multilift_marl.sim.rows import hover_drone
 
@@ -81,6 +82,34 @@ def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, m
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
         pull = add(scale(tension, direction), half)
-        hover_drone(
-            e, n, state, pull, heading(matrow(goal.rotation, e)), hanging.drone_mass, hanging.thrust_coefficient
-        )
+        hover_drone(e, n, state, pull, goal.drone_yaw[e], hanging.drone_mass, hanging.thrust_coefficient)
+
+
+class StartRanges(NamedTuple):
+    """How far a team may be from a target, and that from the origin."""
+
+    xy: float
+    low: float
+    high: float
+    yaw: float
+    radius: float
+    tilt: float
+    speed: float
+
+
+@kernel
+def start_near_target(e, rng, state, goal, rig, ranges, hanging, mass):
+    """Draw a target, and a team in hanging equilibrium there, then moved, tilted and set in motion as one."""
+    x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
+    put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))
+    putmat(goal.rotation[e], rot_z(rng.uniform(-ranges.yaw, ranges.yaw)))
+    place_formation(e, goal, rig)
+    moved = in_ball(rng, ranges.radius)
+    axis = in_ball(rng, 1.0)
+    tilt = axis_angle(scale(1.0 / max(norm(axis), 1e-9), axis), rng.uniform(0.0, ranges.tilt))
+    velocity = in_ball(rng, ranges.speed)
+    payload = add((goal.position[e, 0], goal.position[e, 1], goal.position[e, 2]), moved)
+    attitude = matrow(goal.rotation, e)
+    if np.any(rig.anchors != 0.0):  # a point has no attitude: it counts as aligned
+        attitude = matmul(tilt, attitude)
+    hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, moved)

@@ -9,17 +9,8 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.config.load import load_config
 from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.sim.air import (
-    AIR_DENSITY,
-    SPREADING,
-    advance_turbulence,
-    dryden,
-    ground_gain,
-    make_air,
-    start_turbulence,
-    turbulence,
-    wash_at,
-)
+from multilift_marl.sim.air import AIR_DENSITY, GROWTH, SPREADING, ground_gain, make_air, wash_at
+from multilift_marl.sim.gusts import advance_turbulence, dryden, start_turbulence, turbulence
 from multilift_marl.sim.state import Air
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row, relative
@@ -176,29 +167,28 @@ def wash(fast: bool) -> Result:
     thrust, result = vehicle.mass * GRAVITY, Result()
 
     def speed(x: float, depth: float) -> float:
-        return -wash_at(0, -1, (x, 0.0, 102.0 - depth), 0.0, world.state, c)[2]
+        return -wash_at(0, (x, 0.0, 102.0 - depth), 0.0, world.state, c)[2]
 
     rotor = vehicle.rotor_positions[0]
     induced = np.sqrt(thrust / 4 / (2 * AIR_DENSITY * np.pi * vehicle.rotor_radius**2))
-    below = wash_at(0, -1, (rotor[0], rotor[1], 102.0 - 1e-6), 0.0, world.state, c)
+    below = wash_at(0, (rotor[0], rotor[1], 102.0 - 1e-6), 0.0, world.state, c)
     quantity = "under a rotor, 2 v_i of momentum theory [m/s], relative error"
     result.rows.append(Row("wash", quantity, 2 * induced, -below[2], relative(-below[2], 2 * induced), 1e-4))
-    above = wash_at(0, -1, (rotor[0], rotor[1], 102.5), 0.0, world.state, c)
+    above = wash_at(0, (rotor[0], rotor[1], 102.5), 0.0, world.state, c)
     size = float(np.linalg.norm(above))
     result.rows.append(Row("wash", "speed above the rotors [m/s]", 0.0, size, size, 0.0))
     for depth in (0.1, 0.5, 2.0, 8.0):
         half = vehicle.arm + 5 * max(vehicle.rotor_radius, SPREADING * depth)
         grid = np.linspace(-half, half, 101)
-        squares = [wash_at(0, -1, (x, y, 102 - depth), 0.0, world.state, c)[2] ** 2 for x in grid for y in grid]
+        squares = [wash_at(0, (x, y, 102 - depth), 0.0, world.state, c)[2] ** 2 for x in grid for y in grid]
         flux = AIR_DENSITY * sum(squares) * (grid[1] - grid[0]) ** 2
         quantity = f"momentum flux {depth:g} m below = thrust [N], relative error"
         result.rows.append(Row("wash", quantity, thrust, flux, relative(flux, thrust), 2e-3))
-    growth = SPREADING / np.sqrt(2 * np.log(2))
-    far = np.sqrt(thrust / (np.pi * AIR_DENSITY)) / (growth * 20.0)
+    far = np.sqrt(thrust / (np.pi * AIR_DENSITY)) / (GROWTH * 20.0)
     quantity = "20 m below, one jet √(T/πρ)/b [m/s], relative error"
     result.rows.append(Row("wash", quantity, far, speed(0.0, 20.0), relative(speed(0.0, 20.0), far), 0.01))
     world.step(np.full((1, 1, 4), thrust / 4))
-    square = (2.0 * growth) ** 2 + system.payload_drag_area / np.pi  # of a Gaussian jet, averaged over the payload
+    square = (2.0 * GROWTH) ** 2 + system.payload_drag_area / np.pi  # of a Gaussian jet, averaged over the payload
     squared = thrust / (AIR_DENSITY * np.pi * square) * np.exp(-(vehicle.arm**2) / square)
     pushed = 0.5 * AIR_DENSITY * system.payload_drag_area * squared / system.payload_mass
     found = -world.state.payload_velocity[0, 2] / system.timestep - GRAVITY
@@ -208,7 +198,7 @@ def wash(fast: bool) -> Result:
     plot = Plot("wash", "wash of a falcon that carries itself, through two opposite rotors", "", "down [m/s]")
     plot.x_label = "distance from the middle [m]"
     for depth in (0.3, 1.0, 2.0, 4.0):
-        line = [wash_at(0, -1, (x / 2**0.5, x / 2**0.5, 102 - depth), 0.0, world.state, c)[2] for x in across]
+        line = [wash_at(0, (x / 2**0.5, x / 2**0.5, 102 - depth), 0.0, world.state, c)[2] for x in across]
         plot.curves.append(Curve(f"{depth:g} m below", across, -np.array(line)))
     result.plots.append(plot)
     return result
