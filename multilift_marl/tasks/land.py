@@ -34,7 +34,7 @@ APPROACH, DESCEND, SETTLE = (0.1, 2.7), (2.0, 2.8), (4.8, 1.6)  # begin and leng
 RELEASE, LOWER = (6.4, 2.2), (8.6, 1.4)
 DOWN = SETTLE[0] + SETTLE[1]  # [s] when the target is on the ground
 NEAR = 0.12  # [m] above the ground where the slow last part of the way begins, for the span of a falcon
-SHORTER = 0.2  # of its length: how much nearer to its anchor a drone comes in the end
+SHORTER = 0.15  # of its length: how much nearer to its anchor a drone comes in the end
 AIRBORNE, LANDED, CRASHED = range(3)
 _LANDED_WELL = forgive(LOAD_GROUND)
 _AT_REST = 0.02  # [m/s]
@@ -48,7 +48,9 @@ class LandOptions(Section):
     start_height: Float = Field(1.5, gt=0, description="[m] of the payload at the start")
     pad_radius: Float = Field(0.1, gt=0, description="[m] payload on the pad: within this of its middle")
     touch_speed: Float = Field(0.3, gt=0, description="[m/s] largest speed of the payload when it touches the ground")
-    clearance: Float = Field(0.3, gt=0, description="[m] drones from payload and ground, for the span of a falcon")
+    clearance: Float = Field(
+        0.3, gt=0, description="[m] drones from payload and ground; less for a span below a falcon's"
+    )
     success_seconds: Float = Field(1.0, gt=0, description="[s] at rest, slack and clear throughout the last seconds")
 
 
@@ -96,7 +98,7 @@ class Land(Task):
         self._ground = make_ground(system)
         size, rope, half = self._ground.size, self._ground.rope, drone_half_size(system.vehicle)
         self._down = Down(
-            option.pad_radius, option.touch_speed, option.clearance * size, float(np.linalg.norm(half)), rope,
+            option.pad_radius, option.touch_speed, option.clearance * min(size, 1.0), float(np.linalg.norm(half)), rope,
             system.resting_tension,
         )  # fmt: skip
         self.way, self.touch = np.zeros((e, 3)), np.zeros(e, np.int64)
