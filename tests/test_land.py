@@ -148,7 +148,7 @@ def test_scripts_land(script):
 def test_in_return_motors_off_lose_to_staying_high_to_the_formation_to_its_integral():
     def score(script=None, **gains):
         vec = make("land", num_envs=32)
-        vec.pilot._gains = vec.pilot._gains._replace(**gains)
+        vec.pilot.gains = vec.pilot.gains._replace(**gains)
         vec._bind()
         vec.reset(seed=0)
         high = zeros(vec)
