@@ -100,5 +100,5 @@ def test_success_needs_the_angle_with_six_drones_alone():
 
 
 def test_one_drone_cannot_lose_itself():
-    assert "raise env.num_drones" in refusal(make, "loss", num_drones=1)
+    assert "raise env.num_drones to 2" in refusal(make, "loss", num_drones=1)
     assert "must list the earlier one first" in refusal(make, "loss", **{"task_options.loss_time": (4.0, 2.0)})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -43,6 +44,7 @@ class Task:
         EXTRA: what its observations have beside the common components.
         EXTRA_STATE: how many numbers it adds to the global state.
         RMSE_AFTER: time from which `payload_rmse_m` counts [s].
+        LEAST_DRONES: with fewer it makes no sense.
         KEPT: names of further arrays, environment first, that outlive a step.
 
     Attributes:
@@ -62,11 +64,14 @@ class Task:
     EXTRA: ClassVar[tuple[Component, ...]] = ()
     EXTRA_STATE: ClassVar[int] = 0
     RMSE_AFTER: ClassVar[float] = 0.0
+    LEAST_DRONES: ClassVar[int] = 1
     KEPT: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: Config, world: World, reference: Reference):
         e, n, system = world.num_envs, world.num_drones, world.system
         self.world, self.reference = world, reference
+        if n < self.LEAST_DRONES:
+            raise ConfigError(f"task {self.name} needs more drones; raise env.num_drones to {self.LEAST_DRONES} or more")
         self.options = validate(self.Options, config.task_options, "task_options")
         self.weights = self._weights(config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
@@ -154,7 +159,7 @@ class Task:
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""
         kept = ("cause", "good_time", "min_separation", "time", *self.KEPT)
-        saved = {name: getattr(self, name).copy() for name in kept}
+        saved = {name: operator.attrgetter(name)(self).copy() for name in kept}
         for group in ("goal", "errors", "watch", *(() if self.way is self.goal else ("way",))):
             saved |= {f"{group}.{name}": array.copy() for name, array in getattr(self, group)._asdict().items()}
         return saved

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import radians
 from typing import NamedTuple
 
 import numpy as np
@@ -71,3 +72,19 @@ def measure(lo, hi, state, goal, way, led, errors, dt, largest):
             errors.position_integral[e, j] = clip(moved, -largest, largest)
             moved = errors.rotation_integral[e, j] + dt * twisted[j]
             errors.rotation_integral[e, j] = clip(moved, -largest, largest)
+
+
+@kernel
+def pay_pose(e, state, goal, errors, share, weights, terms):
+    """Write the first five reward terms of environment e, those of a payload that is to be at its target.
+
+    They are position, precision, attitude, level and stillness, each times its weight and `share`.
+    """
+    distance, angle = errors.distance[e], errors.angle[e]
+    speed = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
+    spin = norm(row(state.payload_body_rates, e))
+    terms[e, 0] = weights[0] * tolerance(distance, 0.25) * share
+    terms[e, 1] = weights[1] * tolerance(distance, 0.01) * share
+    terms[e, 2] = weights[2] * tolerance(angle, radians(6.0)) * share
+    terms[e, 3] = weights[3] * tolerance(angle, radians(1.0)) * share
+    terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3) * share
