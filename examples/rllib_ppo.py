@@ -56,9 +56,8 @@ def train(iterations: int = 60, num_envs: int = 8, horizon: int = 256, seed: int
     algorithm, policy = build(num_envs, horizon, seed, **overrides)
     before = parameters_to_vector(policy.parameters()).detach().clone()
     for iteration in range(iterations):
-        told = algorithm.train()["env_runners"]
-        mean = told.get("module_episode_returns_mean", {}).get("team", float("nan"))
-        print(f"iteration {iteration + 1}: a drone's return {mean:.1f}", flush=True)
+        mean = algorithm.train()["env_runners"].get("episode_return_mean")  # summed over the drones
+        print(f"iteration {iteration + 1}: return {'of no episode yet' if mean is None else round(mean)}", flush=True)
     after = parameters_to_vector(policy.parameters()).detach().clone()
     algorithm.stop()
     ray.shutdown()

@@ -11,6 +11,7 @@ from skrl.envs.wrappers.torch import wrap_env
 from skrl.memories.torch import RandomMemory
 from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
 from skrl.multi_agents.torch.mappo import MAPPO, MAPPO_CFG
+from skrl.resources.preprocessors.torch import RunningStandardScaler
 from skrl.trainers.torch import SequentialTrainer
 from skrl.utils import set_seed
 from torch import nn
@@ -53,7 +54,7 @@ class Value(DeterministicMixin, Model):
         return self.value(inputs["states"]), {}
 
 
-def train(iterations: int = 60, horizon: int = 512, seed: int = 0, **overrides):
+def train(iterations: int = 60, horizon: int = 2048, seed: int = 0, **overrides):
     """Train on `hover` and return the policy's weights before and after, as flat tensors."""
     set_seed(seed)
     torch.set_num_threads(1)
@@ -70,11 +71,13 @@ def train(iterations: int = 60, horizon: int = 512, seed: int = 0, **overrides):
         models=dict.fromkeys(agents, shared),
         memories={agent: RandomMemory(memory_size=horizon, num_envs=1, device=env.device) for agent in agents},
         cfg=MAPPO_CFG(
-            rollouts=horizon, learning_epochs=4, mini_batches=4, learning_rate=3e-4,
+            rollouts=horizon, learning_epochs=4, mini_batches=8, learning_rate=3e-4,
             time_limit_bootstrap=True,  # a time limit is no failure
             value_clip=0.0, value_loss_scale=0.5,
             learning_rate_scheduler_kwargs=empty.copy(), observation_preprocessor_kwargs=empty.copy(),
-            state_preprocessor_kwargs=empty.copy(), value_preprocessor_kwargs=empty.copy(),
+            state_preprocessor_kwargs=empty.copy(),
+            value_preprocessor=RunningStandardScaler,
+            value_preprocessor_kwargs={agent: {"size": 1, "device": env.device} for agent in agents},
         ),
         observation_spaces=env.observation_spaces, state_spaces=env.state_spaces, action_spaces=env.action_spaces,
         device=env.device,

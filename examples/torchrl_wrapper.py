@@ -76,7 +76,7 @@ def train(iterations: int = 60, num_envs: int = 8, horizon: int = 128, seed: int
     before = parameters_to_vector(policy.parameters()).detach().clone()
 
     # 3. PPO's loss and the advantages. Only `terminated` ends a return: time limits are bootstrapped.
-    loss = ClipPPOLoss(policy, critic, entropy_bonus=False, critic_coeff=0.5, normalize_advantage=True)
+    loss = ClipPPOLoss(policy, critic, entropy_bonus=False, critic_coeff=0.5, normalize_advantage=False)
     keys = {"value": VALUE, "reward": KEYS["reward"], "done": KEYS["done"], "terminated": KEYS["terminated"]}
     loss.set_keys(**keys, action=KEYS["action"], sample_log_prob=LOG_PROB)
     gae = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
@@ -85,12 +85,12 @@ def train(iterations: int = 60, num_envs: int = 8, horizon: int = 128, seed: int
 
     # 4. Collect, learn, repeat.
     frames = num_envs * horizon
-    for iteration, batch in enumerate(
-        Collector(env, policy, frames_per_batch=frames, total_frames=iterations * frames), start=1
-    ):
+    sizes = {"frames_per_batch": frames, "total_frames": iterations * frames}
+    for iteration, batch in enumerate(Collector(env, policy, **sizes, auto_register_policy_transforms=True), start=1):
         with torch.no_grad():
             gae(batch)
         data = batch.reshape(-1)
+        data["advantage"] = (data["advantage"] - data["advantage"].mean()) / data["advantage"].std()
         for _ in range(EPOCHS):
             for chosen in torch.randperm(frames).chunk(MINIBATCHES):
                 losses = loss(data[chosen])
