@@ -285,6 +285,7 @@ def test_pictures():
     assert frame.shape == (540, 960, 3) and frame.dtype == np.uint8
     assert len(frames) == 2 and same(frames[0], frame) and not same(frames[1], frame)
     env.close(), envs.close()
+    assert envs.closed
     assert env.metadata["render_fps"] == envs.metadata["render_fps"] == 50
 
 

@@ -137,6 +137,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         "render_modes": list(RENDER_MODES),
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
+    closed = True  # until there is something to close: Gymnasium 1.1 closes what was refused, too
 
     def __init__(
         self, task: str | Config = "hover", *, num_envs: int | None = None, num_threads: int | None = None,
@@ -155,6 +156,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._pictures = Pictures(self.vec, render_mode)
         self._causes = np.array(self.vec.failure_causes, dtype=object)
+        self.closed = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
