@@ -41,13 +41,14 @@ def install(name: str, folder: Path) -> Path:
     return python
 
 
-def try_out(python: str | Path, name: str, folder: Path) -> dict[str, Any]:
+def try_out(python: str | Path, name: str, folder: Path, **sizes: int) -> dict[str, Any]:
     """Train an example for some short iterations by a Python that has what it needs.
 
     Args:
         python: the interpreter.
         name: of the example.
         folder: where it runs, and leaves what its trainer writes.
+        **sizes: arguments of its `train` beside SIZES.
 
     Returns:
         `weights` (how many), `moved` (the norm of their change) and `versions` {package: version}.
@@ -55,7 +56,8 @@ def try_out(python: str | Path, name: str, folder: Path) -> dict[str, Any]:
     Raises:
         RuntimeError: it failed, or its weights stayed as they were or are not finite.
     """
-    told = json.loads(run([python, "-c", INSIDE, json.dumps([name, SIZES, PACKAGES])], folder).splitlines()[-1])
+    job = json.dumps([name, SIZES | sizes, PACKAGES])
+    told = json.loads(run([python, "-c", INSIDE, job], folder).splitlines()[-1])
     if not told.pop("finite") or not told["moved"] > 0:
         raise RuntimeError(f"the weights of {name} moved by {told['moved']}")
     return told

@@ -23,7 +23,7 @@ check = load("check")
 
 @pytest.mark.parametrize("name", HERE)
 def test_example_trains(name, tmp_path):
-    told = check.try_out(sys.executable, name, tmp_path)
+    told = check.try_out(sys.executable, name, tmp_path, num_envs=2)
     assert told["weights"] > 1000 and told["moved"] > 0
 
 
