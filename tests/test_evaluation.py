@@ -184,6 +184,7 @@ def test_without_graphics_evaluation_goes_on(run, tmp_path, monkeypatch, capsys)
         ("episodes=many", "episodes must be a whole number, at least 1, but is 'many'"),
         ("video=perhaps", "video must be true or false, but is 'perhaps'"),
         ("checkpoint=none.pt", "no checkpoint none.pt"),
+        ("control.action=ctbr", "was trained with control.action=reference and cannot fly control.action=ctbr"),
         ("payload.mas=1", "unknown key 'payload.mas'; did you mean 'mass'?"),
     ],
 )

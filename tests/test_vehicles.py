@@ -90,6 +90,8 @@ OWN = {
     "rotor_speed_min": 100.0,
     "rotor_thrust_max": 6.0,
     "drag": (0.1, 0.2, 0.3),
+    "rotor_radius": 0.05,
+    "rolling_moment": 1e-6,
 }
 
 

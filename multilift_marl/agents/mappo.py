@@ -15,7 +15,7 @@ from torchrl.objectives.value import MultiAgentGAE
 
 from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic
 from multilift_marl.config.schema import TrainConfig
-from multilift_marl.control.scripted import make_scripted
+from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 
 
@@ -36,7 +36,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     """Return an untrained learner for `env`."""
     # 1. The policy: own observation to a Gaussian over the own action.
     vec = env.vec
-    base = torch.from_numpy(make_scripted(config.residual, vec).matrix())
+    base = torch.from_numpy(residual_matrix(config.residual, vec))
     actor = Actor(vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
     agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
     policy = ProbabilisticActor(

@@ -12,7 +12,7 @@ from typing import Any
 from multilift_marl.cli.common import run_command
 from multilift_marl.config.load import build_config
 from multilift_marl.config.schema import Config
-from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.control.scripted import SCRIPTED, check_interface, make_scripted
 from multilift_marl.errors import ConfigError, RenderingError, nearest
 from multilift_marl.evaluation.report import format_table, make_report, write_report
 from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
@@ -48,6 +48,7 @@ def _evaluate(values: dict[str, Any]) -> int:
     policy, folder = _find_policy(str(own["run"]), str(own["checkpoint"]))
     config = build_config(policy.config.model_dump(), {"env.num_threads": 0} | values)
     _ = config.system
+    _check_interfaces(policy, config, own["baseline"])
     makers = {"policy": lambda vec: policy}
     if own["baseline"] != "none":
         makers |= {name: lambda vec, name=name: make_scripted(name, vec) for name in SCRIPTED}
@@ -82,6 +83,17 @@ def _check(own: dict[str, Any]) -> None:
         raise ConfigError(f"unknown baseline '{own['baseline']}'{nearest(str(own['baseline']), [*SCRIPTED, 'none'])}")
     if not isinstance(own["video"], bool):
         raise ConfigError(f"video must be true or false, but is {own['video']!r}")
+
+
+def _check_interfaces(policy: Any, config: Config, baseline: str) -> None:
+    trained, asked = policy.config.control.action, config.control.action
+    if trained != asked:
+        raise ConfigError(
+            f"{policy.source} was trained with control.action={trained} and cannot fly control.action={asked}; "
+            "leave control.action as it was"
+        )
+    if baseline != "none":
+        check_interface(baseline, asked)
 
 
 def _find_policy(run: str, checkpoint: str) -> tuple[Any, Path]:

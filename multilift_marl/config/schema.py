@@ -143,9 +143,15 @@ class CableConfig(Section):
 class ControlConfig(Section):
     """The drones' geometric controller and its action interface."""
 
-    action: Literal["reference"] = Field("reference", description="what an action means (control/actions.py)")
+    action: Literal["reference", "velocity", "acceleration", "acc_rates", "ctbr", "rotor"] = Field(
+        "reference", description="what an action means (docs/control.md)"
+    )
     max_offset: Float = Field(0.5, gt=0, description="[m] slot offset of a full action, along each axis")
     max_yaw: Float = Field(0.5, gt=0, description="[rad] yaw offset of a full action")
+    max_velocity: Float = Field(1.0, gt=0, description="[m/s] of a full action of `velocity`, along each axis")
+    max_acceleration: Float = Field(3.0, gt=0, description="[m/s²] of a full action of `acceleration`, `acc_rates`")
+    max_tilt_rate: Float = Field(4.0, gt=0, description="[rad/s] roll, pitch of a full action of `acc_rates`, `ctbr`")
+    max_yaw_rate: Float = Field(1.5, gt=0, description="[rad/s] of a full action of `velocity`, `acceleration`, `ctbr`")
     reference_frequency: Float = Field(6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference")
     reference_speed: Float = Field(1.0, gt=0, description="[m/s] speed limit of the smoothed reference")
     position_frequency: Float = Field(4.0, gt=0, description="[rad/s] of the position loop; at most 1/5 of attitude's")
@@ -154,6 +160,13 @@ class ControlConfig(Section):
     attitude_damping: Float = Field(0.8, gt=0, description="[-] its damping ratio")
     drag_feedforward: bool = Field(False, description="feed the drones' nominal drag in still air forward")
     yaw_frequency: Float = Field(8.0, gt=0, description="[rad/s] natural frequency of yaw")
+    disturbance: Literal["none", "integral", "indi"] = Field(
+        "none", description="rejection of unknown forces on a drone (docs/control.md)"
+    )
+    disturbance_frequency: Float = Field(
+        3.0, gt=0, description="[rad/s] bandwidth of that rejection; less where the load asks for it (docs/control.md)"
+    )
+    disturbance_limit: Float = Field(0.5, gt=0, description="[-] largest force rejected, in weights of the drone")
 
 
 class RandomizationConfig(Section):

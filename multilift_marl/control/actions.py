@@ -1,43 +1,284 @@
-"""Action interfaces: what the numbers in [-1, 1] mean. One class each, all in the table at the end."""
+"""Action interfaces: what the numbers in [-1, 1] mean. One class each, all in the table at the end.
+
+An interface turns actions into set-points once for each policy step (`act`), and set-points into rotor thrusts at the
+control rate (`follow`). Vectors are given in the drone's slot frame (x outward from the payload, y to the left of it, z
+up), body rates in the body frame. An action of zero hovers as well as the interface can, under the nominal payload.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.control.formation import Goal, Reference
-from multilift_marl.math3d import add, put, turn, vec
+from multilift_marl.config.system import GRAVITY
+from multilift_marl.control.formation import Goal, Reference, leave_goal, smooth, smooth_moving
+from multilift_marl.control.geometric import Gains, control, fly
+from multilift_marl.control.setpoints import (
+    Setpoint,
+    drift,
+    drift_to_yaw,
+    fly_acc_rates,
+    fly_acceleration,
+    fly_rates,
+    fly_velocity,
+    smooth_velocity,
+)
+from multilift_marl.math3d import add, norm, put, scale, turn, vec
+from multilift_marl.sim.state import SystemState
+
+Call = Callable[[], None]
 
 
-class ReferenceAction:
-    """Offset of the drone's slot in the formation about the target payload pose; zero is the scripted formation.
+class Team(NamedTuple):
+    """What an interface reads and writes."""
 
-    Components, in the drone's slot frame (x outward from the payload, y to the left of it, z up): outward, sideways
-    and upward offset, each ± control.max_offset [m], and yaw relative to the target's, ± control.max_yaw [rad].
+    state: SystemState
+    goal: Goal
+    reference: Reference
+    setpoint: Setpoint
+    pull: np.ndarray
+    """(E, N, 3) what the drones pull their cables with, any rejected disturbance included [N]."""
+    thrust: np.ndarray
+    """(E, N, 4) rotor thrusts, written [N]."""
+    gains: Gains
+
+
+class Interface:
+    """An action interface.
+
+    Class attributes:
+        names: of the numbers of an action.
+        rejects: values of `control.disturbance` that go with it, beside "none".
     """
 
-    names: ClassVar[tuple[str, ...]] = ("outward", "sideways", "up", "yaw")
+    names: ClassVar[tuple[str, ...]]
+    rejects: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, control: ControlConfig):
-        self.max_offset, self.max_yaw = control.max_offset, control.max_yaw
+    def __init__(self, settings: ControlConfig, dt: float):
+        self.settings, self.dt = settings, dt
 
-    def bind(self, lo: int, hi: int, action: np.ndarray, goal: Goal, reference: Reference) -> Callable[[], None]:
-        """Return the call that writes the commands of environments lo to hi for `action` (E, N, 4) in [-1, 1]."""
-        return bind(_command_offset, lo, hi, action, goal, reference, self.max_offset, self.max_yaw)
+    def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+        """Return the call that turns `action` (E, N, A) in [-1, 1] of environments lo to hi into set-points."""
+        raise NotImplementedError
+
+    def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+        """Return what is called in turn at every control step, the last of them for the thrusts."""
+        raise NotImplementedError
+
+    def ride(self, lo: int, hi: int, plan: Call, act: Call, team: Team) -> tuple[Call, ...]:
+        """Return the same as `follow` for goals that move, by calling `plan`, at every control step."""
+        return plan, *self.follow(lo, hi, team)
+
+
+class ReferenceAction(Interface):
+    """Offset of the drone's slot in the formation about the target payload pose; zero is the scripted formation.
+
+    Outward, sideways and upward offset, each ± control.max_offset [m], and yaw relative to the target's, ±
+    control.max_yaw [rad].
+    """
+
+    names = ("outward", "sideways", "up", "yaw")
+    rejects = ("integral", "indi")
+
+    def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+        """See `Interface.act`."""
+        ranges = (self.settings.max_offset, self.settings.max_yaw)
+        return bind(_command_offset, lo, hi, action, team.goal, team.reference, *ranges)
+
+    def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+        """See `Interface.follow`."""
+        smoothing = (self.settings.reference_frequency, self.settings.reference_speed, self.dt)
+        flown = (team.state, team.reference, team.pull, team.thrust, team.gains)
+        if self.settings.disturbance == "none":  # both in one call, which is quicker
+            return (bind(control, lo, hi, *flown, *smoothing),)
+        return bind(smooth, lo, hi, team.reference, *smoothing), bind(fly, lo, hi, *flown)
+
+    def ride(self, lo: int, hi: int, plan: Call, act: Call, team: Team) -> tuple[Call, ...]:
+        """See `Interface.ride`."""
+        smoothing = (self.settings.reference_frequency, self.settings.reference_speed, self.dt)
+        flown = (team.state, team.reference, team.pull, team.thrust, team.gains)
+        leave = bind(leave_goal, lo, hi, team.reference, team.goal)
+        moved = bind(smooth_moving, lo, hi, team.reference, team.goal, *smoothing)
+        return leave, plan, act, moved, bind(fly, lo, hi, *flown)
+
+
+class VelocityAction(Interface):
+    """Velocity outward, sideways and upward, and yaw rate; the velocity is smoothed at control.reference_frequency.
+
+    Each ± control.max_velocity [m/s], ± control.max_yaw_rate [rad/s].
+    """
+
+    names = ("outward", "sideways", "up", "yaw_rate")
+    rejects = ("indi",)
+
+    def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+        """See `Interface.act`."""
+        ranges = (self.settings.max_velocity, self.settings.max_yaw_rate)
+        return bind(_command_vector, lo, hi, action, team.goal, team.reference, team.setpoint.velocity, *ranges)
+
+    def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+        """See `Interface.follow`."""
+        smoothing = (self.settings.reference_frequency, self.dt)
+        moved = bind(smooth_velocity, lo, hi, team.state, team.reference, team.setpoint, *smoothing)
+        flown = bind(fly_velocity, lo, hi, team.state, team.reference, team.pull, team.thrust, team.gains)
+        return moved, flown
+
+
+class AccelerationAction(Interface):
+    """Acceleration outward, sideways and upward, and yaw rate.
+
+    Each ± control.max_acceleration [m/s²], ± control.max_yaw_rate [rad/s].
+    """
+
+    names = ("outward", "sideways", "up", "yaw_rate")
+    rejects = ("indi",)
+
+    def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+        """See `Interface.act`."""
+        ranges = (self.settings.max_acceleration, self.settings.max_yaw_rate)
+        return bind(_command_vector, lo, hi, action, team.goal, team.reference, team.reference.acceleration, *ranges)
+
+    def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+        """See `Interface.follow`."""
+        moved = bind(drift, lo, hi, team.state, team.reference, self.dt)
+        flown = bind(fly_acceleration, lo, hi, team.state, team.reference, team.pull, team.thrust, team.gains)
+        return moved, flown
+
+
+class AccRatesAction(Interface):
+    """Acceleration outward, sideways and upward, and roll and pitch rates; the yaw is the target's.
+
+    Each ± control.max_acceleration [m/s²], ± control.max_tilt_rate [rad/s]. The rates are those of the attitude that
+    the acceleration asks for (Zeng et al., arXiv 2508.01522).
+    """
+
+    names = ("outward", "sideways", "up", "roll_rate", "pitch_rate")
+    rejects = ("indi",)
+
+    def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+        """See `Interface.act`."""
+        ranges = (self.settings.max_acceleration, self.settings.max_tilt_rate)
+        return bind(_command_acc_rates, lo, hi, action, team.goal, team.reference, team.setpoint.rates, *ranges)
+
+    def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+        """See `Interface.follow`."""
+        smoothing = (self.settings.reference_frequency, self.dt)
+        rates = team.setpoint.rates
+        moved = bind(drift_to_yaw, lo, hi, team.state, team.reference, *smoothing)
+        flown = bind(fly_acc_rates, lo, hi, team.state, team.reference, rates, team.pull, team.thrust, team.gains)
+        return moved, flown
+
+
+class CtbrAction(Interface):
+    """Collective thrust and body rates.
+
+    Thrust: 0 for the hover thrust, ± 1 for the limits; roll and pitch rate ± control.max_tilt_rate, yaw rate ±
+    control.max_yaw_rate [rad/s].
+    """
+
+    names = ("thrust", "roll_rate", "pitch_rate", "yaw_rate")
+
+    def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+        """See `Interface.act`."""
+        ranges = (self.settings.max_tilt_rate, self.settings.max_yaw_rate)
+        where = (team.state, team.reference, team.setpoint, team.pull)
+        return bind(_command_rates, lo, hi, action, *where, team.gains, *ranges)
+
+    def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+        """See `Interface.follow`."""
+        rates, total = team.setpoint.rates, team.setpoint.thrust
+        return (bind(fly_rates, lo, hi, team.state, rates, total, team.thrust, team.gains),)
+
+
+class RotorAction(Interface):
+    """Thrust of each rotor, zero: a quarter of the hover thrust, ± 1: its limits. Nothing else holds the attitude."""
+
+    names = ("rotor_0", "rotor_1", "rotor_2", "rotor_3")
+
+    def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+        """See `Interface.act`."""
+        return bind(_command_rotors, lo, hi, action, team.state, team.reference, team.pull, team.thrust, team.gains)
+
+    def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+        """See `Interface.follow`."""
+        return ()
+
+
+@kernel
+def _in_world(e, n, action, goal, full):
+    """Return the first three numbers of an action, times `full`, turned from the slot frame into the world."""
+    asked = (full * action[e, n, 0], full * action[e, n, 1], full * action[e, n, 2])
+    return turn(goal.slot_frame[e, n, 0], goal.slot_frame[e, n, 1], asked)
 
 
 @kernel
 def _command_offset(lo, hi, action, goal, reference, max_offset, max_yaw):
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            c, s = goal.slot_frame[e, n, 0], goal.slot_frame[e, n, 1]
-            offset = (max_offset * action[e, n, 0], max_offset * action[e, n, 1], max_offset * action[e, n, 2])
-            put(reference.command[e, n], add(vec(goal.slots, e, n), turn(c, s, offset)))
-            reference.command_yaw[e, n] = goal.yaw[e] + max_yaw * action[e, n, 3]
+            put(reference.command[e, n], add(vec(goal.slots, e, n), _in_world(e, n, action, goal, max_offset)))
+            reference.command_yaw[e, n] = goal.drone_yaw[e] + max_yaw * action[e, n, 3]
 
 
-ACTIONS: dict[str, type[ReferenceAction]] = {"reference": ReferenceAction}
+@kernel
+def _command_vector(lo, hi, action, goal, reference, vector, largest, max_yaw_rate):
+    for e in range(lo, hi):
+        for n in range(action.shape[1]):
+            put(vector[e, n], _in_world(e, n, action, goal, largest))
+            reference.yaw_rate[e, n] = max_yaw_rate * action[e, n, 3]
+
+
+@kernel
+def _command_acc_rates(lo, hi, action, goal, reference, rates, max_acceleration, max_tilt_rate):
+    for e in range(lo, hi):
+        for n in range(action.shape[1]):
+            put(reference.acceleration[e, n], _in_world(e, n, action, goal, max_acceleration))
+            rates[e, n, 0] = max_tilt_rate * action[e, n, 3]
+            rates[e, n, 1] = max_tilt_rate * action[e, n, 4]
+            reference.command_yaw[e, n] = goal.drone_yaw[e]
+
+
+@kernel
+def _hover_thrust(e, n, pull, g):
+    """Return the thrust [N] that carries a drone and its pull."""
+    return norm(add(vec(pull, e, n), (0.0, 0.0, g.mass * GRAVITY)))
+
+
+@kernel
+def _between(action, low, middle, high):
+    """Return `low` for an action of -1, `middle` for 0, `high` for 1, and what lies between in proportion."""
+    return middle + action * ((high - middle) if action > 0.0 else (middle - low))
+
+
+@kernel
+def _command_rates(lo, hi, action, state, reference, setpoint, pull, g, max_tilt_rate, max_yaw_rate):
+    drift(lo, hi, state, reference, 0.0)
+    for e in range(lo, hi):
+        for n in range(action.shape[1]):
+            hover = _hover_thrust(e, n, pull, g)
+            setpoint.thrust[e, n] = _between(action[e, n, 0], 4.0 * g.thrust_min, hover, 4.0 * g.thrust_max)
+            tilting = scale(max_tilt_rate, (action[e, n, 1], action[e, n, 2], 0.0))
+            put(setpoint.rates[e, n], (tilting[0], tilting[1], max_yaw_rate * action[e, n, 3]))
+
+
+@kernel
+def _command_rotors(lo, hi, action, state, reference, pull, thrust, g):
+    drift(lo, hi, state, reference, 0.0)
+    for e in range(lo, hi):
+        for n in range(action.shape[1]):
+            hover = 0.25 * _hover_thrust(e, n, pull, g)
+            for k in range(4):
+                thrust[e, n, k] = _between(action[e, n, k], g.thrust_min, hover, g.thrust_max)
+
+
+ACTIONS: dict[str, type[Interface]] = {
+    "reference": ReferenceAction,
+    "velocity": VelocityAction,
+    "acceleration": AccelerationAction,
+    "acc_rates": AccRatesAction,
+    "ctbr": CtbrAction,
+    "rotor": RotorAction,
+}

@@ -26,12 +26,23 @@ class Goal(NamedTuple):
     """(E, N, 2) cosine and sine of the slot frame's heading: x points outward from the payload, z up."""
     pull: np.ndarray
     """(E, N, 3) nominal force of each drone on its cable there [N]."""
+    drone_yaw: np.ndarray
+    """(E,) heading that the drones are to have, the target's where a task does not say otherwise [rad]."""
+    velocity: np.ndarray
+    """(E, 3) of a target that moves, and of its slots [m/s]; zero otherwise, like the next ones."""
+    acceleration: np.ndarray
+    """(E, 3) [m/s²]."""
+    jerk: np.ndarray
+    """(E, 3) [m/s³]."""
+    drone_yaw_rate: np.ndarray
+    """(E,) [rad/s]."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> Goal:
         """Return empty goals."""
         e, n = num_envs, num_drones
-        return cls(*(np.zeros(shape) for shape in ((e, 3), (e, 3, 3), (e,), (e, n, 3), (e, n, 2), (e, n, 3))))
+        placed = ((e, 3), (e, 3, 3), (e,), (e, n, 3), (e, n, 2), (e, n, 3), (e,))
+        return cls(*(np.zeros(shape) for shape in (*placed, (e, 3), (e, 3), (e, 3), (e,))))
 
 
 class Rig(NamedTuple):
@@ -80,7 +91,7 @@ def place_formation(e, goal, rig):
     """Write slots, slot frames and pulls of environment e for its target pose."""
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     yaw = heading(target)
-    goal.yaw[e] = yaw
+    goal.yaw[e], goal.drone_yaw[e] = yaw, yaw
     c, s = cos(yaw), sin(yaw)
     for n in range(rig.slots.shape[0]):
         anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
@@ -129,11 +140,52 @@ def smooth(lo, hi, reference, frequency, speed, dt):
             put(reference.velocity[e, n], v)
             put(reference.acceleration[e, n], a)
             put(reference.jerk[e, n], jerk)
-            turn_gap = wrap(reference.command_yaw[e, n] - reference.yaw[e, n])
-            rate = reference.yaw_rate[e, n]
-            rate += dt * (w * w * clip(turn_gap, -1.0, 1.0) - 2.0 * w * rate)
-            reference.yaw_rate[e, n] = rate
-            reference.yaw[e, n] += dt * rate
+            smooth_yaw(e, n, reference, w, dt)
+
+
+@kernel
+def leave_goal(lo, hi, reference, goal):
+    """Make the references of environments lo to hi relative to the slots and motion of their goals, which then move on.
+
+    `smooth_moving` makes them absolute again. In between, references ride along: only commands are smoothed, so a
+    moving target is followed without lag.
+    """
+    for e in range(lo, hi):
+        velocity, acceleration = row(goal.velocity, e), row(goal.acceleration, e)
+        for n in range(reference.yaw.shape[1]):
+            put(reference.position[e, n], sub(vec(reference.position, e, n), vec(goal.slots, e, n)))
+            put(reference.velocity[e, n], sub(vec(reference.velocity, e, n), velocity))
+            put(reference.acceleration[e, n], sub(vec(reference.acceleration, e, n), acceleration))
+            reference.yaw[e, n] -= goal.drone_yaw[e]
+            reference.yaw_rate[e, n] -= goal.drone_yaw_rate[e]
+
+
+@kernel
+def smooth_moving(lo, hi, reference, goal, frequency, speed, dt):
+    """Do as `smooth`, about goals that move; see `leave_goal`."""
+    for e in range(lo, hi):
+        for n in range(reference.yaw.shape[1]):
+            put(reference.position[e, n], add(vec(reference.position, e, n), vec(goal.slots, e, n)))
+            reference.yaw[e, n] += goal.drone_yaw[e]
+    smooth(lo, hi, reference, frequency, speed, dt)
+    for e in range(lo, hi):
+        velocity, acceleration, jerk = row(goal.velocity, e), row(goal.acceleration, e), row(goal.jerk, e)
+        for n in range(reference.yaw.shape[1]):
+            put(reference.velocity[e, n], add(vec(reference.velocity, e, n), velocity))
+            put(reference.acceleration[e, n], add(vec(reference.acceleration, e, n), acceleration))
+            put(reference.jerk[e, n], add(vec(reference.jerk, e, n), jerk))
+            reference.yaw_rate[e, n] += goal.drone_yaw_rate[e]
+
+
+@kernel
+def smooth_yaw(e, n, reference, frequency, dt):
+    """Move the yaw of one drone's reference one control step towards its command, the short way."""
+    w = frequency
+    gap = wrap(reference.command_yaw[e, n] - reference.yaw[e, n])
+    rate = reference.yaw_rate[e, n]
+    rate += dt * (w * w * clip(gap, -1.0, 1.0) - 2.0 * w * rate)
+    reference.yaw_rate[e, n] = rate
+    reference.yaw[e, n] += dt * rate
 
 
 @kernel

@@ -1,4 +1,9 @@
-"""The geometric controller on SO(3) that flies each drone (report eqs 25-32; Lee, Leok and McClamroch, CDC 2010)."""
+"""The geometric controller on SO(3) that flies each drone (report eqs 25-32; Lee, Leok and McClamroch, CDC 2010).
+
+It has levels, each of which hands to the next: position (`fly`) → force (`wanted_force`, `follow_force`) → attitude
+(`follow_attitude`) → torque (`attitude_torque`, `rate_torque`) → rotors (`allocate`). Set-points that enter below the
+position are in `setpoints`.
+"""
 
 from __future__ import annotations
 
@@ -126,6 +131,61 @@ def attitude_torque(attitude, rates, desired, desired_rate, g):
 
 
 @kernel
+def rate_torque(rates, desired, g):
+    """Return the torque that turns body rates Ω into desired ones, Ω × JΩ - J k_w (Ω - Ω_d) [N m]."""
+    momentum = (g.inertia[0] * rates[0], g.inertia[1] * rates[1], g.inertia[2] * rates[2])
+    gyroscopic = cross(rates, momentum)
+    return (
+        gyroscopic[0] - g.inertia[0] * g.k_w[0] * (rates[0] - desired[0]),
+        gyroscopic[1] - g.inertia[1] * g.k_w[1] * (rates[1] - desired[1]),
+        gyroscopic[2] - g.inertia[2] * g.k_w[2] * (rates[2] - desired[2]),
+    )
+
+
+@kernel
+def wanted_force(feedback, acceleration, velocity, pull, attitude, g, share):
+    """Return the force [N] that a drone's rotors are to exert, world frame.
+
+    The nominal pull of the cable, the inertia of the load that hangs on it and the drag are fed forward.
+
+    Args:
+        feedback: acceleration that corrects the errors, negative [m/s²].
+        acceleration: of the set-point [m/s²].
+        velocity: of the set-point, for the drag [m/s].
+        pull: force that the drone exerts on its cable [N].
+        attitude: R, 9 numbers.
+        g: Gains.
+        share: mass of the load that moves with this drone [kg].
+    """
+    force = sub(scale(g.mass + share, acceleration), scale(g.mass, feedback))
+    force = add(force, pull)
+    air = tmul(attitude, velocity)
+    force = add(force, mul(attitude, (g.drag[0] * air[0], g.drag[1] * air[1], g.drag[2] * air[2])))
+    return (force[0], force[1], max(force[2] + g.mass * GRAVITY, 0.1 * g.mass * GRAVITY))
+
+
+@kernel
+def follow_attitude(attitude, rates, desired, desired_rate, total, g):
+    """Return the four rotor thrusts [N] that turn attitude R to R_d (see `attitude_torque`) at total thrust [N]."""
+    torque = attitude_torque(attitude, rates, desired, desired_rate, g)
+    return allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
+
+
+@kernel
+def follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, g):
+    """Return the four rotor thrusts [N] that exert force F, which changes by Ḟ [N/s], at heading ψ.
+
+    Thrust is the desired force along the actual body z axis, F · R e3 (Lee 2010), in place of eq 27's |a_d|. Its last
+    lines are those of `follow_attitude`: a call in their place takes a quarter more time.
+    """
+    desired = thrust_frame(force, yaw)
+    desired_rate = desired_rates(desired, force, force_rate, yaw, yaw_rate)
+    total = max(dot(force, unit(column(attitude, 2))), 0.0)
+    torque = attitude_torque(attitude, rates, desired, desired_rate, g)
+    return allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
+
+
+@kernel
 def control(lo, hi, state, reference, pull, thrust, g, frequency, speed, dt):
     """One control step: `smooth` the references, then `fly` after them."""
     smooth(lo, hi, reference, frequency, speed, dt)
@@ -134,37 +194,27 @@ def control(lo, hi, state, reference, pull, thrust, g, frequency, speed, dt):
 
 @kernel
 def fly(lo, hi, state, reference, pull, thrust, g):
-    """Compute the rotor thrusts that make the drones of environments lo to hi follow their references.
-
-    Thrust is the desired force along the actual body z axis, F_d · R e3 (Lee 2010), in place of eq 27's |a_d|.
-    The nominal pull of the cable, and the inertia of the load that hangs on it, are fed forward.
+    """Compute the rotor thrusts that make the drones of environments lo to hi follow their references: position.
 
     Args:
         lo, hi: the environments.
         state: SystemState.
         reference: Reference to follow.
-        pull: nominal force that each drone exerts on its cable (E, N, 3) [N].
+        pull: force that each drone is to exert on its cable (E, N, 3) [N].
         thrust: written, (E, N, 4) [N].
         g: Gains.
     """
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
             position_error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
-            velocity_error = sub(vec(state.drone_velocity, e, n), vec(reference.velocity, e, n))
+            velocity = vec(reference.velocity, e, n)
+            velocity_error = sub(vec(state.drone_velocity, e, n), velocity)
             feedback = add(scale(g.k_p, position_error), scale(g.k_v, velocity_error))
-            moved = g.mass + g.load_share[n]
-            force = sub(scale(moved, vec(reference.acceleration, e, n)), scale(g.mass, feedback))
-            force = add(force, vec(pull, e, n))
-            attitude = mat(state.drone_rotation, e, n)
-            air = tmul(attitude, vec(reference.velocity, e, n))
-            force = add(force, mul(attitude, (g.drag[0] * air[0], g.drag[1] * air[1], g.drag[2] * air[2])))
-            force = (force[0], force[1], max(force[2] + g.mass * GRAVITY, 0.1 * g.mass * GRAVITY))
-            yaw, yaw_rate = reference.yaw[e, n], reference.yaw_rate[e, n]
-            desired = thrust_frame(force, yaw)
-            force_rate = scale(moved, vec(reference.jerk, e, n))
-            desired_rate = desired_rates(desired, force, force_rate, yaw, yaw_rate)
-            torque = attitude_torque(attitude, vec(state.drone_body_rates, e, n), desired, desired_rate, g)
-            total = max(dot(force, unit(column(attitude, 2))), 0.0)
-            rotors = allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
+            attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
+            share = g.load_share[n]
+            force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, g, share)
+            force_rate = scale(g.mass + share, vec(reference.jerk, e, n))
+            rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
+            rotors = follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, g)
             for k in range(4):
                 thrust[e, n, k] = rotors[k]

@@ -52,8 +52,29 @@ def make_scripted(name: str, vec: MultiliftVec) -> Formation:
     """Return the scripted policy `name` for the environments `vec`.
 
     Raises:
-        ConfigError: there is no such script.
+        ConfigError: there is no such script, or the environments have another action interface than scripts have.
     """
     if name not in SCRIPTED:
         raise ConfigError(f"unknown scripted policy '{name}'{nearest(name, SCRIPTED)}")
+    check_interface(name, vec.config.control.action)
     return SCRIPTED[name](vec)
+
+
+def check_interface(name: str, action: str) -> None:
+    """Refuse the script `name` with an action interface that it does not know."""
+    if action != "reference":
+        raise ConfigError(
+            f"the scripted policy '{name}' acts by control.action=reference and cannot fly control.action={action}; "
+            "set control.action=reference, or leave the script out (baseline=none, train.residual=formation)"
+        )
+
+
+def residual_matrix(name: str, vec: MultiliftVec) -> np.ndarray:
+    """Return M (A, D) of the script that a learned policy corrects; `formation` is zero with every interface.
+
+    Raises:
+        ConfigError: see `make_scripted`.
+    """
+    if name == "formation":
+        return np.zeros((vec.action_size, vec.observation_size), np.float32)
+    return make_scripted(name, vec).matrix()

@@ -6,19 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from multilift_marl._jit import bind
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.config.system import whole_ratio
-from multilift_marl.control.actions import ACTIONS
-from multilift_marl.control.formation import Reference, start_reference
-from multilift_marl.control.geometric import control, make_gains
+from multilift_marl.control.pilot import Pilot
 from multilift_marl.errors import ConfigError
 from multilift_marl.sim.randomization import randomize
 from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.failures import CAUSES, DIVERGED
-from multilift_marl.tasks.observations import OBSERVATION_SIZE, STATE_DRONE, STATE_SHARED, observation_names
+from multilift_marl.tasks.observations import observation_names, state_size
 
 TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
 _MAX_REDRAWS = 1000
@@ -40,6 +37,7 @@ class MultiliftVec:
         max_steps: policy steps of an episode.
         control_ticks: control steps of a policy step.
         world: the physics; `world.state` is the true state.
+        pilot: what flies the drones; `reference` is its reference.
         task: the task; `task.goal` and `task.errors` say where the payload should be.
     """
 
@@ -48,27 +46,26 @@ class MultiliftVec:
             raise ConfigError(f"first_env must not be negative, but is {first_env}")
         task = find_task(config.task)
         self.config, self.purpose, self.first_env = config, purpose, first_env
-        system, settings = config.system, config.control
+        system = config.system
         self.num_envs, self.num_drones = config.env.num_envs, system.num_drones
         self.control_ticks = whole_ratio(config.sim.control_hz, config.env.policy_hz, "env.policy_hz", "sim.control_hz")
         self.max_steps = round(config.env.episode_seconds * config.env.policy_hz)
         if self.max_steps < 1:
             raise ConfigError(f"env.episode_seconds={config.env.episode_seconds} is shorter than one step; raise it")
         e, n = self.num_envs, self.num_drones
-        self._gains = make_gains(settings, system)
-        self._interface = ACTIONS[settings.action](settings)
-        self._smoothing = (settings.reference_frequency, settings.reference_speed, 1.0 / config.sim.control_hz)
         self.world = World(system, e, config.env.num_threads)
-        self.reference = Reference.zeros(e, n)
+        self.pilot = Pilot(config, self.world)
+        self.reference = self.pilot.reference
         self.task = task(config, self.world, self.reference)
-        self.action_names = self._interface.names
-        self.action_size, self.observation_size = len(self.action_names), OBSERVATION_SIZE
-        self.observation_names = observation_names()
-        self.state_size = STATE_SHARED + n * STATE_DRONE
+        self.action_names = self.pilot.action_names
+        self.action_size = len(self.action_names)
+        self.observation_names = observation_names(self.action_size, task.EXTRA)
+        self.observation_size = len(self.observation_names)
+        self.state_size = state_size(n, self.action_size) + task.EXTRA_STATE
         self.reward_terms, self.failure_causes = tuple(task.REWARD), CAUSES
         self._action = np.zeros((e, n, self.action_size))
         self._previous = np.zeros_like(self._action)
-        self._observation = np.zeros((e, n, OBSERVATION_SIZE), np.float32)
+        self._observation = np.zeros((e, n, self.observation_size), np.float32)
         self._state = np.zeros((e, self.state_size), np.float32)
         self._mass = np.full(e, system.payload_mass)
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
@@ -107,7 +104,7 @@ class MultiliftVec:
         self._action[mask] = self._previous[mask] = 0.0
         self.steps[mask], self._ended[mask] = 0, False
         for e in drawn:
-            start_reference(e, self.world.state, self.reference)
+            self.pilot.start(e)
             self.task.observe(e, e + 1, self._action, self._observation, self._state)
         return self.current()
 
@@ -163,7 +160,7 @@ class MultiliftVec:
         """Return copies of everything that later steps depend on."""
         saved = {f"world.{key}": array for key, array in self.world.state_dict().items()}
         saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
-        saved |= {f"reference.{key}": array.copy() for key, array in self.reference._asdict().items()}
+        saved |= self.pilot.state_dict()
         for name in ("_action", "_observation", "_state", "seeds", "episodes", "steps", "_ended"):
             saved[name] = getattr(self, name).copy()
         return saved
@@ -176,29 +173,24 @@ class MultiliftVec:
                     f"the saved state does not fit these environments: '{key}' has shape "
                     f"{np.shape(saved.get(key))}, expected {array.shape}; use the configuration it was saved with"
                 )
-        groups: dict[str, dict[str, np.ndarray]] = {"world": {}, "task": {}, "reference": {}}
+        groups: dict[str, dict[str, np.ndarray]] = {"world": {}, "task": {}}
         for key, array in saved.items():
             group, _, name = key.partition(".")
-            if name:
+            if group in groups:
                 groups[group][name] = array
-            else:
+            elif not name:
                 getattr(self, key)[:] = array
         self.world.load_state_dict(groups["world"])
         self.task.load_state_dict(groups["task"])
-        for name, array in groups["reference"].items():
-            getattr(self.reference, name)[:] = array
+        self.pilot.load_state_dict(saved)
 
     def _bind(self) -> None:
         """Bind what is called in every step to its arrays, for each shard."""
-        world, task, reference = self.world, self.task, self.reference
         self._calls: dict[int, tuple] = {}
-        for shard in world.shards:
+        for shard in self.world.shards:
             span = (shard.lo, shard.hi)
-            act = self._interface.bind(*span, self._action, task.goal, reference)
-            follow = bind(
-                control, *span, world.state, reference, task.goal.pull, world.thrust, self._gains, *self._smoothing
-            )
-            after = task.after_step(*span, self._action, self._previous, self._observation, self._state)
+            act, follow = self.pilot.bind(*span, self._action, self.task.goal, self.task.planner(*span))
+            after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
             self._calls[shard.lo] = (act, follow, after)
 
     def _advance(self, shard: Shard) -> None:
@@ -206,7 +198,8 @@ class MultiliftVec:
         act, follow, after = self._calls[shard.lo]
         act()
         for _ in range(self.control_ticks):
-            follow()
+            for call in follow:
+                call()
             self.world.advance(shard, self.world.system.control_interval)
         for call in after:
             call()

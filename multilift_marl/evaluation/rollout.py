@@ -81,7 +81,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
     policy.reset()
     running = np.ones(e, bool)
     total, length, settling = np.zeros(e), np.zeros(e), np.zeros(e)
-    square, change = np.zeros(e), np.zeros(e)
+    square, counted, change = np.zeros((3, e))
     final_distance, final_angle, final_steps = np.zeros(e), np.zeros(e), np.zeros(e)
     result = {name: np.zeros(e) for name in _AT_END}
     result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
@@ -93,7 +93,9 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
         total += running * reward.mean(axis=1, dtype=np.float64)
         length += running
         change += running * ((np.clip(action, -1, 1) - previous) ** 2).mean(axis=(1, 2))
-        square += running * errors.distance**2
+        if (step + 1) * dt > vec.task.RMSE_AFTER:
+            square += running * errors.distance**2
+            counted += running
         settling = np.where(running & (errors.distance > SETTLED), (step + 1) * dt, settling)
         if step >= vec.max_steps - round(FINAL_SECONDS / dt):
             final_distance += running * errors.distance
@@ -120,7 +122,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
     return result | {
         "payload_position_error_m": np.where(failed, MAX_DISTANCE, final_distance / steps),
         "payload_attitude_error_deg": np.where(failed, 180.0, final_angle / steps),
-        "payload_rmse_m": np.where(failed, MAX_DISTANCE, np.sqrt(square / np.maximum(length, 1))),
+        "payload_rmse_m": np.where(failed, MAX_DISTANCE, np.sqrt(square / np.maximum(counted, 1))),
         "settling_time_s": np.where(failed, limit, settling),
         "return": total,
         "action_rate": np.sqrt(change / np.maximum(length, 1)),

@@ -14,15 +14,8 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
 from multilift_marl.math3d import add, clip, mat, mul, norm, put, row, scale, sub, tmul, vec
-from multilift_marl.sim.air import (
-    AIR_DENSITY,
-    AirConstants,
-    air_moment,
-    blow,
-    ground_gain,
-    make_air,
-    spread_wash,
-)
+from multilift_marl.sim.air import AIR_DENSITY, air_moment, ground_gain, spread_wash
+from multilift_marl.sim.gusts import blow
 from multilift_marl.sim.scene import Layout
 
 
@@ -62,7 +55,6 @@ class Constants(NamedTuple):
     """Whether those torques are in the world frame in place of the body frame."""
     payload_nq: int
     payload_nv: int
-    air: AirConstants
 
 
 def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: int, cartesian: int) -> Constants:
@@ -96,7 +88,6 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         world_torque=chain,
         payload_nq=layout.payload_nq,
         payload_nv=layout.payload_nv,
-        air=make_air(system),
     )
 
 
@@ -105,7 +96,7 @@ def _lag(h: float) -> tuple[float, float, float]:
 
 
 @kernel
-def apply_loads(rows, lo, hi, thrust, state, plant, air, record, c):
+def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
     """Advance the rotors by one physics step and write the loads of that step into `batch.state`.
 
     The rotor speed follows its command with a first-order lag, one for rising and one for falling. The thrust applied
@@ -117,22 +108,25 @@ def apply_loads(rows, lo, hi, thrust, state, plant, air, record, c):
         rows: `batch.state` of environments lo to hi.
         lo, hi: the environments.
         thrust: commanded thrust of each rotor (E, N, 4) [N].
-        state, plant, air, record: SystemState, Plant, Air, Record of all environments.
+        state, plant, record: SystemState, Plant, Record of all environments.
         c: Constants.
+        air, flow: Air of all environments and AirConstants; both None where all of it is off, for which Numba compiles
+            a version without it.
     """
     for e in range(lo, hi):
         line = rows[e - lo]
         wind = row(plant.wind, e)
-        if c.air.gusts:
-            wind = add(wind, blow(e, wind, state, air, c.timestep, c.air))
-        if c.air.wash:
-            spread_wash(e, state, air, c.air)
+        if flow is not None:
+            if flow.gusts:
+                wind = add(wind, blow(e, wind, state, air, c.timestep, flow))
+            if flow.wash:
+                spread_wash(e, state, air, flow)
         for n in range(thrust.shape[1]):
             total, mx, my, mz, power = 0.0, 0.0, 0.0, 0.0, 0.0
             for k in range(4):
                 before = state.rotor_speed[e, n, k]
                 target = sqrt(max(thrust[e, n, k], 0.0) / c.thrust_coefficient)
-                target = clip(target, c.speed_min, c.speed_max)
+                target = 0.0 if plant.motors_off[e, n] else clip(target, c.speed_min, c.speed_max)
                 gap = before - target
                 decay, mean_first, mean_second = c.falling if gap > 0.0 else c.rising
                 after = target + gap * decay
@@ -144,15 +138,18 @@ def apply_loads(rows, lo, hi, thrust, state, plant, air, record, c):
                 my -= c.rotor_positions[k, 0] * f
                 mz += c.rotor_spin[k] * c.torque_ratio * f
                 power += c.torque_ratio * f * 0.5 * (before + after)
-            if c.air.ground_effect:
-                gain = ground_gain(state.drone_position[e, n, 2], c.air)
-                total, mx, my = gain * total, gain * mx, gain * my
             attitude = mat(state.drone_rotation, e, n)
-            here = add(wind, vec(air.wash, e, n)) if c.air.wash else wind
+            here = wind
+            if flow is not None:
+                here = add(wind, vec(air.wash, e, n))
             through = tmul(attitude, sub(vec(state.drone_velocity, e, n), here))
-            if c.air.moments:
-                more = air_moment(e, n, through, state, c.air)
-                mx, my = mx + more[0], my + more[1]
+            if flow is not None:
+                if flow.ground_effect:
+                    gain = ground_gain(state.drone_position[e, n, 2], flow)
+                    total, mx, my = gain * total, gain * mx, gain * my
+                if flow.moments:
+                    more = air_moment(e, n, through, state, flow)
+                    mx, my = mx + more[0], my + more[1]
             body = (-c.drag[0] * through[0], -c.drag[1] * through[1], total - c.drag[2] * through[2])
             torque = (mx, my, mz)
             if c.world_torque:
@@ -161,7 +158,9 @@ def apply_loads(rows, lo, hi, thrust, state, plant, air, record, c):
             put(line[at : at + 3], mul(attitude, body))
             put(line[at + 3 : at + 6], torque)
             record.energy[e] += c.timestep * power
-        here = add(wind, vec(air.wash, e, thrust.shape[1])) if c.air.wash else wind
+        here = wind
+        if flow is not None:
+            here = add(wind, vec(air.wash, e, thrust.shape[1]))
         through = sub(row(state.payload_velocity, e), here)
         drag = scale(-c.payload_drag * norm(through), through)
         put(line[c.force : c.force + 3], add(drag, row(plant.payload_force, e)))

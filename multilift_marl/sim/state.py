@@ -56,6 +56,8 @@ class Plant(NamedTuple):
     """(E, 3) constant external force on the payload's centre of mass, world frame [N]."""
     wind: np.ndarray
     """(E, 3) air velocity, world frame [m/s]."""
+    motors_off: np.ndarray
+    """(E, N) bool, drones whose motors have stopped; `World.load` starts them again."""
 
 
 class Air(NamedTuple):

@@ -15,11 +15,12 @@ from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
-from multilift_marl.sim.air import start_turbulence
+from multilift_marl.sim.air import make_air
 from multilift_marl.sim.breaking import cut_cables
 from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.chain import make_chain, read_chains, write_chains
 from multilift_marl.sim.dynamics import apply_loads, make_constants
+from multilift_marl.sim.gusts import start_turbulence
 from multilift_marl.sim.rows import hover_drone, read_rows, write_rows
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.state import Air, Plant, Record, SystemState
@@ -62,11 +63,14 @@ class World:
         air: what blows beside the mean wind.
         record: what accumulated since the reset.
         diverged: (E,) bool, until reset.
+        breakable: whether `state.cable_broken` is looked at after every physics step.
     """
 
     def __init__(self, system: System, num_envs: int, num_threads: int = 0, seed: int = 0):
         if num_envs < 1 or num_threads < 0:
             raise ValueError(f"num_envs={num_envs} must be at least 1 and num_threads={num_threads} at least 0")
+        if seed < 0:
+            raise ValueError(f"seed={seed} must be at least 0")
         _quiet_mujoco()
         self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
         self.model, self.layout = build_model(system)
@@ -76,11 +80,12 @@ class World:
             payload_mass=np.full(num_envs, system.payload_mass),
             payload_force=np.zeros((num_envs, 3)),
             wind=np.tile(system.wind, (num_envs, 1)),
+            motors_off=np.zeros((num_envs, system.num_drones), bool),
         )
         self.air, self.seed = Air.zeros(num_envs, self.num_drones), seed
         self.record = Record.zeros(num_envs)
         self.diverged = np.zeros(num_envs, bool)
-        self._breakable = bool(np.isfinite(system.breaking_load).any())
+        self.breakable = bool(np.isfinite(system.breaking_load).any())
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool, self._pool_owner = None, 0
         self.reset()
@@ -139,7 +144,7 @@ class World:
             except SimulationError as error:
                 self.diverged[shard.lo + np.asarray(error.ids, int)] = True
             shard.read()
-            if self._breakable:
+            if self.breakable:
                 self._cut(shard)
 
     def run(self, work: Callable[[Shard], None]) -> None:
@@ -202,9 +207,9 @@ class World:
     def load(self, mask: np.ndarray) -> None:
         """Make `state` of the environments in `mask` (E,) the simulations' own.
 
-        Records and gusts start anew, cables are whole.
+        Records and gusts start anew, cables are whole, motors run.
         """
-        self.state.cable_broken[mask] = False
+        self.state.cable_broken[mask] = self.plant.motors_off[mask] = False
         self.air.gust[mask] = self.air.wash[mask] = self.air.steps[mask] = 0
         for shard in self.shards:
             local = mask[shard.lo : shard.hi]
@@ -269,8 +274,11 @@ class World:
             offsets = [_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied", "xfrc_applied")]
             constants = make_constants(self.system, self.layout, *offsets)  # the same for every shard
             self.constants = (constants, make_chain(self.system)) if chain else (constants,)
+            flow = make_air(self.system)
+            air, flow = (None, None) if flow.still else (self.air, flow)
             span, told = (batch.state, lo, hi), batch.bind("sensordata")
-            apply = bind(apply_loads, *span, self.thrust, self.state, self.plant, self.air, self.record, constants)
+            blown = (self.thrust, self.state, self.plant, self.record, constants, air, flow)
+            apply = bind(apply_loads, *span, *blown)
             follow = bind(read, *span, told, self.state, self.record, self.diverged, *self.constants)
             shards.append(Shard(lo, hi, batch, step, apply, follow, np.zeros((hi - lo, self.num_drones), bool)))
         return shards

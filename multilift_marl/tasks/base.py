@@ -13,18 +13,19 @@ from multilift_marl.config.validate import validate
 from multilift_marl.control.formation import Goal, Reference, Rig
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.world import World
-from multilift_marl.tasks.failures import find_failures, make_limits
-from multilift_marl.tasks.observations import observe_team
+from multilift_marl.tasks.failures import Watch, find_failures, make_limits
+from multilift_marl.tasks.observations import Component, observe_team
+from multilift_marl.tasks.starts import make_hanging
 from multilift_marl.tasks.terms import Errors, measure
 
 INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
 
 
 @kernel
-def check_team(lo, hi, state, goal, errors, dt, limits, cause, min_separation):
+def check_team(lo, hi, state, goal, errors, dt, limits, watch, cause, min_separation):
     """Measure the errors of environments lo to hi, integrate them over `dt` [s], look for failures."""
     measure(lo, hi, state, goal, errors, dt, INTEGRAL_LIMIT)
-    find_failures(lo, hi, state, errors, limits, cause, min_separation)
+    find_failures(lo, hi, state, errors, limits, watch, cause, min_separation)
 
 
 class Task:
@@ -38,6 +39,10 @@ class Task:
         name: registry name.
         Options: its `task_options`, typed.
         REWARD: default weight of every reward term; `reward.<term>` overrides.
+        EXTRA: what its observations have beside the common components.
+        EXTRA_STATE: how many numbers it adds to the global state.
+        RMSE_AFTER: time from which `payload_rmse_m` counts [s].
+        KEPT: names of further arrays, environment first, that outlive a step.
 
     Attributes:
         goal, errors: Goal, Errors; live arrays.
@@ -45,25 +50,32 @@ class Task:
         terms: weighted reward terms (E, T) in the order of `REWARD`.
         good_time: time since the payload was last outside the success region (E,) [s].
         min_separation: smallest distance between drones in the episode (E,) [m].
+        watch: failures that do not count for now.
+        time: since the start, for tasks with a plan (E,) [s].
     """
 
     name: ClassVar[str]
     Options: ClassVar[type[Section]] = Section
     REWARD: ClassVar[dict[str, float]] = {}
+    EXTRA: ClassVar[tuple[Component, ...]] = ()
+    EXTRA_STATE: ClassVar[int] = 0
+    RMSE_AFTER: ClassVar[float] = 0.0
+    KEPT: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: Config, world: World, reference: Reference):
         e, n, system = world.num_envs, world.num_drones, world.system
         self.world, self.reference = world, reference
         self.options = validate(self.Options, config.task_options, "task_options")
         self.weights = self._weights(config.reward)
-        self.dt = 1.0 / config.env.policy_hz
+        self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
         self.rig = Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull)
-        self.limits = make_limits(system)
+        self.limits, self.hanging = make_limits(system), make_hanging(system)
         tension = system.resting_tension
         self._nominal = np.append(np.stack([system.cable_length, tension], axis=1), [[system.payload_mass, 0]], axis=0)
         self.cause, self.good_time = np.zeros(e, np.int64), np.zeros(e)
-        self.min_separation = np.zeros(e)
+        self.min_separation, self.time = np.zeros(e), np.zeros(e)
+        self.watch = Watch.zeros(e, n)
         self.terms = np.zeros((e, len(self.REWARD)))
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
@@ -83,10 +95,21 @@ class Task:
         """Return which environments (E,) would be successes if they ended now."""
         raise NotImplementedError
 
+    def planner(self, lo: int, hi: int) -> Callable[[], None] | None:
+        """Return what moves the goals of environments lo to hi on by one control step; None if they stay.
+
+        It adds `control_dt` to `time` and writes goal and its velocities for that moment.
+        """
+        return None
+
+    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None] | None:
+        """Return what writes `EXTRA` and `EXTRA_STATE`, the last numbers of each row, of environments lo to hi."""
+        return None
+
     def begin(self, env: int) -> bool:
         """Reset the measurements of one environment to its drawn start; return whether that start is sound."""
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
-        self.good_time[env], self.min_separation[env], self.terms[env] = 0.0, 1e9, 0.0
+        self.good_time[env], self.min_separation[env], self.terms[env], self.time[env] = 0.0, 1e9, 0.0, 0.0
         self.check(env, env + 1, 0.0)
         return self.cause[env] == 0
 
@@ -97,20 +120,24 @@ class Task:
     def observe(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> None:
         """Write observations (E, N, D) and global states (E, S) of environments lo to hi."""
         observe_team(*self._observed(lo, hi, action, observation, critic))
+        if extra := self.observer(lo, hi, observation, critic):
+            extra()
 
     def after_step(
         self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray, observation: np.ndarray, critic: np.ndarray
     ) -> list[Callable[[], None]]:
         """Return what is called in turn for environments lo to hi after each policy step: check, score, observe."""
+        extra = self.observer(lo, hi, observation, critic)
         return [
             bind(check_team, *self._checked(lo, hi, self.dt)),
             self.scorer(lo, hi, action, previous),
             bind(observe_team, *self._observed(lo, hi, action, observation, critic)),
+            *([extra] if extra else []),
         ]
 
     def _checked(self, lo: int, hi: int, dt: float) -> tuple:
         state, errors = self.world.state, self.errors
-        return lo, hi, state, self.goal, errors, dt, self.limits, self.cause, self.min_separation
+        return lo, hi, state, self.goal, errors, dt, self.limits, self.watch, self.cause, self.min_separation
 
     def _observed(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> tuple:
         state, plant, goal, reference = self.world.state, self.world.plant, self.goal, self.reference
@@ -118,8 +145,9 @@ class Task:
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""
-        saved = {name: getattr(self, name).copy() for name in ("cause", "good_time", "min_separation")}
-        for group in ("goal", "errors"):
+        kept = ("cause", "good_time", "min_separation", "time", *self.KEPT)
+        saved = {name: getattr(self, name).copy() for name in kept}
+        for group in ("goal", "errors", "watch"):
             saved |= {f"{group}.{name}": array.copy() for name, array in getattr(self, group)._asdict().items()}
         return saved
 

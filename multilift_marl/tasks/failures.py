@@ -21,16 +21,32 @@ CAUSES = (
     "below_payload",  # a drone lower than the payload
     "tilt",  # a drone tilted over 80°
     "cable_broken",  # its tension has exceeded cable.breaking_load
+    "wall",  # anything touches a wall (task gate)
     "out_of_range",  # payload over 3 m from its target, whatever the vehicle
     "diverged",  # the simulation has failed, not the team
 )
-_GROUND, _COLLISION, _CROSSING, _CABLE, _BELOW, _TILT, _BROKEN, _RANGE, DIVERGED = range(1, len(CAUSES))
+GROUND, COLLISION, CROSSING, CABLE, BELOW, TILT, BROKEN, WALL, RANGE, DIVERGED = range(1, len(CAUSES))
+LOAD_GROUND = 0  # the payload's contact with the ground, to be forgiven apart from the drones'
 
 MAX_DISTANCE = 3.0  # [m]
 _CABLE_DISTANCE = 0.1  # [m] for the span of a falcon
 _TOUCH = 0.005  # [m]
 _MIN_UP = cos(radians(80.0))
 _MIN_CABLE_PAYLOAD = cos(radians(135.0))
+
+
+class Watch(NamedTuple):
+    """What does not count as a failure for now; all zero unless a task says otherwise."""
+
+    forgiven: np.ndarray
+    """(E,) int64, a bit for every cause, see `forgive`."""
+    lost: np.ndarray
+    """(E, N) bool, drones that count no more."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, num_drones: int) -> Watch:
+        """Return a watch that forgives nothing."""
+        return cls(np.zeros(num_envs, np.int64), np.zeros((num_envs, num_drones), bool))
 
 
 class Limits(NamedTuple):
@@ -73,46 +89,63 @@ def make_limits(system: System) -> Limits:
 
 
 @kernel
-def find_failures(lo, hi, state, errors, limits, cause, min_separation):
+def find_failures(lo, hi, state, errors, limits, watch, cause, min_separation):
     """Write the first failure cause (0: none) of environments lo to hi; update the least separation (E,) [m]."""
     for e in range(lo, hi):
-        cause[e] = _cause(e, state, errors, limits, min_separation)
+        cause[e] = _cause(e, state, errors, limits, watch, min_separation)
+
+
+def forgive(*causes: int) -> int:
+    """Return the value of `Watch.forgiven` that lets pass `causes`."""
+    return sum(1 << cause for cause in causes)
 
 
 @kernel
-def _cause(e, state, errors, limits, min_separation):
+def _counts(cause, forgiven):
+    """Return whether a cause is a failure."""
+    return (forgiven >> cause) & 1 == 0
+
+
+@kernel
+def _cause(e, state, errors, limits, watch, min_separation):
+    forgiven = watch.forgiven[e]
     payload, attitude = row(state.payload_position, e), matrow(state.payload_rotation, e)
     up = column(attitude, 2)
     count = state.drone_position.shape[1]
     if not errors.distance[e] <= MAX_DISTANCE:
-        return _RANGE
+        return RANGE
     half, center = limits.payload_half, add(payload, mul(attitude, limits.payload_center))
     below = _round_extent(attitude, half) if limits.payload_round else _extent(attitude, half)
-    if center[2] - below < _TOUCH:
-        return _GROUND
+    if center[2] - below < _TOUCH and _counts(LOAD_GROUND, forgiven):
+        return GROUND
     for n in range(count):
+        if watch.lost[e, n]:
+            continue
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
         anchor = add(payload, mul(attitude, (limits.anchors[n, 0], limits.anchors[n, 1], limits.anchors[n, 2])))
         cable = unit(sub(drone, anchor))
-        if drone[2] - _extent(frame, limits.drone_half) < _TOUCH:
-            return _GROUND
-        if state.cable_broken[e, n]:
-            return _BROKEN
-        if frame[8] < _MIN_UP:
-            return _TILT
-        if drone[2] < payload[2]:
-            return _BELOW
+        if drone[2] - _extent(frame, limits.drone_half) < _TOUCH and _counts(GROUND, forgiven):
+            return GROUND
+        if state.cable_broken[e, n] and _counts(BROKEN, forgiven):
+            return BROKEN
+        if frame[8] < _MIN_UP and _counts(TILT, forgiven):
+            return TILT
+        if drone[2] < payload[2] and _counts(BELOW, forgiven):
+            return BELOW
         if dot(cable, column(frame, 2)) < 0.0 or dot(cable, up) < _MIN_CABLE_PAYLOAD:
-            return _CABLE
+            if _counts(CABLE, forgiven):
+                return CABLE
         for m in range(n):
+            if watch.lost[e, m]:
+                continue
             other = vec(state.drone_position, e, m)
             apart = norm(sub(drone, other))
             min_separation[e] = min(min_separation[e], apart)
-            if apart < limits.separation:
-                return _COLLISION
+            if apart < limits.separation and _counts(COLLISION, forgiven):
+                return COLLISION
             foot = add(payload, mul(attitude, (limits.anchors[m, 0], limits.anchors[m, 1], limits.anchors[m, 2])))
-            if segment_distance(anchor, drone, foot, other) < limits.cables[n, m]:
-                return _CROSSING
+            if segment_distance(anchor, drone, foot, other) < limits.cables[n, m] and _counts(CROSSING, forgiven):
+                return CROSSING
     return 0
 
 

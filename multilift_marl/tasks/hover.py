@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, pi, radians, sin, sqrt
-from typing import ClassVar, NamedTuple
+from math import radians
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section
-from multilift_marl.config.system import GRAVITY
-from multilift_marl.control.formation import Reference, place_formation
+from multilift_marl.control.formation import Reference
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import (
-    add,
-    axis_angle,
-    heading,
-    matmul,
-    matrow,
-    mul,
     norm,
-    put,
-    putmat,
-    rot_z,
-    scale,
-    sub,
-    vec,
 )
-from multilift_marl.sim.cables import cable_end
-from multilift_marl.sim.rows import hover_drone
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.terms import tolerance
+from multilift_marl.tasks.starts import StartRanges, start_near_target
+from multilift_marl.tasks.terms import mean_change, tolerance
 
 
 class HoverOptions(Section):
@@ -72,15 +58,12 @@ class Hover(Task):
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, displacement, tilt and velocity; see `Task.start`."""
-        option, world, vehicle = self.options, self.world, self.world.system.vehicle
+        option = self.options
         ranges = StartRanges(
             option.target_xy, *option.target_height, radians(option.target_yaw),
             option.start_radius, radians(option.start_tilt), option.start_speed,
         )  # fmt: skip
-        load = mass / world.system.payload_mass
-        cables = (world.system.cable_length, world.system.cable_stiffness, world.system.cable_mass * GRAVITY)
-        team = (world.system.cable_segments, load, vehicle.mass, vehicle.thrust_coefficient)
-        _start(env, rng, world.state, self.goal, self.rig, ranges, cables, team)
+        start_near_target(env, rng, self.world.state, self.goal, self.rig, ranges, self.hanging, mass)
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
@@ -95,76 +78,17 @@ class Hover(Task):
         return self.good_time >= self._success_seconds - 1e-9
 
 
-class StartRanges(NamedTuple):
-    """HoverOptions of the start, in SI units."""
-
-    xy: float
-    low: float
-    high: float
-    yaw: float
-    radius: float
-    tilt: float
-    speed: float
-
-
-@kernel
-def in_ball(rng, radius):
-    """Return a vector uniform in a ball."""
-    z, azimuth = rng.uniform(-1.0, 1.0), rng.uniform(-pi, pi)
-    r = radius * rng.uniform(0.0, 1.0) ** (1.0 / 3.0)
-    flat = r * sqrt(1.0 - z * z)
-    return (flat * cos(azimuth), flat * sin(azimuth), r * z)
-
-
-@kernel
-def _start(e, rng, state, goal, rig, ranges, cables, team):
-    cable_length, cable_stiffness, cable_weight = cables
-    segments, load, drone_mass, thrust_coefficient = team
-    x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
-    put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))
-    putmat(goal.rotation[e], rot_z(rng.uniform(-ranges.yaw, ranges.yaw)))
-    place_formation(e, goal, rig)
-    moved = in_ball(rng, ranges.radius)
-    axis = in_ball(rng, 1.0)
-    tilt = axis_angle(scale(1.0 / max(norm(axis), 1e-9), axis), rng.uniform(0.0, ranges.tilt))
-    velocity = in_ball(rng, ranges.speed)
-    payload = add((goal.position[e, 0], goal.position[e, 1], goal.position[e, 2]), moved)
-    attitude = matrow(goal.rotation, e)
-    if np.any(rig.anchors != 0.0):  # a point has no attitude: it counts as aligned
-        attitude = matmul(tilt, attitude)
-    put(state.payload_position[e], payload)
-    put(state.payload_velocity[e], velocity)
-    putmat(state.payload_rotation[e], attitude)
-    state.payload_body_rates[e] = 0.0
-    for n in range(rig.slots.shape[0]):
-        anchor = add(payload, mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
-        cable = sub(add(vec(goal.slots, e, n), moved), anchor)
-        direction = scale(1.0 / norm(cable), cable)
-        half = (0.0, 0.0, 0.5 * cable_weight[n])
-        tension = load * norm(sub(vec(goal.pull, e, n), half))  # in the middle, whose direction is the cable's
-        end = cable_end(direction, tension, cable_length[n], cable_stiffness[n], segments[n], cable_weight[n])
-        put(state.drone_position[e, n], add(anchor, end))
-        put(state.drone_velocity[e, n], velocity)
-        state.drone_body_rates[e, n] = 0.0
-        pull = add(scale(tension, direction), half)
-        hover_drone(e, n, state, pull, heading(matrow(goal.rotation, e)), drone_mass, thrust_coefficient)
-
-
 @kernel
 def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms, good_time):
     for e in range(lo, hi):
         distance, angle = errors.distance[e], errors.angle[e]
         speed = norm((state.payload_velocity[e, 0], state.payload_velocity[e, 1], state.payload_velocity[e, 2]))
         spin = norm((state.payload_body_rates[e, 0], state.payload_body_rates[e, 1], state.payload_body_rates[e, 2]))
-        change, count = 0.0, action.shape[1] * action.shape[2]
-        for n in range(action.shape[1]):
-            for k in range(action.shape[2]):
-                change += (action[e, n, k] - previous[e, n, k]) ** 2
         terms[e, 0] = weights[0] * tolerance(distance, 0.25)
         terms[e, 1] = weights[1] * tolerance(distance, 0.01)
         terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
         terms[e, 3] = weights[3] * tolerance(angle, radians(1.0))
         terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
-        terms[e, 5] = weights[5] * change / count
+        terms[e, 5] = weights[5] * mean_change(e, action, previous)
         good = distance <= success[0] and angle <= success[1]
         good_time[e] = good_time[e] + dt if good else 0.0

@@ -42,16 +42,26 @@ OBSERVATION = (
     Component("payload_error_integral", 3, "slot", "m s", "clipped integral of payload_error"),
     Component("rotation_error_integral", 3, "slot", "rad s", "clipped integral of payload_rotation_error"),
     Component("slot_direction", 2, "target", "-", "cosine and sine of the own slot's azimuth"),
-    Component("previous_action", 4, "-", "-", "own last action"),
+    Component("previous_action", 4, "-", "-", "own last action"),  # as many as the action interface has
 )
-OBSERVATION_SIZE = sum(component.size for component in OBSERVATION)
-STATE_SHARED = 26  # numbers of the global state that belong to no drone; see observe_team
-STATE_DRONE = 20  # numbers for each drone
+_STATE_SHARED = 26  # numbers of the global state that belong to no drone; see observe_team
+_STATE_DRONE = 16  # numbers for each drone, beside its action
 
 
-def observation_names() -> tuple[str, ...]:
-    """Return the name of every number in an observation, such as "velocity_1"."""
-    return tuple(f"{part.name}_{i}" for part in OBSERVATION for i in range(part.size))
+def observation_names(action_size: int, extra: tuple[Component, ...] = ()) -> tuple[str, ...]:
+    """Return the name of every number in an observation, such as "velocity_1".
+
+    Args:
+        action_size: numbers of an action.
+        extra: what a task adds.
+    """
+    components = (*OBSERVATION[:-1], OBSERVATION[-1]._replace(size=action_size), *extra)
+    return tuple(f"{part.name}_{i}" for part in components for i in range(part.size))
+
+
+def state_size(num_drones: int, action_size: int) -> int:
+    """Return how many numbers the global state holds."""
+    return _STATE_SHARED + num_drones * (_STATE_DRONE + action_size)
 
 
 @kernel
@@ -72,7 +82,7 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
     Args:
         lo, hi: the environments.
         state, plant, goal, reference, errors: see their types.
-        action: previous actions (E, N, 4).
+        action: previous actions (E, N, A).
         rig: the nominal formation.
         nominal: cable length and tension (N, 2) and, in its last row, payload mass [m, N, kg].
         observation, critic: written.
@@ -133,7 +143,7 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
             at = _write(out, at, turn(c, s, tracking_error))
             out[at] = state.cable_tension[e, n] / nominal[n, 1] - 1.0
             at += 1
-            for k in range(4):
+            for k in range(action.shape[2]):
                 own[i + k] = action[e, n, k]
                 out[at + k] = action[e, n, k]
-            at += 4
+            at += action.shape[2]

@@ -16,6 +16,16 @@ def tolerance(value, margin):
     return 1.0 / (1.0 + (value / margin) ** 2)
 
 
+@kernel
+def mean_change(e, action, previous):
+    """Return the mean square of how an action (E, N, A) of environment e differs from the last one."""
+    change, count = 0.0, action.shape[1] * action.shape[2]
+    for n in range(action.shape[1]):
+        for k in range(action.shape[2]):
+            change += (action[e, n, k] - previous[e, n, k]) ** 2
+    return change / count
+
+
 class Errors(NamedTuple):
     """How far the payload is from its goal."""
 

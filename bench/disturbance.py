@@ -1,0 +1,171 @@
+"""How far wind and a payload heavier than thought move the drones, with each `control.disturbance`.
+
+    python bench/disturbance.py [rigs=falcon4] [seconds=30] [any configuration key]
+
+A team hovers, then flies a circle of 5 m with its yaw along the path, at 0.2 and at 0.4 rad/s (1 and 2 m/s). The drones
+are told where to be, with all derivatives, and feed forward the nominal load and drag; the payload is not controlled.
+Printed are the mean distances of the drones from their places over the last `seconds`, and in brackets the payload's
+from its own; then how fast a swing of the payload dies out. `rigs` may name several, as rigs=falcon4,report4.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from multilift_marl.config import Config, load_config, parse_overrides
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
+from multilift_marl.control.formation import Reference
+from multilift_marl.control.geometric import fly, make_gains
+from multilift_marl.sim.world import REST_HEIGHT, World
+
+RADIUS = 5.0  # [m]
+START, RAMP = 10.0, 6.0  # [s] before anything is counted, and of it to gather speed
+CASES = {  # true payload mass over nominal, mean wind [m/s], gust amplitude [m/s] and frequency [rad/s]
+    "nominal": (1.0, 0.0, 0.0, 0.0),
+    "payload +20 %": (1.2, 0.0, 0.0, 0.0),
+    "payload -20 %": (0.8, 0.0, 0.0, 0.0),
+    "wind 5 m/s": (1.0, 5.0, 0.0, 0.0),
+    "both (+20 %)": (1.2, 5.0, 0.0, 0.0),
+    "wind 5 ± 2 m/s, 0.3 rad/s": (1.0, 5.0, 2.0, 0.3),
+    "wind 5 ± 2 m/s, 1 rad/s": (1.0, 5.0, 2.0, 1.0),
+}
+
+
+class Flight:
+    """Teams of one rig whose drones are told to hold their formation, or to follow `reference`.
+
+    Args:
+        config: rig and rejection.
+        mass: true payload mass over nominal (E,).
+    """
+
+    def __init__(self, config: Config, mass: np.ndarray):
+        self.system, self.dt, self.kind = config.system, 1 / config.sim.control_hz, config.control.disturbance
+        e, n = len(mass), self.system.num_drones
+        self.world, self.reference = World(self.system, e, 1), Reference.zeros(e, n)
+        self.world.set_payload_mass(np.ones(e, bool), mass * self.system.payload_mass)
+        self.gains = make_gains(config.control, self.system)
+        self.pull = np.broadcast_to(self.system.drone_pull, (e, n, 3)).copy()
+        self.slots = self.system.slots + [0, 0, REST_HEIGHT]
+        self.reference.position[:] = self.slots
+        self.disturbance = Disturbance.zeros(e, n)
+        if self.kind != "none":
+            self.rejection = make_rejection(config.control, self.system, self.gains, self.dt)
+        self.begin()
+
+    def begin(self) -> None:
+        """Start from what stands in `world.state`."""
+        self.world.load(np.ones(self.world.num_envs, bool))
+        for e in range(self.world.num_envs):
+            forget(e, self.world.state, self.disturbance)
+
+    def reject(self) -> None:
+        """Bring the estimates up to date."""
+        known, own = (self.world.state, self.reference, self.pull), (self.disturbance, self.gains, self.rejection)
+        REJECTIONS[self.kind](0, self.world.num_envs, *known, *own)
+
+    def step(self) -> None:
+        """Fly one control step."""
+        pull, thrust = self.pull, self.world.thrust
+        if self.kind != "none":
+            self.reject()
+            pull = self.disturbance.pull
+        fly(0, self.world.num_envs, self.world.state, self.reference, pull, thrust, self.gains)
+        self.world.step(thrust, self.system.control_interval)
+
+
+def circle(t: float, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, float]:
+    """Return position, velocity, acceleration and jerk (3,) on the circle, yaw and yaw rate at time t [s]."""
+    s = min(t / RAMP, 1.0)
+    angle = rate * RAMP * (s**4 * (2.5 - 3 * s + s**2)) + rate * max(t - RAMP, 0.0)
+    w = rate * s**3 * (10 - 15 * s + 6 * s**2)
+    w1 = rate / RAMP * 30 * s**2 * (1 - s) ** 2
+    w2 = rate / RAMP**2 * 60 * s * (1 - s) * (1 - 2 * s)
+    outward, along = np.array([np.cos(angle), np.sin(angle), 0]), np.array([-np.sin(angle), np.cos(angle), 0])
+    velocity, acceleration = w * along, w1 * along - w**2 * outward
+    jerk = (w2 - w**3) * along - 3 * w * w1 * outward
+    return RADIUS * (outward - [1, 0, 0]), RADIUS * velocity, RADIUS * acceleration, RADIUS * jerk, angle, w
+
+
+def fly_cases(config: Config, rate: float, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean distances from their places [m] of the drones and of the payload, (cases,) each.
+
+    Args:
+        config: rig and rejection.
+        rate: angular velocity on the circle [rad/s]; 0 to hover.
+        seconds: how long to measure [s].
+    """
+    cases = np.array(list(CASES.values()))
+    flight = Flight(config, cases[:, 0])
+    state, reference, rest = flight.world.state, flight.reference, np.array([0, 0, REST_HEIGHT])
+    drones, payload, counted = np.zeros(len(cases)), np.zeros(len(cases)), 0
+    for tick in range(round((START + seconds) / flight.dt)):
+        t = tick * flight.dt
+        flight.world.plant.wind[:, 0] = cases[:, 1] + cases[:, 2] * np.sin(cases[:, 3] * t)
+        position, velocity, acceleration, jerk, yaw, yaw_rate = circle(t, rate)
+        reference.position[:], reference.velocity[:] = flight.slots + position, velocity
+        reference.acceleration[:], reference.jerk[:] = acceleration, jerk
+        reference.yaw[:], reference.yaw_rate[:] = yaw, yaw_rate
+        if t >= START:
+            drones += np.linalg.norm(state.drone_position - reference.position, axis=-1).mean(axis=1)
+            payload += np.linalg.norm(state.payload_position - rest - position, axis=-1)
+            counted += 1
+        flight.step()
+    if flight.world.diverged.any():
+        raise RuntimeError(
+            f"{flight.kind} at {rate:g} rad/s has diverged: {list(CASES)[flight.world.diverged.argmax()]}"
+        )
+    return drones / counted, payload / counted
+
+
+def swing_decay(config: Config, seconds: float) -> np.ndarray:
+    """Return the least rate [1/s] at which swings of payloads of 0.8, 1 and 1.2 of the nominal mass die out, (3,).
+
+    They start at 0.3 m/s and 0.3 rad/s, about either axis; counted from 6 s on, `seconds` long.
+    """
+    flight = Flight(config, np.array([0.8, 1.0, 1.2] * 2))
+    state = flight.world.state
+    state.payload_velocity[:3, 0] = state.payload_velocity[3:, 1] = 0.3
+    if flight.system.payload_shape != "point":
+        state.payload_body_rates[:3, 2] = state.payload_body_rates[3:, 0] = 0.3
+    flight.begin()
+
+    def most(duration: float) -> np.ndarray:
+        speed = np.zeros(6)
+        for _ in range(round(duration / flight.dt)):
+            flight.step()
+            spin = np.linalg.norm(state.payload_body_rates, axis=1) * (flight.system.payload_shape != "point")
+            speed = np.maximum(speed, np.linalg.norm(state.payload_velocity, axis=1) + 0.2 * spin)
+        return speed
+
+    most(4.0)
+    early, _, late = most(2.0), most(seconds), most(2.0)
+    return np.log(early / late).reshape(2, 3).min(axis=0) / (seconds + 2.0)
+
+
+def main(arguments: list[str]) -> None:
+    """Measure and print two tables for each rig."""
+    values = parse_overrides(arguments)
+    seconds = float(values.pop("seconds", 30.0))
+    for rig in str(values.pop("rigs", "falcon4")).split(","):
+        told = {"control.drag_feedforward": True} | values
+        configs = {
+            kind: load_config(f"rigs/{rig}", told | {"control.disturbance": kind}) for kind in ("none", *REJECTIONS)
+        }
+        print(f"\n{rig}: drones' error [cm], mean over {seconds:g} s (payload's)\n")
+        columns = [(rate, kind) for rate in (0.0, 0.2, 0.4) for kind in configs]
+        print("| | " + " | ".join(f"{f'{rate:g} rad/s' if rate else 'hover'}, {kind}" for rate, kind in columns) + " |")
+        print("|---" * (len(columns) + 1) + "|")
+        flown = [fly_cases(configs[kind], rate, seconds) for rate, kind in columns]
+        for i, case in enumerate(CASES):
+            cells = [f"{100 * drones[i]:.2f} ({100 * payload[i]:.1f})" for drones, payload in flown]
+            print(f"| {case} | " + " | ".join(cells) + " |")
+        print(f"\n{rig}: decay of a swing [1/s] with 0.8, 1, 1.2 of the payload's mass\n")
+        for kind, config in configs.items():
+            print(f"| {kind} | " + ", ".join(f"{rate:.2f}" for rate in swing_decay(config, seconds / 3)) + " |")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

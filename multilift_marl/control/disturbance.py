@@ -1,0 +1,141 @@
+"""Rejection of unknown forces on a drone: wind, a payload heavier than thought, or whatever else moves it.
+
+The estimate is an additional pull that the drone has to overcome. It is added to the nominal pull of its cable, so that
+whatever flies with the one flies with the other.
+"""
+
+from __future__ import annotations
+
+from math import exp, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.schema import ControlConfig
+from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.control.geometric import Gains
+from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale, sub, tmul, vec
+
+# Bandwidth over ω_p m/(m + m_L), at most: ω_p of the position loop, m and m_L the masses of a drone and of its load.
+# The share m_L/(m + m_L) of a thrust comes back as pull of the cable, which slows any loop around the drone. Faster,
+# the rejection would drive a payload that swings slower than the drones move, in place of damping it.
+BANDWIDTH = {"integral": 0.5, "indi": 1.0}
+
+
+class Disturbance(NamedTuple):
+    """What the rejection remembers."""
+
+    force: np.ndarray
+    """(E, N, 3) estimated force that the drone has to overcome beside the nominal ones, world frame [N]."""
+    velocity: np.ndarray
+    """(E, N, 3) of the drone one control step ago [m/s]."""
+    pull: np.ndarray
+    """(E, N, 3) nominal pull and estimate: what the drone flies with [N]."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, num_drones: int) -> Disturbance:
+        """Return estimates of zero."""
+        return cls(*(np.zeros((num_envs, num_drones, 3)) for _ in cls._fields))
+
+
+class Rejection(NamedTuple):
+    """Numbers of a rejection."""
+
+    dt: float
+    """Control step [s]."""
+    share: float
+    """Of the gap to the measured force that the filtered one closes in a step, 1 - exp(-ω dt)."""
+    gain: float
+    """Of the integral, m k_p ω [N/(m s)]."""
+    largest: float
+    """Limit of the estimate [N]."""
+    thrust_coefficient: float
+
+
+def make_rejection(control: ControlConfig, system: System, g: Gains, dt: float) -> Rejection:
+    """Return the numbers of `control.disturbance`, "integral" or "indi", for control steps of dt [s]."""
+    own_share = g.mass / (g.mass + max(g.load_share.max(), 0.0))
+    frequency = min(control.disturbance_frequency, BANDWIDTH[control.disturbance] * sqrt(g.k_p) * own_share)
+    return Rejection(
+        dt=dt,
+        share=1 - exp(-frequency * dt),
+        gain=g.mass * g.k_p * frequency,
+        largest=control.disturbance_limit * g.mass * GRAVITY,
+        thrust_coefficient=system.vehicle.thrust_coefficient,
+    )
+
+
+@kernel
+def rotor_force(e, n, state, thrust_coefficient):
+    """Return the force of drone n's rotors at their present speeds, Σ b ω² R e3 [N]."""
+    total = 0.0
+    for k in range(4):
+        total += thrust_coefficient * state.rotor_speed[e, n, k] ** 2
+    return scale(total, column(mat(state.drone_rotation, e, n), 2))
+
+
+@kernel
+def forget(e, state, disturbance):
+    """Let the estimates of environment e start anew."""
+    for n in range(disturbance.force.shape[1]):
+        disturbance.force[e, n] = 0.0
+        put(disturbance.velocity[e, n], vec(state.drone_velocity, e, n))
+
+
+@kernel
+def integrate_error(lo, hi, state, reference, pull, disturbance, g, c):
+    """Add the integral of the position error to the pulls of environments lo to hi: `integral`.
+
+    F_i = -m k_p ω ∫ (p - p_d) dt, no longer than the limit. While a rotor is at its limit the integral may only shrink.
+
+    Args:
+        lo, hi: the environments.
+        state, reference: SystemState, Reference.
+        pull: nominal pulls (E, N, 3) [N].
+        disturbance: Disturbance, written.
+        g, c: Gains, Rejection.
+    """
+    margin = 0.01 * g.thrust_max
+    for e in range(lo, hi):
+        for n in range(pull.shape[1]):
+            saturated = False
+            for k in range(4):
+                thrust = c.thrust_coefficient * state.rotor_speed[e, n, k] ** 2
+                saturated = saturated or thrust > g.thrust_max - margin or thrust < g.thrust_min + margin
+            error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
+            before = vec(disturbance.force, e, n)
+            force = limit(sub(before, scale(c.gain * c.dt, error)), c.largest)
+            if saturated and norm(force) > norm(before):
+                force = before
+            put(disturbance.force[e, n], force)
+            put(disturbance.pull[e, n], add(vec(pull, e, n), force))
+
+
+@kernel
+def estimate_force(lo, hi, state, reference, pull, disturbance, g, c):
+    """Add the measured external force to the pulls of environments lo to hi: `indi`.
+
+    What moved the drone over the last control step is m Δv/Δt = F_rotors - m g e3 - (pull, load and drag that are fed
+    forward) - F. The rotors' force comes from their speeds, so their lag and limits are in it; acceleration and force
+    pass the same first-order low-pass filter, here as one number (Smeur, de Croon and Chu, Control Engineering
+    Practice 73, 2018; Tal and Karaman, IEEE TCST 29(3), 2021). Arguments are those of `integrate_error`.
+    """
+    for e in range(lo, hi):
+        for n in range(pull.shape[1]):
+            velocity, rotors = vec(state.drone_velocity, e, n), rotor_force(e, n, state, c.thrust_coefficient)
+            nominal, attitude = vec(pull, e, n), mat(state.drone_rotation, e, n)
+            air = tmul(attitude, vec(reference.velocity, e, n))
+            drag = mul(attitude, (g.drag[0] * air[0], g.drag[1] * air[1], g.drag[2] * air[2]))
+            told = add(add(nominal, drag), scale(g.load_share[n], vec(reference.acceleration, e, n)))
+            moved = scale(g.mass / c.dt, sub(velocity, vec(disturbance.velocity, e, n)))
+            used = add(moved, (0.0, 0.0, g.mass * GRAVITY))
+            before = vec(disturbance.force, e, n)
+            gap = sub(sub(sub(rotors, used), told), before)
+            force = limit(add(before, scale(c.share, gap)), c.largest)
+            put(disturbance.force[e, n], force)
+            put(disturbance.velocity[e, n], velocity)
+            put(disturbance.pull[e, n], add(nominal, force))
+
+
+REJECTIONS = {"integral": integrate_error, "indi": estimate_force}

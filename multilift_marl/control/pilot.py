@@ -1,0 +1,97 @@
+"""What flies the drones: the action interface, the references, and the rejection of disturbances, put together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from multilift_marl._jit import bind
+from multilift_marl.config.schema import Config
+from multilift_marl.control.actions import ACTIONS, Call, Team
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
+from multilift_marl.control.formation import Goal, Reference, start_reference
+from multilift_marl.control.geometric import make_gains
+from multilift_marl.control.setpoints import Setpoint
+from multilift_marl.errors import ConfigError
+from multilift_marl.sim.world import World
+
+
+class Pilot:
+    """From the actions of E teams to their rotor thrusts.
+
+    Args:
+        config: `control` says how.
+        world: whose state is read and whose thrusts are written.
+
+    Attributes:
+        action_names: names of the numbers of an action.
+        reference: what the drones are told to follow; live arrays.
+        gains: of the controller, for the nominal drones.
+        disturbance: what `control.disturbance` remembers, None without.
+
+    Raises:
+        ConfigError: an interface and a rejection that do not go together.
+    """
+
+    def __init__(self, config: Config, world: World):
+        settings, dt = config.control, 1.0 / config.sim.control_hz
+        e, n = world.num_envs, world.num_drones
+        self.world = world
+        self.interface = ACTIONS[settings.action](settings, dt)
+        self.action_names = self.interface.names
+        self.reference, self.disturbance = Reference.zeros(e, n), None
+        self._setpoint = Setpoint.zeros(e, n)
+        self.gains = make_gains(settings, world.system)
+        self._kind = settings.disturbance
+        if self._kind != "none":
+            if self._kind not in self.interface.rejects:
+                able = [name for name, interface in ACTIONS.items() if self._kind in interface.rejects]
+                raise ConfigError(
+                    f"control.disturbance={self._kind} has nothing to correct with control.action={settings.action}; "
+                    f"use it with {' or '.join(able)}, or set control.disturbance=none"
+                )
+            self.disturbance = Disturbance.zeros(e, n)
+            self._rejection = make_rejection(settings, world.system, self.gains, dt)
+
+    def bind(
+        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
+    ) -> tuple[Call, tuple[Call, ...]]:
+        """Return what environments lo to hi call once for each policy step, and in turn at each control step.
+
+        Args:
+            lo, hi: the environments.
+            action: (E, N, A), live array.
+            goal: of the task.
+            plan: moves the goals on by one control step; None if they stay.
+        """
+        state, thrust, g = self.world.state, self.world.thrust, self.gains
+        rejection = self.disturbance
+        pull = goal.pull if rejection is None else rejection.pull
+        team = Team(state, goal, self.reference, self._setpoint, pull, thrust, g)
+        act = self.interface.act(lo, hi, action, team)
+        follow = self.interface.follow(lo, hi, team) if plan is None else self.interface.ride(lo, hi, plan, act, team)
+        if rejection is None:
+            return act, follow
+        known, own = (state, self.reference, goal.pull), (rejection, g, self._rejection)
+        estimate = bind(REJECTIONS[self._kind], lo, hi, *known, *own)
+        return act, (*follow[:-1], estimate, follow[-1])
+
+    def start(self, e: int) -> None:
+        """Let references and estimates of environment e start from the state of its drones."""
+        start_reference(e, self.world.state, self.reference)
+        if self.disturbance is not None:
+            forget(e, self.world.state, self.disturbance)
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return copies of the arrays that outlive a step."""
+        return {name: array.copy() for name, array in self._arrays().items()}
+
+    def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
+        """Restore what `state_dict` returned; other keys do not count."""
+        for name, array in self._arrays().items():
+            array[:] = saved[name]
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        arrays = {f"reference.{name}": array for name, array in self.reference._asdict().items()}
+        if self.disturbance is not None:
+            arrays |= {f"disturbance.{name}": array for name, array in self.disturbance._asdict().items()}
+        return arrays

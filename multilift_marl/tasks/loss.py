@@ -1,0 +1,142 @@
+"""Loss: one drone's motors stop for good, and the others hold the payload."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import cos, radians, sin
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from multilift_marl._jit import bind, kernel
+from multilift_marl.config.schema import Config, Float, Section
+from multilift_marl.control.formation import Reference
+from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import norm, row
+from multilift_marl.sim.world import World
+from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.starts import StartRanges, start_near_target
+from multilift_marl.tasks.terms import mean_change, tolerance
+
+LEVEL_FROM = 6  # drones with which the rest can hold a payload level wherever one is lost
+
+
+class LossOptions(Section):
+    """When a drone is lost, where the team starts, and what counts as success."""
+
+    loss_time: tuple[Float, Float] = Field((2.0, 4.0), description="[s] earliest and latest stop of the motors")
+    snap: bool = Field(False, description="whether the lost drone's cable breaks, so that it is gone")
+    target_xy: Float = Field(1.0, ge=0, description="[m] target x and y within ± this")
+    target_height: tuple[Float, Float] = Field((1.5, 2.5), description="[m] lowest and highest target")
+    target_yaw: Float = Field(45.0, ge=0, le=180, description="[deg] target heading within ± this")
+    start_radius: Float = Field(0.5, ge=0, description="[m] start within a ball of this radius about the target")
+    start_tilt: Float = Field(10.0, ge=0, le=90, description="[deg] largest tilt of the payload at the start")
+    start_speed: Float = Field(0.3, ge=0, description="[m/s] largest speed of the team at the start")
+    success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of its target ...")
+    success_angle: Float = Field(10.0, gt=0, description="[deg] ... and, with six drones or more, of its attitude ...")
+    success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds")
+
+
+class Loss(Task):
+    """Hold the payload with one drone less; see docs/loss.md."""
+
+    name: ClassVar[str] = "loss"
+    Options: ClassVar[type[Section]] = LossOptions
+    REWARD: ClassVar[dict[str, float]] = {
+        "position": 0.45,
+        "precision": 0.25,
+        "attitude": 0.15,
+        "stillness": 0.15,
+        "action_rate": -0.05,
+    }
+    EXTRA: ClassVar[tuple[Component, ...]] = (
+        Component("lost", 1, "-", "-", "1 if the own motors have stopped"),
+        Component("team_lost", 1, "-", "-", "1 if those of any drone have"),
+        Component("lost_direction", 2, "slot", "-", "cosine and sine of its azimuth from the own one; 0 before"),
+    )
+    EXTRA_STATE: ClassVar[int] = 3
+    KEPT: ClassVar[tuple[str, ...]] = ("when", "who")
+
+    def __init__(self, config: Config, world: World, reference: Reference):
+        super().__init__(config, world, reference)
+        early, late = self.options.loss_time
+        if not 0 <= early <= late:
+            raise ConfigError(f"task_options.loss_time={self.options.loss_time} must list the earlier one first")
+        if world.num_drones < 2:
+            raise ConfigError("task loss needs a drone that is left; raise env.num_drones to 2 or more")
+        self.when, self.who = np.zeros(world.num_envs), np.zeros(world.num_envs, np.int64)
+        world.breakable = world.breakable or self.options.snap
+        self._angle = radians(self.options.success_angle) if world.num_drones >= LEVEL_FROM else np.inf
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw target, start, drone and time; see `Task.start`."""
+        option = self.options
+        ranges = StartRanges(
+            option.target_xy, *option.target_height, radians(option.target_yaw),
+            option.start_radius, radians(option.start_tilt), option.start_speed,
+        )  # fmt: skip
+        start_near_target(env, rng, self.world.state, self.goal, self.rig, ranges, self.hanging, mass)
+        self.who[env], self.when[env] = rng.integers(self.world.num_drones), rng.uniform(*option.loss_time)
+        self.watch.lost[env] = False
+
+    def planner(self, lo: int, hi: int) -> Callable[[], None]:
+        """Stop the motors when their time has come; see `Task.planner`."""
+        state, plant = self.world.state, self.world.plant
+        snap = self.options.snap
+        return bind(_lose, lo, hi, self.time, self.control_dt, self.when, self.who, snap, state, plant, self.watch)
+
+    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+        """Tell who is lost; see `Task.observer`."""
+        return bind(_tell, lo, hi, self.who, self.watch, self.rig, observation, critic)
+
+    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+        """Pay for closeness, attitude and stillness; see `Task.scorer`."""
+        success = (self.options.success_distance, self._angle)
+        return bind(
+            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights, success, self.dt,
+            self.terms, self.good_time,
+        )  # fmt: skip
+
+    def succeeded(self) -> np.ndarray:
+        """Within the success region throughout the last seconds, with a drone less."""
+        return (self.good_time >= self.options.success_seconds - 1e-9) & self.watch.lost.any(axis=1)
+
+
+@kernel
+def _lose(lo, hi, time, dt, when, who, snap, state, plant, watch):
+    for e in range(lo, hi):
+        time[e] += dt
+        if time[e] >= when[e] and not watch.lost[e, who[e]]:
+            watch.lost[e, who[e]] = True
+            plant.motors_off[e, who[e]] = True
+            if snap:
+                state.cable_broken[e, who[e]] = True
+
+
+@kernel
+def _tell(lo, hi, who, watch, rig, observation, critic):
+    for e in range(lo, hi):
+        gone = watch.lost[e, who[e]]
+        any_lost, azimuth = 1.0 if gone else 0.0, rig.azimuth[who[e]]
+        told = critic[e, critic.shape[1] - 3 :]
+        told[0], told[1], told[2] = any_lost, any_lost * cos(azimuth), any_lost * sin(azimuth)
+        for n in range(observation.shape[1]):
+            own = observation[e, n, observation.shape[2] - 4 :]
+            own[0], own[1] = 1.0 if watch.lost[e, n] else 0.0, any_lost
+            own[2] = any_lost * cos(azimuth - rig.azimuth[n])
+            own[3] = any_lost * sin(azimuth - rig.azimuth[n])
+
+
+@kernel
+def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms, good_time):
+    for e in range(lo, hi):
+        distance, angle = errors.distance[e], errors.angle[e]
+        speed, spin = norm(row(state.payload_velocity, e)), norm(row(state.payload_body_rates, e))
+        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
+        terms[e, 1] = weights[1] * tolerance(distance, 0.03)
+        terms[e, 2] = weights[2] * tolerance(angle, radians(10.0))
+        terms[e, 3] = weights[3] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
+        terms[e, 4] = weights[4] * mean_change(e, action, previous)
+        good_time[e] = good_time[e] + dt if distance <= success[0] and angle <= success[1] else 0.0

@@ -1,0 +1,246 @@
+"""Recover: from slack cables, tilted drones and speed to a payload that hangs at its target."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import atan2, cos, pi, radians, sin, sqrt
+from typing import ClassVar, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from multilift_marl._jit import bind, kernel
+from multilift_marl.config.schema import Config, Float, Section
+from multilift_marl.config.system import GRAVITY
+from multilift_marl.control.formation import Reference, place_formation
+from multilift_marl.math3d import (
+    add,
+    axis_angle,
+    clip,
+    matmul,
+    matrow,
+    mul,
+    norm,
+    put,
+    putmat,
+    rot_z,
+    row,
+    scale,
+    sub,
+    unit,
+    vec,
+)
+from multilift_marl.sim.world import World
+from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, forgive
+from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.starts import in_ball
+from multilift_marl.tasks.terms import mean_change, tolerance
+
+
+class RecoverOptions(Section):
+    """How harsh the start is, and what counts as success."""
+
+    start: Literal["slack", "crazymarl"] = Field("slack", description="how teams are thrown; see docs/recover.md")
+    target_xy: Float = Field(1.0, ge=0, description="[m] target x and y within ± this")
+    target_height: tuple[Float, Float] = Field((1.5, 2.5), description="[m] lowest and highest target")
+    target_yaw: Float = Field(45.0, ge=0, le=180, description="[deg] target heading within ± this")
+    start_radius: Float = Field(0.5, ge=0, description="[m] slack: payload within a ball of this radius of the target")
+    start_tilt: Float = Field(90.0, ge=0, le=90, description="[deg] slack: largest tilt of drones; of payloads, half")
+    start_speed: Float = Field(1.0, ge=0, description="[m/s] slack: largest speed of each body")
+    start_slack: Float = Field(0.6, gt=0, le=1, description="[-] slack: shortest distance of a hook over cable length")
+    grace: Float = Field(2.0, ge=0, description="[s] in which tilt and cable angle are no failure")
+    success_distance: Float = Field(0.01, gt=0, description="[m] payload closer than this to its target ...")
+    success_seconds: Float = Field(0.5, gt=0, description="[s] ... throughout the last seconds")
+
+
+class Recover(Task):
+    """Recover from a harsh start; see docs/recover.md."""
+
+    name: ClassVar[str] = "recover"
+    Options: ClassVar[type[Section]] = RecoverOptions
+    REWARD: ClassVar[dict[str, float]] = {
+        "position": 0.4,
+        "precision": 0.25,
+        "attitude": 0.15,
+        "stillness": 0.2,
+        "action_rate": -0.05,
+    }
+    EXTRA: ClassVar[tuple[Component, ...]] = (
+        Component("grace", 1, "-", "-", "share of the time left in which tilt and cable angle are no failure"),
+        Component("slack", 1, "-", "-", "own cable's natural length minus the distance it spans, over the length"),
+    )
+    EXTRA_STATE: ClassVar[int] = 1
+
+    def __init__(self, config: Config, world: World, reference: Reference):
+        super().__init__(config, world, reference)
+        self._early = forgive(TILT, CABLE)
+        if self.options.start == "crazymarl":  # a quarter of its teams start on the ground
+            self._early = forgive(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw target and team; see `Task.start`."""
+        option, goal, state = self.options, self.goal, self.world.state
+        flat = rng.uniform(-option.target_xy, option.target_xy, 2)
+        goal.position[env] = *flat, rng.uniform(*option.target_height)
+        putmat(goal.rotation[env], rot_z(radians(rng.uniform(-option.target_yaw, option.target_yaw))))
+        place_formation(env, goal, self.rig)
+        self.watch.forgiven[env] = self._early
+        throw = Throw(option.start_radius, radians(option.start_tilt), option.start_speed, option.start_slack)
+        if option.start == "slack":
+            _throw(env, rng, state, goal, self.rig, self.hanging, throw)
+        else:
+            _throw_as_crazymarl(env, rng, state, goal, self.hanging)
+        if not self.rig.anchors.any():
+            _turn_formation(env, state, goal, self.rig)
+        carried = self.hanging.drone_mass + mass / self.world.num_drones
+        hover = sqrt(carried * GRAVITY / 4 / self.hanging.thrust_coefficient)
+        state.rotor_speed[env] = hover
+        state.payload_body_rates[env] = 0.0
+
+    def planner(self, lo: int, hi: int) -> Callable[[], None]:
+        """Count the time; the goals stay. See `Task.planner`."""
+        return bind(_wait, lo, hi, self.time, self.control_dt, self.options.grace, self.watch)
+
+    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+        """Tell grace and slack; see `Task.observer`."""
+        return bind(
+            _tell, lo, hi, self.time, self.options.grace, self.world.state, self.rig, self.hanging, observation, critic
+        )
+
+    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+        """Pay for closeness, attitude and stillness; see `Task.scorer`."""
+        return bind(
+            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights,
+            self.options.success_distance, self.dt, self.terms, self.good_time,
+        )  # fmt: skip
+
+    def succeeded(self) -> np.ndarray:
+        """Close to the target throughout the last moments."""
+        return self.good_time >= self.options.success_seconds - 1e-9
+
+
+class Throw(NamedTuple):
+    """RecoverOptions of the start `slack`, in SI units."""
+
+    radius: float
+    tilt: float
+    speed: float
+    slack: float
+
+
+@kernel
+def _tilted(rng, angle, yaw):
+    """Return an attitude, 9 numbers, tilted by up to `angle` about a random horizontal axis at heading `yaw`."""
+    azimuth = rng.uniform(-pi, pi)
+    return matmul(axis_angle((cos(azimuth), sin(azimuth), 0.0), rng.uniform(0.0, angle)), rot_z(yaw))
+
+
+@kernel
+def _throw(e, rng, state, goal, rig, hanging, throw):
+    """Write a team whose cables hang slack, each drone somewhere near its slot's direction."""
+    payload = add(row(goal.position, e), in_ball(rng, throw.radius))
+    attitude = _tilted(rng, 0.5 * throw.tilt, goal.yaw[e]) if np.any(rig.anchors != 0.0) else matrow(goal.rotation, e)
+    put(state.payload_position[e], payload)
+    put(state.payload_velocity[e], in_ball(rng, throw.speed))
+    putmat(state.payload_rotation[e], attitude)
+    for n in range(rig.anchors.shape[0]):
+        anchor = mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2]))
+        at_rest = add(row(goal.position, e), mul(matrow(goal.rotation, e), row(rig.anchors, n)))
+        towards = unit(sub(vec(goal.slots, e, n), at_rest))
+        towards = unit(add(towards, in_ball(rng, 0.5)))  # within 30° of the slot's
+        span = hanging.length[n] * rng.uniform(throw.slack, 1.0)
+        put(state.drone_position[e, n], add(add(payload, anchor), scale(span, towards)))
+        put(state.drone_velocity[e, n], in_ball(rng, throw.speed))
+        putmat(state.drone_rotation[e, n], _tilted(rng, throw.tilt, goal.drone_yaw[e]))
+        state.drone_body_rates[e, n] = 0.0
+
+
+@kernel
+def _throw_as_crazymarl(e, rng, state, goal, hanging):
+    """Write a team as CrazyMARL's sampler draws it (viktorlorentz/crazyMARL, crazymarl/utils/multi_quad_sampling.py,
+    commit 8723b9a, and the reset of crazymarl/envs/multi_quad_env.py, commit 02d5761).
+
+    Load: x, y in ± 1.5 m, z uniform in -1 to 3 m, clipped to the ground; drones: distance normal (L, L/3) clipped to
+    0.05 m and L, polar angle normal (45°, 22.5°), azimuths evenly spaced plus normal (π/(N+1)), never below the ground,
+    19 cm apart and 3 cm from the load; velocities normal, 0.2 m/s and 20°/s; roll and pitch normal (10°), any heading.
+    """
+    count = state.drone_position.shape[1]
+    low_load, low_drone = 0.0055, 0.008
+    apart = False
+    while not apart:
+        z = clip(rng.uniform(-1.0, 3.0), low_load, 3.0)
+        payload = (rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), z)
+        turned, apart = rng.uniform(-pi, pi), True
+        for n in range(count):
+            span = clip(rng.normal(hanging.length[n], hanging.length[n] / 3.0), 0.05, hanging.length[n])
+            polar = rng.normal(0.25 * pi, 0.125 * pi)
+            azimuth = turned + 2.0 * pi * n / count + rng.normal(0.0, pi / (count + 1))
+            flat = span * sin(polar)
+            height = clip(payload[2] + span * cos(polar), low_drone, 3.0)
+            put(
+                state.drone_position[e, n], (payload[0] + flat * cos(azimuth), payload[1] + flat * sin(azimuth), height)
+            )
+            apart = apart and norm(sub(vec(state.drone_position, e, n), payload)) >= 0.03
+            for m in range(n):
+                apart = apart and norm(sub(vec(state.drone_position, e, n), vec(state.drone_position, e, m))) >= 0.19
+    put(state.payload_position[e], payload)
+    state.payload_velocity[e] = 0.0
+    putmat(state.payload_rotation[e], matrow(goal.rotation, e))
+    for n in range(count):
+        tilt, limit = radians(10.0), radians(60.0)
+        roll, pitch = clip(rng.normal(0.0, tilt), -limit, limit), clip(rng.normal(0.0, tilt), -limit, limit)
+        if state.drone_position[e, n, 2] < 0.02:
+            roll, pitch = 0.0, 0.0
+        level = matmul(axis_angle((0.0, 1.0, 0.0), pitch), axis_angle((1.0, 0.0, 0.0), roll))
+        putmat(state.drone_rotation[e, n], matmul(rot_z(rng.uniform(-pi, pi)), level))
+        for k in range(3):
+            state.drone_velocity[e, n, k] = rng.normal(0.0, 0.2)
+            state.drone_body_rates[e, n, k] = rng.normal(0.0, radians(20.0))
+
+
+@kernel
+def _turn_formation(e, state, goal, rig):
+    """Turn the formation about a point load, which has no heading to hold, to where the drones are."""
+    c, s = 0.0, 0.0
+    for n in range(rig.slots.shape[0]):
+        away = sub(vec(state.drone_position, e, n), row(state.payload_position, e))
+        turned = atan2(away[1], away[0]) - rig.azimuth[n]
+        c, s = c + cos(turned), s + sin(turned)
+    putmat(goal.rotation[e], rot_z(atan2(s, c)))
+    putmat(state.payload_rotation[e], matrow(goal.rotation, e))
+    place_formation(e, goal, rig)
+
+
+@kernel
+def _wait(lo, hi, time, dt, grace, watch):
+    for e in range(lo, hi):
+        time[e] += dt
+        if time[e] > grace:
+            watch.forgiven[e] = 0
+
+
+@kernel
+def _tell(lo, hi, time, grace, state, rig, hanging, observation, critic):
+    for e in range(lo, hi):
+        left = clip(1.0 - time[e] / max(grace, 1e-9), 0.0, 1.0)
+        critic[e, critic.shape[1] - 1] = left
+        attitude = matrow(state.payload_rotation, e)
+        for n in range(observation.shape[1]):
+            anchor = add(row(state.payload_position, e), mul(attitude, row(rig.anchors, n)))
+            span = norm(sub(vec(state.drone_position, e, n), anchor))
+            own = observation[e, n, observation.shape[2] - 2 :]
+            own[0], own[1] = left, 1.0 - span / hanging.length[n]
+
+
+@kernel
+def _score(lo, hi, state, errors, action, previous, weights, near, dt, terms, good_time):
+    for e in range(lo, hi):
+        distance, angle = errors.distance[e], errors.angle[e]
+        speed, spin = norm(row(state.payload_velocity, e)), norm(row(state.payload_body_rates, e))
+        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
+        terms[e, 1] = weights[1] * tolerance(distance, 0.01)
+        terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
+        terms[e, 3] = weights[3] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
+        terms[e, 4] = weights[4] * mean_change(e, action, previous)
+        good_time[e] = good_time[e] + dt if distance <= near else 0.0

@@ -1,0 +1,115 @@
+"""How teams stand when an episode starts."""
+
+from __future__ import annotations
+
+from math import cos, pi, sin, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.control.formation import place_formation
+from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
+from multilift_marl.sim.cables import cable_end
+from multilift_marl.sim.rows import hover_drone
+
+
+class Hanging(NamedTuple):
+    """Numbers of a team that hangs in equilibrium, nominal."""
+
+    length: np.ndarray
+    """(N,) of the cables [m]; likewise the next ones."""
+    stiffness: np.ndarray
+    weight: np.ndarray
+    segments: np.ndarray
+    payload_mass: float
+    drone_mass: float
+    thrust_coefficient: float
+
+
+def make_hanging(system: System) -> Hanging:
+    """Return the numbers of `system`."""
+    return Hanging(
+        length=system.cable_length,
+        stiffness=system.cable_stiffness,
+        weight=system.cable_mass * GRAVITY,
+        segments=system.cable_segments,
+        payload_mass=system.payload_mass,
+        drone_mass=system.vehicle.mass,
+        thrust_coefficient=system.vehicle.thrust_coefficient,
+    )
+
+
+@kernel
+def in_ball(rng, radius):
+    """Return a vector uniform in a ball."""
+    z, azimuth = rng.uniform(-1.0, 1.0), rng.uniform(-pi, pi)
+    r = radius * rng.uniform(0.0, 1.0) ** (1.0 / 3.0)
+    flat = r * sqrt(1.0 - z * z)
+    return (flat * cos(azimuth), flat * sin(azimuth), r * z)
+
+
+@kernel
+def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, moved):
+    """Write a team that moves as one, its cables at the tension of rest and in the directions of its slots.
+
+    Args:
+        e: the environment.
+        state: SystemState, written.
+        goal: whose slots and pulls, moved, the drones' cables point to.
+        rig, hanging: Rig, Hanging.
+        mass: true mass of the payload [kg].
+        payload, attitude: where it is [m] and its attitude, 9 numbers; cables keep their lengths.
+        velocity: of all bodies [m/s].
+        moved: of the slots from the goal's [m].
+    """
+    put(state.payload_position[e], payload)
+    put(state.payload_velocity[e], velocity)
+    putmat(state.payload_rotation[e], attitude)
+    state.payload_body_rates[e] = 0.0
+    load = mass / hanging.payload_mass
+    for n in range(rig.slots.shape[0]):
+        anchor = add(payload, mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
+        cable = sub(add(vec(goal.slots, e, n), moved), anchor)
+        direction = scale(1.0 / norm(cable), cable)
+        half = (0.0, 0.0, 0.5 * hanging.weight[n])
+        tension = load * norm(sub(vec(goal.pull, e, n), half))  # in the middle, whose direction is the cable's
+        end = cable_end(
+            direction, tension, hanging.length[n], hanging.stiffness[n], hanging.segments[n], hanging.weight[n]
+        )
+        put(state.drone_position[e, n], add(anchor, end))
+        put(state.drone_velocity[e, n], velocity)
+        state.drone_body_rates[e, n] = 0.0
+        pull = add(scale(tension, direction), half)
+        hover_drone(e, n, state, pull, goal.drone_yaw[e], hanging.drone_mass, hanging.thrust_coefficient)
+
+
+class StartRanges(NamedTuple):
+    """How far a team may be from a target, and that from the origin."""
+
+    xy: float
+    low: float
+    high: float
+    yaw: float
+    radius: float
+    tilt: float
+    speed: float
+
+
+@kernel
+def start_near_target(e, rng, state, goal, rig, ranges, hanging, mass):
+    """Draw a target, and a team in hanging equilibrium there, then moved, tilted and set in motion as one."""
+    x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
+    put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))
+    putmat(goal.rotation[e], rot_z(rng.uniform(-ranges.yaw, ranges.yaw)))
+    place_formation(e, goal, rig)
+    moved = in_ball(rng, ranges.radius)
+    axis = in_ball(rng, 1.0)
+    tilt = axis_angle(scale(1.0 / max(norm(axis), 1e-9), axis), rng.uniform(0.0, ranges.tilt))
+    velocity = in_ball(rng, ranges.speed)
+    payload = add((goal.position[e, 0], goal.position[e, 1], goal.position[e, 2]), moved)
+    attitude = matrow(goal.rotation, e)
+    if np.any(rig.anchors != 0.0):  # a point has no attitude: it counts as aligned
+        attitude = matmul(tilt, attitude)
+    hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, moved)

@@ -1,0 +1,188 @@
+"""Track: the payload follows a path, level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import cos, pi, radians, sin, sqrt
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from multilift_marl._jit import bind, kernel
+from multilift_marl.config.schema import Config, Float, Section, Vector
+from multilift_marl.control.formation import Reference, place_formation
+from multilift_marl.math3d import add, matrow, norm, put, putmat, rot_z, row, sub, turn
+from multilift_marl.sim.world import World
+from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.paths import (
+    CIRCLE,
+    FIGURE8,
+    HELIX,
+    LEMNISCATE,
+    PATHS,
+    Path,
+    draw_curve,
+    largest_rates,
+    motion,
+    own_time,
+    place,
+    set_goal,
+)  # fmt: skip
+from multilift_marl.tasks.starts import hang_team, in_ball
+from multilift_marl.tasks.terms import mean_change, tolerance
+
+AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
+
+
+class TrackOptions(Section):
+    """The path, and what counts as success."""
+
+    path: Literal["circle", "figure8", "lemniscate", "helix", "random"] = Field("figure8", description="its form")
+    speed: Float = Field(1.0, gt=0, description="[m/s] peak speed v of figure8, lemniscate and random")
+    acceleration: Float = Field(0.5, gt=0, description="[m/s²] their peak acceleration a")
+    radius: Float = Field(5.0, gt=0, description="[m] of circle and helix")
+    rate: Float = Field(0.2, gt=0, description="[rad/s] of circle and helix")
+    climb: Float = Field(0.5, ge=0, description="[m] that a helix goes up, and down, from its middle height")
+    room: Vector = Field((3.0, 3.0, 0.5), description="[m] random way-points within ± this of the start")
+    height: Float = Field(2.0, gt=0, description="[m] of the path's centre")
+    start_radius: Float = Field(0.1, ge=0, description="[m] start within a ball of this radius about the path's start")
+    success_distance: Float = Field(0.5, gt=0, description="[m] payload never farther than this from its target")
+
+
+class Track(Task):
+    """Follow a path; see docs/track.md."""
+
+    name: ClassVar[str] = "track"
+    Options: ClassVar[type[Section]] = TrackOptions
+    REWARD: ClassVar[dict[str, float]] = {
+        "position": 0.4,
+        "precision": 0.3,
+        "attitude": 0.1,
+        "velocity": 0.2,
+        "action_rate": -0.05,
+    }
+    EXTRA: ClassVar[tuple[Component, ...]] = (
+        Component("target_velocity", 3, "slot", "m/s", "velocity of the target"),
+        Component("target_acceleration", 3, "slot", "m/s²", "acceleration of the target"),
+        *(
+            Component(
+                f"target_ahead_{round(1000 * t)}ms", 3, "slot", "m", f"the way the target moves in the next {t:g} s"
+            )
+            for t in AHEAD
+        ),
+    )
+    EXTRA_STATE: ClassVar[int] = 6 + 3 * len(AHEAD)
+    KEPT: ClassVar[tuple[str, ...]] = ("worst",)
+    RMSE_AFTER: ClassVar[float] = 5.0
+
+    def __init__(self, config: Config, world: World, reference: Reference):
+        super().__init__(config, world, reference)
+        self.path, self.worst = Path.zeros(world.num_envs), np.zeros(world.num_envs)
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw heading and, for a random path, way-points; the team hangs at its start. See `Task.start`."""
+        option, path = self.options, self.path
+        kind = PATHS.index(option.path)
+        path.kind[env], path.heading[env], path.climb[env] = kind, rng.uniform(-pi, pi), option.climb
+        v, a = option.speed, option.acceleration
+        if kind in (CIRCLE, HELIX):
+            path.size[env], path.rate[env] = option.radius, option.rate
+        elif kind == FIGURE8:  # peak speed A ω √2, peak acceleration with its factor at that size
+            path.size[env], path.rate[env] = 1.0625 * v**2 / a, 0.6655 * a / v
+        elif kind == LEMNISCATE:  # Bernoulli's: peak speed A ω and acceleration 3 A ω² at the ends
+            path.size[env], path.rate[env] = 3 * v**2 / a, a / (3 * v)
+        else:
+            path.curve[env] = draw_curve(rng, np.array(option.room))
+            fastest, hardest = largest_rates(path.curve[env])
+            path.rate[env] = min(v / fastest, sqrt(a / hardest))
+        _start(env, rng, self.world.state, self.goal, self.rig, self.hanging, mass, path, option.height,
+               option.start_radius)  # fmt: skip
+        self.worst[env] = 0.0
+
+    def planner(self, lo: int, hi: int) -> Callable[[], None]:
+        """Move the goals along their paths; see `Task.planner`."""
+        return bind(_plan, lo, hi, self.time, self.control_dt, self.path, self.goal, self.rig)
+
+    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+        """Tell how the target will move; see `Task.observer`."""
+        return bind(_look_ahead, lo, hi, self.time, self.path, self.goal, observation, critic)
+
+    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+        """Pay for closeness to the moving target; see `Task.scorer`."""
+        return bind(
+            _score, lo, hi, self.world.state, self.goal, self.errors, action, previous, self.weights, self.terms,
+            self.worst,
+        )  # fmt: skip
+
+    def succeeded(self) -> np.ndarray:
+        """Never too far from the target."""
+        return self.worst <= self.options.success_distance
+
+
+@kernel
+def _start(e, rng, state, goal, rig, hanging, mass, path, height, radius):
+    put(path.centre[e], (0.0, 0.0, 0.0))
+    begin = place(e, 0.0, path)
+    put(path.centre[e], (-begin[0], -begin[1], height - begin[2]))  # every path starts above the origin
+    putmat(goal.rotation[e], rot_z(path.heading[e]))
+    _aim(e, 0.0, path, goal, rig)
+    moved = in_ball(rng, radius)
+    payload = add(row(goal.position, e), moved)
+    hang_team(e, state, goal, rig, hanging, mass, payload, matrow(goal.rotation, e), row(goal.velocity, e), moved)
+
+
+@kernel
+def _aim(e, t, path, goal, rig):
+    """Write the goal of environment e at a time."""
+    set_goal(e, motion(e, t, path), goal)
+    place_formation(e, goal, rig)
+    if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
+        goal.drone_yaw[e] = path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi
+        goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
+
+
+@kernel
+def _plan(lo, hi, time, dt, path, goal, rig):
+    for e in range(lo, hi):
+        time[e] += dt
+        _aim(e, time[e], path, goal, rig)
+
+
+@kernel
+def _look_ahead(lo, hi, time, path, goal, observation, critic):
+    many = 6 + 3 * len(AHEAD)
+    for e in range(lo, hi):
+        c, s = cos(goal.yaw[e]), -sin(goal.yaw[e])
+        told = critic[e, critic.shape[1] - many :]
+        _tell(e, c, s, time[e], path, goal, told)
+        for n in range(observation.shape[1]):
+            cn, sn = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
+            own = observation[e, n, observation.shape[2] - many :]
+            for k in range(0, many, 3):  # from the target's frame to the slot's
+                cos_turn, sin_turn = cn * c + sn * s, sn * c - cn * s
+                v = turn(cos_turn, sin_turn, (float(told[k]), float(told[k + 1]), float(told[k + 2])))
+                own[k], own[k + 1], own[k + 2] = v
+
+
+@kernel
+def _tell(e, c, s, t, path, goal, out):
+    """Write velocity, acceleration and places to come of a target, in its heading frame."""
+    put(out[0:3], turn(c, s, row(goal.velocity, e)))
+    put(out[3:6], turn(c, s, row(goal.acceleration, e)))
+    for i in range(len(AHEAD)):
+        put(out[6 + 3 * i : 9 + 3 * i], turn(c, s, sub(place(e, t + AHEAD[i], path), row(goal.position, e))))
+
+
+@kernel
+def _score(lo, hi, state, goal, errors, action, previous, weights, terms, worst):
+    for e in range(lo, hi):
+        distance, angle = errors.distance[e], errors.angle[e]
+        slip = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
+        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
+        terms[e, 1] = weights[1] * tolerance(distance, 0.02)
+        terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
+        terms[e, 3] = weights[3] * tolerance(slip, 0.2)
+        terms[e, 4] = weights[4] * mean_change(e, action, previous)
+        worst[e] = max(worst[e], distance)

@@ -1,0 +1,146 @@
+"""The balance of momentum of the whole team: gravity, thrust, drag and the hidden force change it, no cable does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from multilift_marl.config.system import GRAVITY
+from multilift_marl.sim.world import World
+from multilift_marl.validation.experiment import Curve, Plot, Result, Row, order_row
+from multilift_marl.validation.team import Team, make_team, poses, take_off, velocities
+
+_LIMIT = 1e-9
+
+
+def momentum(fast: bool) -> Result:
+    """A team flies in wind, its cables slack at first: linear and angular momentum of all of it about a fixed point."""
+    result = Result()
+    caption = "What the time step adds to or takes from the team's momentum over one second, relative to all impulses."
+    plot = Plot(
+        "momentum", "drift of the team's momentum", "time step [ms]", "relative drift", caption=caption, log=True
+    )
+    for model, balance in (("massless", massless_balance), ("chain", chain_balance)):
+        team, seconds = make_team(model), 1.0 if fast else 5.0
+        linear, angular = balance(team, seconds)
+        for name, error in (("linear", linear), ("angular", angular)):
+            quantity = f"{name} momentum less impulses, each step, relative"
+            result.rows.append(Row(f"momentum, {model}", quantity, 0.0, error, error, _LIMIT))
+        steps = (4e-3, 2e-3, 1e-3) if model == "massless" else (1e-3, 5e-4, 2.5e-4)
+        drift = [momentum_drift(replace(team, timestep=step), 1.0)[1] for step in steps]
+        plot.curves.append(Curve(f"{model}, angular", 1e3 * np.array(steps), np.array(drift)))
+        result.rows.append(order_row(f"momentum, {model}", "drift of the angular momentum in 1 s", drift, steps))
+    result.plots.append(plot)
+    return result
+
+
+def massless_balance(team: Team, seconds: float) -> tuple[float, float]:
+    """Return the largest residuals of linear and angular momentum of all steps, relative to the loads' impulses.
+
+    A step changes velocities at the place and attitude where it began, so the balance is taken there. The gyroscopic
+    torque enters as the integrator takes it: with its value at the start of the step, and with its linear change over
+    the step as well for a body without a stretched cable ("Gyroscopic derivatives for free bodies" in MuJoCo's
+    computation chapter).
+    """
+    (world, steer), worst = take_off(team), np.zeros(2)
+    system, h = world.system, world.system.timestep
+    mass, inertia = _masses(world)
+    for i in range(round(seconds / h)):
+        if i % system.control_interval == 0:
+            steer()
+        (r, attitude), (v, w) = poses(world), velocities(world)
+        world.step(world.thrust)
+        pushed, turned = (after - before for after, before in zip(velocities(world), (v, w), strict=True))
+        force, torque = loads(world)
+        force = force + mass[:, None] * [0, 0, -GRAVITY]
+        span = np.linalg.norm(r[1:] - r[0] - system.anchors @ attitude[0].T, axis=1)
+        tied = span > system.cable_length
+        free = np.concatenate([[not tied.any()], ~tied])[:, None]
+        gyroscopic = np.cross(w, inertia * w) + free * (np.cross(turned, inertia * w) + np.cross(w, inertia * turned))
+        linear = (mass[:, None] * pushed - h * force).sum(axis=0)
+        spin = np.einsum("nij,nj->i", attitude, inertia * turned - h * (torque - gyroscopic))
+        angular = np.cross(r, mass[:, None] * pushed - h * force).sum(axis=0) + spin
+        scale = h * np.abs(force).sum(), h * np.abs(np.cross(r, force)).sum()
+        worst = np.maximum(worst, [np.abs(linear).max() / scale[0], np.abs(angular).max() / scale[1]])
+    return float(worst[0]), float(worst[1])
+
+
+def chain_balance(team: Team, seconds: float) -> tuple[float, float]:
+    """Return the same for chains, as one tree: the equations of motion of its root, the payload's free joint.
+
+    Those six are the balance of the whole tree's momentum, about the payload's centre of mass; springs and dampers
+    within the tree have no part in them.
+    """
+    (world, steer), worst = take_off(team), np.zeros(2)
+    model, h = world.model, world.system.timestep
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    rows = world.shards[0].batch
+    for i in range(round(seconds / h)):
+        if i % world.system.control_interval == 0:
+            steer()
+        r, attitude = poses(world)
+        data.qpos[:], data.qvel[:] = rows.bind("qpos")[0], rows.bind("qvel")[0]
+        world.step(world.thrust)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        change = inertia[:6] @ (rows.bind("qvel")[0] - data.qvel) + h * data.qfrc_bias[:6]  # which holds gravity
+        force, torque = loads(world)
+        moment = np.cross(r - r[0], force).sum(axis=0) + torque.sum(axis=0)
+        linear, angular = change[:3] - h * force.sum(axis=0), change[3:] - h * attitude[0].T @ moment
+        scale = h * np.abs(force).sum(), h * np.abs(np.cross(r - r[0], force)).sum()
+        worst = np.maximum(worst, [np.abs(linear).max() / scale[0], np.abs(angular).max() / scale[1]])
+    return float(worst[0]), float(worst[1])
+
+
+def momentum_drift(team: Team, seconds: float) -> np.ndarray:
+    """Return by how much linear and angular momentum end off the sum of impulses, (2,), relative to their sizes."""
+    world, steer = take_off(team)
+    model, h = world.model, world.system.timestep
+    data, batch = mujoco.MjData(model), world.shards[0].batch
+    weight = model.body_mass.sum() * GRAVITY
+
+    def total() -> np.ndarray:
+        """Return linear and angular momentum about the origin (6,), and the centre of mass (3,)."""
+        data.qpos[:], data.qvel[:] = batch.bind("qpos")[0], batch.bind("qvel")[0]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        linear = model.body_subtreemass[0] * data.subtree_linvel[0]
+        centre = data.subtree_com[0]
+        return np.concatenate([linear, data.subtree_angmom[0] + np.cross(centre, linear), centre])
+
+    start, impulse, size = total()[:6], np.zeros(6), np.zeros(2)
+    for i in range(round(seconds / h)):
+        if i % world.system.control_interval == 0:
+            steer()
+        (r, attitude), centre = poses(world), total()[6:]
+        world.step(world.thrust)
+        force, torque = loads(world)
+        if world.system.cable_model == "massless":
+            torque = np.einsum("nij,nj->ni", attitude, torque)
+        down = np.array([0, 0, -weight])
+        moment = np.cross(r, force).sum(axis=0) + torque.sum(axis=0) + np.cross(centre, down)
+        impulse += h * np.concatenate([force.sum(axis=0) + down, moment])
+        size += h * np.array([np.abs(force).sum(), np.abs(np.cross(r, force)).sum()])
+    off = np.abs(total()[:6] - start - impulse).reshape(2, 3)
+    return off.max(axis=1) / size
+
+
+def loads(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Return force (1 + N, 3) [N] and torque (1 + N, 3) [N m] on payload and drones in the last step.
+
+    The torques are in the frames of the bodies, for drones on chains in the world frame.
+    """
+    constants, row = world.constants[0], world.shards[0].batch.state[0]
+    at = np.array([constants.force, *constants.drone_loads])[:, None] + np.arange(3)
+    return row[at], row[at + 3]
+
+
+def _masses(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Return masses (1 + N,) [kg] and principal moments (1 + N, 3) [kg m²] of payload and drones."""
+    system, vehicle = world.system, world.system.vehicle
+    mass = np.array([system.payload_mass] + [vehicle.mass] * system.num_drones)
+    return mass, np.array([system.payload_inertia] + [vehicle.inertia] * system.num_drones)

@@ -1,0 +1,138 @@
+"""Task track: paths, their motion, and what a team is told and paid."""
+
+from math import sqrt
+
+import numpy as np
+import pytest
+from conftest import make, zeros
+
+from multilift_marl.control.scripted import make_scripted
+from multilift_marl.tasks.paths import PATHS, RAMP, motion, own_time
+
+KINDS = pytest.mark.parametrize("kind", PATHS)
+
+
+def track(kind: str = "figure8", num_envs: int = 2, **keywords):
+    """Return environments of one path, reset."""
+    vec = make("track", num_envs=num_envs, **{"task_options.path": kind, **keywords})
+    vec.reset(seed=0)
+    return vec
+
+
+def goals(vec, steps: int) -> dict[str, np.ndarray]:
+    """Fly the formation and return what the goal was after each step (T, E, ...)."""
+    names = ("position", "velocity", "acceleration", "jerk", "drone_yaw", "drone_yaw_rate")
+    rows = {name: [] for name in names}
+    for _ in range(steps):
+        vec.step(zeros(vec))
+        for name in names:
+            rows[name].append(getattr(vec.task.goal, name).copy())
+    return {name: np.array(values) for name, values in rows.items()}
+
+
+def test_own_time_starts_at_rest_and_runs_at_full_rate_after_the_ramp():
+    h = 1e-3
+    assert own_time(0.0) == 0 and own_time(-1.0) == 0
+    assert own_time(1e-2) < 1e-9
+    for t in (RAMP, RAMP + 0.7, 9.0):
+        assert (own_time(t + h) - own_time(t)) / h == pytest.approx(1, abs=1e-6)
+    assert own_time(RAMP) == pytest.approx(RAMP / 2)
+
+
+@KINDS
+def test_velocity_acceleration_and_jerk_are_derivatives_of_the_position(kind):
+    rows, dt = goals(track(kind), 300), 0.02
+    for name, derivative, tolerance in (
+        ("position", "velocity", 2e-3), ("velocity", "acceleration", 4e-3), ("acceleration", "jerk", 0.05)
+    ):  # fmt: skip
+        slope = (rows[name][2:] - rows[name][:-2]) / (2 * dt)
+        scale = max(1.0, np.abs(rows[derivative]).max())
+        gap = np.abs(slope - rows[derivative][1:-1])
+        assert np.quantile(gap, 0.98) < tolerance * scale, derivative  # splines have corners in the jerk
+    assert np.abs(rows["position"][0] - [0, 0, 2.0]).max() < 1e-6 and np.abs(rows["velocity"][0]).max() < 1e-4
+
+
+@pytest.mark.parametrize("kind", ["figure8", "lemniscate", "random"])
+@pytest.mark.parametrize("speed, acceleration", [(1.0, 0.5), (2.0, 4.0)])
+def test_paths_keep_and_reach_their_limits(kind, speed, acceleration):
+    options = {"task_options.speed": speed, "task_options.acceleration": acceleration}
+    vec = make("track", num_envs=4, **{"task_options.path": kind, "env.episode_seconds": 60.0, **options})
+    vec.reset(seed=0)
+    t = np.arange(RAMP + 0.1, 40, 0.02)
+    task = vec.task
+    rows = [[] for _ in range(4)]
+    for e in range(4):
+        rows[e] = [motion(e, x, task.path)[1:3] for x in t]
+    speeds, pushes = (np.linalg.norm([[row[k] for row in each] for each in rows], axis=2) for k in (0, 1))
+    assert speeds.max() <= speed * 1.01 and pushes.max() <= acceleration * 1.02
+    reached = np.maximum(speeds.max(axis=1) / speed, pushes.max(axis=1) / acceleration)
+    assert kind == "random" or (reached > 0.97).all()  # a random path may be fastest while it gathers speed
+
+
+def test_figure_eight_is_the_published_one():
+    task = track("figure8", **{"task_options.speed": 2.0, "task_options.acceleration": 4.0}).task
+    assert task.path.size[0] == pytest.approx(1.0625 * 2**2 / 4)
+    assert task.path.rate[0] == pytest.approx(0.6655 * 4 / 2)
+    assert task.path.size[0] * task.path.rate[0] * sqrt(2) == pytest.approx(2.0, rel=1e-3)
+
+
+def test_on_the_circle_drones_face_along_the_path():
+    rows = goals(track("circle"), 400)
+    along = np.arctan2(rows["velocity"][..., 1], rows["velocity"][..., 0])[50:]
+    turned = rows["drone_yaw"][50:] - along
+    np.testing.assert_allclose(np.arctan2(np.sin(turned), np.cos(turned)), 0, atol=1e-3)
+    np.testing.assert_allclose(rows["drone_yaw_rate"][150:], 0.2, atol=1e-6)
+
+
+@KINDS
+def test_references_ride_along_without_lag(kind):
+    vec = track(kind)
+    for _ in range(200):
+        vec.step(zeros(vec))
+    task, reference = vec.task, vec.reference
+    np.testing.assert_allclose(reference.position, task.goal.slots, atol=1e-5)
+    for name in ("velocity", "acceleration", "jerk"):
+        asked = getattr(task.goal, name)[:, None]
+        np.testing.assert_allclose(getattr(reference, name), np.broadcast_to(asked, (2, 4, 3)), atol=2e-3, err_msg=name)
+
+
+def test_drones_are_told_where_the_target_will_be():
+    vec = track("figure8", num_envs=1)
+    for _ in range(150):
+        vec.step(zeros(vec))
+    observation, _ = vec.current()
+    names, goal, now = vec.observation_names, vec.task.goal, vec.task.goal.position[0].copy()
+    asked = ("target_ahead_400ms", "target_velocity")
+    told = {name: observation[0, :, names.index(f"{name}_0") :][:, :3] for name in asked}
+    frame = goal.slot_frame[0].copy()
+    velocity = goal.velocity[0].copy()
+    for _ in range(20):
+        vec.step(zeros(vec))
+
+    def turned(v):
+        c, s = frame[:, 0], frame[:, 1]
+        return np.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], np.full(4, v[2])], axis=1)
+
+    np.testing.assert_allclose(told["target_ahead_400ms"], turned(vec.task.goal.position[0] - now), atol=1e-6)
+    np.testing.assert_allclose(told["target_velocity"], turned(velocity), atol=1e-6)
+
+
+def test_success_is_never_to_be_far():
+    vec = track(num_envs=2, **{"env.episode_seconds": 1.0})
+    vec.step(zeros(vec))
+    vec.task.worst[1] = 0.51
+    for _ in range(vec.max_steps - 1):
+        info = vec.step(zeros(vec))[4]
+    assert info["success"].tolist() == [True, False]
+
+
+@pytest.mark.parametrize("kind", ["circle", "figure8"])
+def test_the_formation_follows(kind):
+    vec = track(kind, num_envs=4)
+    script, distances = make_scripted("formation_integral", vec), []
+    observation, _ = vec.current()
+    for _ in range(500):
+        observation, _, terminated, _, _ = vec.step(script.act(observation))
+        assert not terminated.any()
+        distances.append(vec.task.errors.distance.copy())
+    assert np.sqrt(np.mean(np.square(distances[250:]))) < 0.03
