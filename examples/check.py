@@ -37,7 +37,7 @@ def install(name: str, folder: Path) -> Path:
     venv.create(folder / "venv", with_pip=True)
     python = folder / "venv" / "bin" / "python"
     requirements = HERE / "requirements" / f"{name}.txt"
-    run([python, "-m", "pip", "install", "-q", "--no-compile", "-e", HERE.parent, "-r", requirements], folder)
+    run([python, "-m", "pip", "install", "-q", "-e", HERE.parent, "-r", requirements], folder)
     return python
 
 
