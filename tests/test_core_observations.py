@@ -12,7 +12,8 @@ import multilift_marl as ml
 @pytest.fixture(scope="module", params=ml.list_tasks())
 def ensemble(request):
     """Return observations (K, D) and states (K, S) of many moments of many episodes of four drones, and the names."""
-    vec = make(request.param, num_envs=64, num_drones=4)
+    varied = {"task_options.path": "random"} if request.param == "track" else {}  # others stay at one height
+    vec = make(request.param, num_envs=64, num_drones=4, **varied)
     observation, _ = vec.reset(seed=0)
     seen, states = [observation], [vec.state()]
     for step in range(max(150, vec.max_steps)):  # all phases of an episode

@@ -71,7 +71,9 @@ class Task:
         e, n, system = world.num_envs, world.num_drones, world.system
         self.world, self.reference = world, reference
         if n < self.LEAST_DRONES:
-            raise ConfigError(f"task {self.name} needs more drones; raise env.num_drones to {self.LEAST_DRONES} or more")
+            raise ConfigError(
+                f"task {self.name} needs more drones; raise env.num_drones to {self.LEAST_DRONES} or more"
+            )
         self.options = validate(self.Options, config.task_options, "task_options")
         self.weights = self._weights(config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
