@@ -34,7 +34,7 @@ def touch_down(velocity, aside=(0.0, 0.0), height=0.004):
     vec = make("land", num_envs=1)
     vec.reset(seed=0)
     state, task = vec.world.state, vec.task
-    moved = task.way[0, :2] + aside, state.payload_position[0, 2] - 0.075 - height
+    moved = task.course[0, :2] + aside, state.payload_position[0, 2] - 0.075 - height
     for array in (state.payload_position[0], state.drone_position[0].T):
         array[0], array[1], array[2] = array[0] + moved[0][0], array[1] + moved[0][1], array[2] - moved[1]
     state.payload_velocity[0] = velocity
@@ -49,7 +49,7 @@ def test_land_starts_are_as_documented():
     vec.reset(seed=0)
     state, task, system = vec.world.state, vec.task, vec.world.system
     np.testing.assert_allclose(state.payload_position, np.broadcast_to([0, 0, 1.5], (2000, 3)))
-    assert np.abs(task.way[:, :2]).max() <= 1 and np.ptp(task.way[:, :2]) > 1.99
+    assert np.abs(task.course[:, :2]).max() <= 1 and np.ptp(task.course[:, :2]) > 1.99
     assert np.degrees(np.abs(task.goal.yaw).max()) <= 45 and np.degrees(np.ptp(task.goal.yaw)) > 89
     assert (state.payload_velocity == 0).all() and task.errors.angle.max() < 1e-7
     expected = system.resting_tension * (vec.world.plant.payload_mass / system.payload_mass)[:, None]

@@ -90,7 +90,7 @@ class Land(Task):
         Component("target_velocity", 3, "slot", "m/s", "velocity of the target"),
     )
     EXTRA_STATE: ClassVar[int] = 5
-    KEPT: ClassVar[tuple[str, ...]] = ("way", "touch", "speed", "share")
+    KEPT: ClassVar[tuple[str, ...]] = ("course", "touch", "speed", "share")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
@@ -101,7 +101,7 @@ class Land(Task):
             option.pad_radius, option.touch_speed, option.clearance * min(size, 1.0), float(np.linalg.norm(half)), rope,
             system.resting_tension,
         )  # fmt: skip
-        self.way, self.touch = np.zeros((e, 3)), np.zeros(e, np.int64)
+        self.course, self.touch = np.zeros((e, 3)), np.zeros(e, np.int64)
         self.speed, self.share = np.zeros(e), np.zeros(e)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
@@ -109,7 +109,7 @@ class Land(Task):
         option = self.options
         _start(
             env, rng, self.world.state, self.goal, self.rig, self.hanging, mass, option.pad_xy, radians(option.pad_yaw),
-            self._ground.payload, option.start_height, self.way,
+            self._ground.payload, option.start_height, self.course,
         )  # fmt: skip
         self.touch[env], self.speed[env], self.time[env] = AIRBORNE, 0.0, 0.0
         _plan(env, env + 1, 0.0, *self._planned())
@@ -125,7 +125,7 @@ class Land(Task):
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for keeping the plan, as payload first and as slack drones later; see `Task.scorer`."""
         return bind(
-            _score, lo, hi, self.world.state, self.goal, self.errors, self.way, self.share, self.limits, self._down,
+            _score, lo, hi, self.world.state, self.goal, self.errors, self.course, self.share, self.limits, self._down,
             action, previous, self.weights, self.dt, self.terms, self.good_time,
         )  # fmt: skip
 
@@ -133,7 +133,7 @@ class Land(Task):
         self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray, observation: np.ndarray, critic: np.ndarray
     ) -> list[Callable[[], None]]:
         """See who touches the ground before failures are looked for; see `Task.after_step`."""
-        touching = (self.way, self.touch, self.speed, self.world.state, self.limits, self._down, self.watch)
+        touching = (self.course, self.touch, self.speed, self.world.state, self.limits, self._down, self.watch)
         judge = bind(_touch_down, lo, hi, *touching)
         return [judge, *super().after_step(lo, hi, action, previous, observation, critic)]
 
@@ -143,7 +143,7 @@ class Land(Task):
 
     def _planned(self) -> tuple:
         return (
-            self.time, self.way, self.touch, self.speed, self.share, self.world.state, self.goal, self.rig,
+            self.time, self.course, self.touch, self.speed, self.share, self.world.state, self.goal, self.rig,
             self._ground, self.limits, self._down, self.watch,
         )  # fmt: skip
 
