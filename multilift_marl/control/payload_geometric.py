@@ -41,7 +41,7 @@ class PayloadGains(NamedTuple):
     """Gains of the payload's controller: accelerations that correct its errors, and a lead.
 
     Those of attitude and rates are negative: what is commanded arrives about a third of a swing late, through the
-    smoothed reference and the drone, so that a push along an error comes as one against its rate (docs/control.md).
+    smoothed reference and the drone, so that a push along an error comes as one against its rate (docs/pose.md).
     """
 
     position: tuple[float, float, float] = (2.5, 2.5, 6.0)
