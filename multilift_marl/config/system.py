@@ -23,7 +23,7 @@ from multilift_marl.config.rig import (
 from multilift_marl.config.teams import resolve_vehicles
 from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import thrust_frame
+from multilift_marl.math3d import quat_to_mat, thrust_frame
 
 if TYPE_CHECKING:
     from multilift_marl.config.schema import Config, WindConfig
@@ -132,6 +132,12 @@ class System:
     def resting_rotation(self) -> np.ndarray:
         """Attitude of each resting drone in the payload's frame (N, 3, 3)."""
         return _resting_rotations(self.vehicles, self.drone_pull)
+
+    @property
+    def inertia_matrix(self) -> tuple[float, ...]:
+        """Return the payload's nominal inertia about its centre of mass, in its frame, row by row (9,) [kg m²]."""
+        axes = np.reshape(quat_to_mat(*(float(q) for q in self.payload_axes)), (3, 3))
+        return tuple(float(moment) for moment in ((axes * self.payload_inertia) @ axes.T).ravel())
 
 
 def resolve_system(config: Config) -> System:
