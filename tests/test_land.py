@@ -156,7 +156,7 @@ def test_in_return_motors_off_lose_to_staying_high_to_the_formation_to_its_integ
         total, *_ = fly_once(vec, make_scripted(script, vec).act if script else lambda observation: high)
         return total.mean()
 
-    off, high = score(thrust_min=0.0, thrust_max=0.0), score()
+    off, high = score(thrust_min=np.zeros(4), thrust_max=np.zeros(4)), score()
     formation, integral = score("formation"), score("formation_integral")
     assert off < 0.2 * high
     assert high < 0.8 * formation

@@ -180,7 +180,7 @@ def test_returns_rank_motors_off_holding_the_start_and_the_scripts():
     def score(script="formation", off=False, **options):
         vec = make("pose", num_envs=48, **{f"task_options.{key}": value for key, value in options.items()})
         if off:
-            vec.pilot._gains = vec.pilot._gains._replace(thrust_min=0.0, thrust_max=0.0)
+            vec.pilot.gains = vec.pilot.gains._replace(thrust_min=np.zeros(4), thrust_max=np.zeros(4))
             vec._bind()
         policy, total, over = make_scripted(script, vec), np.zeros(48), np.zeros(48, bool)
         observation, _ = vec.reset(seed=0)

@@ -40,7 +40,7 @@ def test_in_return_motors_off_lose_to_holding_the_start_to_the_formation_to_its_
         total, *_ = fly_once(vec, make_scripted(script, vec).act if script else lambda observation: hold)
         return total
 
-    off = score(thrust_min=0.0, thrust_max=0.0)
+    off = score(thrust_min=np.zeros(4), thrust_max=np.zeros(4))
     hold, formation, integral = score(), score("formation"), score("formation_integral")
     assert off.mean() < 0.1 * hold.mean()
     assert hold.mean() < 0.8 * formation.mean()

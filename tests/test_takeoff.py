@@ -188,7 +188,7 @@ def test_in_return_motors_off_lose_to_standing_by_to_the_formation_to_its_integr
         total, *_ = fly_once(vec, make_scripted(script, vec).act if script else lambda observation: action)
         return total.mean()
 
-    off, low = score(thrust_min=0.0, thrust_max=0.0), score(raised=-0.5)
+    off, low = score(thrust_min=np.zeros(4), thrust_max=np.zeros(4)), score(raised=-0.5)
     formation, integral = score("formation"), score("formation_integral")
     assert off < 0.35 * formation
     assert off < low < 0.8 * formation
