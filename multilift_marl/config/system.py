@@ -21,7 +21,7 @@ from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, check_roto
 from multilift_marl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from multilift_marl.config.schema import Config, WindConfig
+    from multilift_marl.config.schema import Config, RandomizationConfig, WindConfig
 
 MIN_THRUST_TO_WEIGHT = 1.18
 MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the vehicle's span
@@ -57,6 +57,7 @@ class System:
         air: what else the air does.
         timestep: physics step [s].
         control_interval: physics steps for each control step.
+        varied: keys of `randomization` by which environments differ.
     """
 
     vehicle: Vehicle
@@ -86,6 +87,7 @@ class System:
     air: WindConfig
     timestep: float
     control_interval: int
+    varied: frozenset[str] = frozenset()
 
     @property
     def num_drones(self) -> int:
@@ -186,8 +188,10 @@ def resolve_system(config: Config) -> System:
         control_interval=whole_ratio(
             1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"
         ),
+        varied=frozenset(key for key, value in config.randomization if np.any(value)),
     )
-    _check_possible(system, heaviest=1 + config.randomization.payload_mass)
+    _check_ranges(config.randomization, system)
+    _check_possible(system, config.randomization)
     return system
 
 
@@ -211,9 +215,22 @@ def _steady_bending(tension: float, mass: float, length: float, n: int, h: float
     return max(tension * link * h, float(least.max()))
 
 
-def _check_possible(system: System, heaviest: float) -> None:
-    """Refuse what cannot fly, hovering under a payload `heaviest` times its nominal mass included."""
+def _check_ranges(ranges: RandomizationConfig, system: System) -> None:
+    """Refuse to vary what the system has not, and delays in the wrong order."""
+    if system.payload_shape == "point":
+        for key in ("payload_inertia", "payload_center_of_mass"):
+            if np.any(getattr(ranges, key)):
+                raise ConfigError(f"randomization.{key} needs a payload with extent, not a point; set it to 0")
+    for key in ("action_delay", "observation_delay"):
+        low, high = getattr(ranges, key)
+        if low > high:
+            raise ConfigError(f"randomization.{key}={[low, high]} must list the shorter delay first")
+
+
+def _check_possible(system: System, ranges: RandomizationConfig) -> None:
+    """Refuse what cannot fly, the heaviest payload and the heaviest and weakest drones included."""
     n, vehicle = system.num_drones, system.vehicle
+    heaviest = 1 + ranges.payload_mass
     if system.air.wash or system.air.ground_effect:
         check_rotors(vehicle)
     thrust = 4 * vehicle.rotor_thrust_max
@@ -224,12 +241,16 @@ def _check_possible(system: System, heaviest: float) -> None:
             f"{lifted}, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
         )
     rope = system.drone_pull - system.formation_force
-    hover = np.linalg.norm(heaviest * system.formation_force + rope + [0, 0, vehicle.mass * GRAVITY], axis=1)
+    weight = (1 + ranges.vehicle_mass) * vehicle.mass * GRAVITY
+    hover = np.linalg.norm(heaviest * system.formation_force + rope + [0, 0, weight], axis=1)
+    thrust *= 1 - ranges.vehicle_thrust_coefficient
     if np.any(hover > thrust):
         i = int(hover.argmax())
+        varied = ranges.vehicle_mass or ranges.vehicle_thrust_coefficient
+        cure = "randomization.vehicle_mass, randomization.vehicle_thrust_coefficient, " if varied else ""
         raise ConfigError(
             f"drone {i} would need {hover[i]:.1f} N of its {thrust:.1f} N to hover under the heaviest payload; lower "
-            "payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
+            f"{cure}payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
         )
     tight = heaviest * system.resting_tension
     if np.any(tight >= system.breaking_load):

@@ -22,8 +22,9 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     """A team of N drones as a PettingZoo environment; agents `drone_0` ... act at once and end together.
 
     Observations are (D,) float32, actions (A,) in [-1, 1], rewards are the team's. Each agent's info holds `success`,
-    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one) and `reward_terms` {name: float}. A
-    copy, also by pickle, is a new environment of the same configuration, not yet reset.
+    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms` {name: float} and
+    `randomization` {name: array}, the hidden draw. A copy, also by pickle, is a new environment of the same
+    configuration, not yet reset.
 
     Args:
         config: what to build; it is stepped alone, whatever `env.num_envs` says.
@@ -68,15 +69,16 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
 
         Args:
             seed: start at episode 0 of this seed; None goes to the next episode.
-            options: ignored; PettingZoo's API test passes some of its own.
+            options: `randomization` and `state`, values by name to start from; see docs/randomization.md.
 
         Returns:
             Observation {agent: (D,) float32} and info of each agent.
 
         Raises:
-            ValueError: a negative seed.
+            ValueError: a negative seed, an unknown option or one that cannot be.
         """
-        observation, info = self.vec.reset(seed)
+        options = {name: value for name, value in (options or {}).items() if name != "options"}  # of PettingZoo's test
+        observation, info = self.vec.reset(seed, options=options)
         self.agents, self._started = self.possible_agents.copy(), True
         return dict(zip(self.agents, observation[0], strict=True)), self._infos(info)
 
@@ -166,6 +168,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         terms = dict(zip(vec.reward_terms, vec.task.terms[0].tolist(), strict=True))
         success, failure, diverged = bool(info["success"][0]), bool(info["failure"][0]), bool(info["diverged"][0])
         cause = vec.failure_causes[info["failure_cause"][0]]
+        drawn = {name: array[0] for name, array in info["randomization"].items()}
         return {
             name: {
                 "success": success,
@@ -173,6 +176,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
                 "diverged": diverged,
                 "failure_cause": cause,
                 "reward_terms": terms.copy(),
+                "randomization": drawn.copy(),
             }
             for name in self.possible_agents
         }

@@ -141,6 +141,8 @@ def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
     body = spec.worldbody.add_body(name="payload", pos=[0, 0, 0 if point else 1.5])
     body.mass, body.explicitinertial = system.payload_mass, True
     body.inertia, body.ipos, body.iquat = system.payload_inertia, [0, 0, 0], system.payload_axes
+    if "payload_center_of_mass" in system.varied:
+        body.simple = False  # or MuJoCo takes the centre of mass to be the origin for good
     colour = [0.86, 0.66, 0.35, 1]
     if point:
         for name, axis in zip("xyz", np.eye(3), strict=True):

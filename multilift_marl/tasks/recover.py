@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import atan2, cos, pi, radians, sin, sqrt
+from math import atan2, cos, pi, radians, sin
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -94,8 +94,7 @@ class Recover(Task):
         if not self.rig.anchors.any():
             _turn_formation(env, state, goal, self.rig)
         carried = self.hanging.drone_mass + mass / self.world.num_drones
-        hover = sqrt(carried * GRAVITY / 4 / self.hanging.thrust_coefficient)
-        state.rotor_speed[env] = hover
+        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / self.hanging.thrust_coefficient)[:, None]
         state.payload_body_rates[env] = 0.0
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
@@ -105,7 +104,7 @@ class Recover(Task):
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell grace and slack; see `Task.observer`."""
         return bind(
-            _tell, lo, hi, self.time, self.options.grace, self.world.state, self.rig, self.hanging, observation, critic
+            _tell, lo, hi, self.time, self.options.grace, self.seen, self.rig, self.hanging, observation, critic
         )
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:

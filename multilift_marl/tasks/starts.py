@@ -12,11 +12,12 @@ from multilift_marl.config.system import GRAVITY, System
 from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
 from multilift_marl.sim.cables import cable_end
+from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.rows import hover_drone
 
 
 class Hanging(NamedTuple):
-    """Numbers of a team that hangs in equilibrium, nominal."""
+    """Numbers of a team that hangs in equilibrium."""
 
     length: np.ndarray
     """(N,) of the cables [m]; likewise the next ones."""
@@ -24,20 +25,36 @@ class Hanging(NamedTuple):
     weight: np.ndarray
     segments: np.ndarray
     payload_mass: float
-    drone_mass: float
-    thrust_coefficient: float
+    """Nominal [kg]."""
+    drone_mass: np.ndarray
+    """(N,) [kg]."""
+    thrust_coefficient: np.ndarray
+    """(N,) [N s²]."""
 
 
 def make_hanging(system: System) -> Hanging:
-    """Return the numbers of `system`."""
+    """Return the nominal numbers of `system`."""
+    n = system.num_drones
     return Hanging(
         length=system.cable_length,
         stiffness=system.cable_stiffness,
         weight=system.cable_mass * GRAVITY,
         segments=system.cable_segments,
         payload_mass=system.payload_mass,
-        drone_mass=system.vehicle.mass,
-        thrust_coefficient=system.vehicle.thrust_coefficient,
+        drone_mass=np.full(n, system.vehicle.mass),
+        thrust_coefficient=np.full(n, system.vehicle.thrust_coefficient),
+    )
+
+
+def true_hanging(nominal: Hanging, parameters: Parameters, e: int) -> Hanging:
+    """Return the numbers of the team in environment e."""
+    p = parameters
+    return nominal._replace(
+        length=p.cable_length[e],
+        stiffness=p.cable_stiffness[e],
+        weight=nominal.weight * (p.cable_length[e] / nominal.length),
+        drone_mass=p.vehicle_mass[e],
+        thrust_coefficient=nominal.thrust_coefficient * p.vehicle_thrust_coefficient[e],
     )
 
 
@@ -82,7 +99,7 @@ def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, m
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
         pull = add(scale(tension, direction), half)
-        hover_drone(e, n, state, pull, goal.drone_yaw[e], hanging.drone_mass, hanging.thrust_coefficient)
+        hover_drone(e, n, state, pull, goal.drone_yaw[e], hanging.drone_mass[n], hanging.thrust_coefficient[n])
 
 
 class StartRanges(NamedTuple):
