@@ -10,6 +10,7 @@ import numpy as np
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.options import Rows, check_delays, check_stretch, read_options
 from multilift_marl.errors import ConfigError
+from multilift_marl.sim.parameters import Parameters, check_parameters
 from multilift_marl.sim.randomization import Draw
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
@@ -47,6 +48,11 @@ class Episodes:
         """Return what `options` fix, with a row for each environment in `mask`; see `read_options`."""
         fixed = read_options(options, mask, self._draw.values, self._world.state)
         check_delays(fixed["randomization"], self._longest)
+        for name, rows in fixed["randomization"].items():
+            if name in Parameters._fields:
+                value = self._draw.values[name].copy()
+                value[mask] = rows
+                check_parameters(self._world.system, self._draw.parameters, mask, {name: value})
         return fixed
 
     def draw(self, e: int, seed: int, key: tuple[int, int, int], fixed: dict[str, Rows], row: int) -> None:

@@ -60,7 +60,6 @@ class World:
         system: what to simulate, such as `load_config("hover").system`.
         num_envs: E.
         num_threads: threads; 0 for one on each available CPU. Results do not depend on it, bit for bit.
-
         seed: of the turbulence that each `reset` starts with; `seed_turbulence` gives another.
 
     Attributes:
