@@ -25,6 +25,7 @@ class Pilot:
     Attributes:
         action_names: names of the numbers of an action.
         reference: what the drones are told to follow; live arrays.
+        gains: of the controller, for the nominal drones.
         disturbance: what `control.disturbance` remembers, None without.
 
     Raises:
@@ -39,7 +40,7 @@ class Pilot:
         self.action_names = self.interface.names
         self.reference, self.disturbance = Reference.zeros(e, n), None
         self._setpoint = Setpoint.zeros(e, n)
-        self._gains = make_gains(settings, world.system)
+        self.gains = make_gains(settings, world.system)
         self._kind = settings.disturbance
         if self._kind != "none":
             if self._kind not in self.interface.rejects:
@@ -49,7 +50,7 @@ class Pilot:
                     f"use it with {' or '.join(able)}, or set control.disturbance=none"
                 )
             self.disturbance = Disturbance.zeros(e, n)
-            self._rejection = make_rejection(settings, world.system, self._gains, dt)
+            self._rejection = make_rejection(settings, world.system, self.gains, dt)
 
     def bind(
         self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
@@ -62,7 +63,7 @@ class Pilot:
             goal: of the task.
             plan: moves the goals on by one control step; None if they stay.
         """
-        state, thrust, g = self.world.state, self.world.thrust, self._gains
+        state, thrust, g = self.world.state, self.world.thrust, self.gains
         rejection = self.disturbance
         pull = goal.pull if rejection is None else rejection.pull
         team = Team(state, goal, self.reference, self._setpoint, pull, thrust, g)

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
+from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import smooth_yaw
 from multilift_marl.control.geometric import (
     desired_rates,
-    drive_rotors,
     follow_attitude,
     follow_force,
     rate_torque,
@@ -75,7 +75,9 @@ def fly_velocity(lo, hi, state, reference, pull, thrust, g):
             force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, g, share)
             force_rate = scale(g.mass + share, vec(reference.jerk, e, n))
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
-            follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, thrust[e, n], g)
+            rotors = follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, g)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
 
 
 @kernel
@@ -97,7 +99,9 @@ def fly_acceleration(lo, hi, state, reference, pull, thrust, g):
             velocity = vec(reference.velocity, e, n)
             force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, g, g.load_share[n])
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
-            follow_force(attitude, rates, force, STILL, yaw, yaw_rate, thrust[e, n], g)
+            rotors = follow_force(attitude, rates, force, STILL, yaw, yaw_rate, g)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
 
 
 @kernel
@@ -126,7 +130,9 @@ def fly_acc_rates(lo, hi, state, reference, rates, pull, thrust, g):
             desired_rate = (rates[e, n, 0], rates[e, n, 1], turning[2])
             total = max(dot(force, unit(column(attitude, 2))), 0.0)
             own = vec(state.drone_body_rates, e, n)
-            follow_attitude(attitude, own, desired, desired_rate, total, thrust[e, n], g)
+            rotors = follow_attitude(attitude, own, desired, desired_rate, total, g)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
 
 
 @kernel
@@ -144,7 +150,9 @@ def fly_attitude(lo, hi, state, attitude, rates, total, thrust, g):
         for n in range(thrust.shape[1]):
             own, own_rates = mat(state.drone_rotation, e, n), vec(state.drone_body_rates, e, n)
             desired, desired_rate = mat(attitude, e, n), vec(rates, e, n)
-            follow_attitude(own, own_rates, desired, desired_rate, total[e, n], thrust[e, n], g)
+            rotors = follow_attitude(own, own_rates, desired, desired_rate, total[e, n], g)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
 
 
 @kernel
@@ -153,4 +161,6 @@ def fly_rates(lo, hi, state, rates, total, thrust, g):
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
             torque = rate_torque(vec(state.drone_body_rates, e, n), vec(rates, e, n), g)
-            drive_rotors(total[e, n], torque, thrust[e, n], g)
+            rotors = allocate(total[e, n], torque, g.allocation, g.thrust_min, g.thrust_max)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.gate import Gate
 from multilift_marl.tasks.hover import Hover
 from multilift_marl.tasks.loss import Loss
 from multilift_marl.tasks.recover import Recover
 from multilift_marl.tasks.track import Track
 
-TASKS: dict[str, type[Task]] = {"hover": Hover, "loss": Loss, "recover": Recover, "track": Track}
+TASKS: dict[str, type[Task]] = {"gate": Gate, "hover": Hover, "loss": Loss, "recover": Recover, "track": Track}
 
 
 def list_tasks() -> list[str]:

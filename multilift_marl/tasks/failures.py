@@ -21,10 +21,11 @@ CAUSES = (
     "below_payload",  # a drone lower than the payload
     "tilt",  # a drone tilted over 80°
     "cable_broken",  # its tension has exceeded cable.breaking_load
+    "wall",  # anything touches a wall (task gate)
     "out_of_range",  # payload over 3 m from its target, whatever the vehicle
     "diverged",  # the simulation has failed, not the team
 )
-GROUND, COLLISION, CROSSING, CABLE, BELOW, TILT, BROKEN, RANGE, DIVERGED = range(1, len(CAUSES))
+GROUND, COLLISION, CROSSING, CABLE, BELOW, TILT, BROKEN, WALL, RANGE, DIVERGED = range(1, len(CAUSES))
 LOAD_GROUND = 0  # the payload's contact with the ground, to be forgiven apart from the drones'
 
 MAX_DISTANCE = 3.0  # [m]

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.math3d import add, row, scale, sub, turn
+from multilift_marl.math3d import add, put, row, scale, sub, turn
 
 PATHS = ("circle", "figure8", "lemniscate", "helix", "random")
 CIRCLE, FIGURE8, LEMNISCATE, HELIX, RANDOM = range(len(PATHS))
 RAMP = 2.0  # [s] from rest to full speed
 WAYPOINTS = 12  # of a random path, with the first and the last
-_H = 0.01  # [s] between the points that are differentiated
+STEP = 0.01  # [s] between the places that are differentiated
 
 
 class Path(NamedTuple):
@@ -89,13 +89,27 @@ def _spline(curve, u):
 @kernel
 def motion(e, t, path):
     """Return position, velocity, acceleration and jerk of the path of environment e, [m] and [s]."""
-    a, b, c = place(e, t - 2.0 * _H, path), place(e, t - _H, path), place(e, t, path)
-    d, f = place(e, t + _H, path), place(e, t + 2.0 * _H, path)
+    a, b, c = place(e, t - 2.0 * STEP, path), place(e, t - STEP, path), place(e, t, path)
+    return differences(a, b, c, place(e, t + STEP, path), place(e, t + 2.0 * STEP, path))
+
+
+@kernel
+def differences(a, b, c, d, f):
+    """Return position and its first three derivatives at the third of five places that are STEP apart."""
     inner, outer = sub(d, b), sub(f, a)
-    velocity = scale(1.0 / (12.0 * _H), sub(scale(8.0, inner), outer))
+    velocity = scale(1.0 / (12.0 * STEP), sub(scale(8.0, inner), outer))
     middle = sub(scale(16.0, add(b, d)), add(scale(30.0, c), add(a, f)))
-    jerk = scale(1.0 / (2.0 * _H**3), sub(outer, scale(2.0, inner)))
-    return c, velocity, scale(1.0 / (12.0 * _H**2), middle), jerk
+    jerk = scale(1.0 / (2.0 * STEP**3), sub(outer, scale(2.0, inner)))
+    return c, velocity, scale(1.0 / (12.0 * STEP**2), middle), jerk
+
+
+@kernel
+def set_goal(e, motion, goal):
+    """Write position, velocity, acceleration and jerk of a goal."""
+    put(goal.position[e], motion[0])
+    put(goal.velocity[e], motion[1])
+    put(goal.acceleration[e], motion[2])
+    put(goal.jerk[e], motion[3])
 
 
 def draw_curve(rng: np.random.Generator, half: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ from multilift_marl.tasks.paths import (
     motion,
     own_time,
     place,
+    set_goal,
 )  # fmt: skip
 from multilift_marl.tasks.starts import hang_team, in_ball
 from multilift_marl.tasks.terms import mean_change, tolerance
@@ -135,11 +136,7 @@ def _start(e, rng, state, goal, rig, hanging, mass, path, height, radius):
 @kernel
 def _aim(e, t, path, goal, rig):
     """Write the goal of environment e at a time."""
-    position, velocity, acceleration, jerk = motion(e, t, path)
-    put(goal.position[e], position)
-    put(goal.velocity[e], velocity)
-    put(goal.acceleration[e], acceleration)
-    put(goal.jerk[e], jerk)
+    set_goal(e, motion(e, t, path), goal)
     place_formation(e, goal, rig)
     if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
         goal.drone_yaw[e] = path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi

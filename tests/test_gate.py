@@ -1,0 +1,107 @@
+"""Task gate: the way through, what touches, and what drones are told."""
+
+import numpy as np
+import pytest
+from conftest import make, zeros
+
+
+def reset(num_envs: int = 4, **options):
+    """Return environments at their starts; options of the task by name."""
+    vec = make("gate", num_envs=num_envs, **{f"task_options.{key}": value for key, value in options.items()})
+    vec.reset(seed=0)
+    return vec
+
+
+def run(vec, seconds: float):
+    """Fly the formation and return positions of the target (T, E, 3) and who ended with which cause."""
+    path, causes = [], {}
+    for _ in range(round(50 * seconds)):
+        _, _, terminated, truncated, info = vec.step(zeros(vec))
+        path.append(vec.task.goal.position.copy())
+        for e in np.flatnonzero(terminated):
+            causes[e] = vec.failure_causes[info["failure_cause"][e]]
+        if (terminated | truncated).any():
+            break
+    return np.array(path), causes
+
+
+@pytest.mark.parametrize("gates", [1, 2])
+def test_the_target_flies_straight_through_every_gap(gates):
+    vec = reset(gates=gates, gap_width=4.0, gap_height=10.0)
+    middles = vec.task.gap_y.copy()
+    path, causes = run(vec, 12.0)
+    assert not causes
+    np.testing.assert_allclose(path[0], np.tile([-2, 0, 1.3], (4, 1)), atol=1e-9)
+    np.testing.assert_allclose(path[-1], np.tile([2, 0, 1.3], (4, 1)), atol=1e-9)
+    for e in range(4):
+        for x, y in zip(vec.task.gates.x, middles[e], strict=True):
+            inside = np.abs(path[:, e, 0] - x) < 0.2
+            assert inside.sum() > 5
+            np.testing.assert_allclose(path[inside, e, 1], y, atol=1e-9)
+    assert np.abs(middles).max() <= 0.3 and np.ptp(middles) > 0.1
+
+
+def test_the_formation_hits_the_wall_where_it_stands():
+    vec = reset(num_envs=8)
+    seen = {}
+    for _ in range(500):
+        _, _, terminated, _, info = vec.step(zeros(vec))
+        for e in np.flatnonzero(terminated):
+            seen[e] = (vec.failure_causes[info["failure_cause"][e]], vec.world.state.drone_position[e].copy())
+        if terminated.any():
+            break
+    cause, drones = next(iter(seen.values()))
+    assert cause == "wall"
+    assert np.abs(drones[:, 0]).min() < 0.25
+
+
+def test_a_wide_gap_lets_the_formation_pass_and_succeed():
+    vec = reset(num_envs=8, gap_width=1.8)
+    for _ in range(vec.max_steps):
+        _, _, terminated, _, info = vec.step(zeros(vec))
+        assert not terminated.any()
+    assert info["success"].all()
+
+
+@pytest.mark.parametrize(
+    "drone, touches",
+    [((0.0, 0.0, 2.0), False), ((0.0, 0.44, 2.0), True), ((0.2, 0.44, 2.0), False), ((0.0, 0.0, 2.99), True)],
+)
+def test_a_drone_touches_beside_and_above_the_gap_alone(drone, touches):
+    from multilift_marl.tasks.gate import _least_room
+
+    vec = reset(num_envs=1)
+    state, task = vec.world.state, vec.task
+    task.gap_y[0] = 0.0
+    state.payload_position[0], state.payload_rotation[0] = [drone[0], 0, 1.3], np.eye(3)
+    state.drone_position[0] = [[x, 0.0, 2.0] for x in (0.8, -0.8, 1.2, -1.2)]
+    state.drone_rotation[0] = np.eye(3)
+    state.drone_position[0, 0] = drone
+    state.payload_position[0, 0] = 1.0  # the load is past the wall
+    state.drone_position[0, 1:, 0] = [0.8, 1.0, 1.2]
+    room = _least_room(0, state, task.gates, task.bodies)
+    assert (room < 0) == touches
+
+
+def test_a_cable_touches_too():
+    from multilift_marl.tasks.gate import _cable_room
+
+    gates = reset(num_envs=1).task.gates
+    gates.y[0] = 0.0
+    assert _cable_room(0, 0, (-0.5, 0.0, 1.3), (0.5, 0.9, 2.0), gates) > 0  # crosses at y = 0.45
+    assert _cable_room(0, 0, (-0.5, 0.2, 1.3), (0.5, 0.9, 2.0), gates) < 0
+    assert _cable_room(0, 0, (0.3, 2.0, 1.3), (0.5, 2.0, 2.0), gates) == 1
+
+
+def test_drones_are_told_the_gap_and_their_room():
+    vec = reset(num_envs=4)
+    observation, _ = vec.current()
+    names, state, task = vec.observation_names, vec.world.state, vec.task
+    at = names.index("gap_0")
+    for e in range(4):
+        for n in range(4):
+            c, s = task.goal.slot_frame[e, n]
+            away = state.drone_position[e, n] - [0.0, task.gap_y[e, 0], 1.3]
+            expected = [c * away[0] + s * away[1], c * away[1] - s * away[0], away[2]]
+            np.testing.assert_allclose(observation[e, n, at : at + 3], expected, atol=1e-5)
+    assert (observation[..., names.index("clearance_0")] < -0.1).all()

@@ -1,0 +1,104 @@
+"""Task loss: who is lost and when, what that does, and what the others are told."""
+
+import numpy as np
+import pytest
+from conftest import GRAVITY, make, refusal, zeros
+
+from multilift_marl.control.scripted import make_scripted
+
+
+def fly_past_the_loss(config: str = "loss", seconds: float = 5.0, **keywords):
+    """Return environments, flown by formation_integral until all have lost a drone."""
+    vec = make(config, **{"num_envs": 4, **keywords})
+    observation, _ = vec.reset(seed=0)
+    script = make_scripted("formation_integral", vec)
+    for _ in range(round(50 * seconds)):
+        observation, _, terminated, _, _ = vec.step(script.act(observation))
+        assert not terminated.any()
+    return vec, observation
+
+
+def test_the_drawn_drone_is_lost_at_the_drawn_time():
+    vec = make("loss", num_envs=64)
+    vec.reset(seed=0)
+    assert vec.task.when.min() >= 2 and vec.task.when.max() <= 4 and np.ptp(vec.task.when) > 1.5
+    assert set(vec.task.who) == {0, 1, 2, 3}
+    for step in range(1, 211):
+        vec.step(zeros(vec))
+        gone = vec.task.watch.lost.any(axis=1)
+        assert (gone == (vec.task.when <= 0.02 * step + 1e-9)).all()
+    assert (vec.task.watch.lost == vec.world.plant.motors_off).all()
+    assert (vec.task.watch.lost.argmax(axis=1) == vec.task.who).all() and gone.all()
+
+
+@pytest.mark.parametrize("num_drones", [3, 4, 6])
+def test_motors_stop_and_the_drone_hangs_on_its_cable(num_drones):
+    vec, _ = fly_past_the_loss(num_drones=num_drones, seconds=9.0)
+    state, world = vec.world.state, vec.world
+    for e, n in enumerate(vec.task.who):
+        assert world.state.rotor_speed[e, n].max() < 1e-6
+        assert state.drone_position[e, n, 2] < state.payload_position[e, 2]
+        assert state.cable_tension[e, n] == pytest.approx(world.system.vehicle.mass * GRAVITY, rel=0.3)
+        others = np.delete(np.arange(num_drones), n)
+        assert (state.drone_position[e, others, 2] > state.payload_position[e, 2]).all()
+
+
+def test_with_a_snapped_cable_the_drone_is_gone():
+    vec, _ = fly_past_the_loss("loss_snap")
+    state = vec.world.state
+    for e, n in enumerate(vec.task.who):
+        assert state.cable_broken[e].tolist() == [i == n for i in range(4)]
+        assert state.cable_tension[e, n] == 0 and state.drone_position[e, n, 2] < 0.5
+    vec.reset()
+    assert not state.cable_broken.any() and not vec.world.plant.motors_off.any() and not vec.task.watch.lost.any()
+    vec.step(zeros(vec))
+    assert (state.cable_tension > 0).all()
+
+
+def test_the_action_of_a_lost_drone_is_ignored():
+    vec, _ = fly_past_the_loss(seconds=5.0)
+    other, _ = fly_past_the_loss(seconds=5.0)
+    for step in range(25):
+        action = zeros(vec)
+        vec.step(action)
+        for e, n in enumerate(other.task.who):
+            action[e, n] = np.random.default_rng(step).uniform(-1, 1, 4)
+        other.step(action)
+    assert (vec.world.state.payload_position == other.world.state.payload_position).all()
+
+
+def test_drones_are_told_who_is_lost():
+    vec, observation = fly_past_the_loss()
+    names, azimuth = vec.observation_names, vec.task.rig.azimuth
+    lost, team = (observation[..., names.index(f"{name}_0")] for name in ("lost", "team_lost"))
+    assert (lost == vec.task.watch.lost).all() and (team == 1).all()
+    at = names.index("lost_direction_0")
+    for e, n in enumerate(vec.task.who):
+        expected = np.stack([np.cos(azimuth[n] - azimuth), np.sin(azimuth[n] - azimuth)], axis=1)
+        np.testing.assert_allclose(observation[e, :, at : at + 2], expected, atol=1e-6)
+    observation, _ = vec.reset()
+    assert not observation[..., names.index("lost_0") :].any()
+
+
+def test_success_needs_the_angle_with_six_drones_alone():
+    for num_drones, expected in ((4, True), (6, False)):
+        vec = make(
+            "loss",
+            num_envs=1,
+            num_drones=num_drones,
+            **{"task_options.start_radius": 0.0, "task_options.start_speed": 0.0},
+        )
+        vec.reset(seed=0)
+        vec.world.state.payload_rotation[0] = [[1, 0, 0], [0, np.cos(0.3), -np.sin(0.3)], [0, np.sin(0.3), np.cos(0.3)]]
+        vec.task.goal.rotation[0] = np.eye(3)
+        vec.task.check(0, 1, 0.0)
+        score = vec.task.scorer(0, 1, vec._action, vec._action)
+        for _ in range(101):
+            score()
+        vec.task.watch.lost[0, 0] = True
+        assert vec.task.succeeded()[0] == expected
+
+
+def test_one_drone_cannot_lose_itself():
+    assert "raise env.num_drones" in refusal(make, "loss", num_drones=1)
+    assert "must list the earlier one first" in refusal(make, "loss", **{"task_options.loss_time": (4.0, 2.0)})
