@@ -56,7 +56,8 @@ class Task:
         watch: failures that do not count for now.
         time: since the start, for tasks with a plan (E,) [s].
         seen: the state as the drones are told it, for observers; live arrays.
-        hanging: nominal numbers of a hanging team; in `start`, those of the environment.
+        hanging: numbers of a hanging team; in `start`, the true ones of the environment, else nominal.
+        nominal_hanging: always nominal, for goals.
     """
 
     name: ClassVar[str]
@@ -76,7 +77,8 @@ class Task:
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
         self.rig = Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull)
-        self.limits, self.hanging = make_limits(system), make_hanging(system)
+        self.limits, self.nominal_hanging = make_limits(system), make_hanging(system)
+        self.hanging = self.nominal_hanging
         tension = system.resting_tension
         self._nominal = np.append(np.stack([system.cable_length, tension], axis=1), [[system.payload_mass, 0]], axis=0)
         self.cause, self.good_time = np.zeros(e, np.int64), np.zeros(e)
@@ -119,10 +121,9 @@ class Task:
 
     def place(self, env: int, rng: np.random.Generator, parameters: Parameters) -> bool:
         """Draw a start of one environment, whose team has true `parameters`; return whether it is sound."""
-        nominal = self.hanging
-        self.hanging = true_hanging(nominal, parameters, env)
+        self.hanging = true_hanging(self.nominal_hanging, parameters, env)
         self.start(env, rng, float(parameters.payload_mass[env]))
-        self.hanging = nominal
+        self.hanging = self.nominal_hanging
         return self.begin(env)
 
     def begin(self, env: int) -> bool:

@@ -117,7 +117,8 @@ class Gate(Task):
 
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell where the next gap is; see `Task.observer`."""
-        return bind(_tell, lo, hi, self.world.state, self.goal, self.gates, self.bodies, observation, critic)
+        state = self.world.state
+        return bind(_tell, lo, hi, state, self.seen, self.goal, self.gates, self.bodies, observation, critic)
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness to the moving target and for room; a touched wall is a failure. See `Task.scorer`."""
@@ -249,19 +250,19 @@ def _spread(e, g, state, gates, bodies):
 
 
 @kernel
-def _tell(lo, hi, state, goal, gates, bodies, observation, critic):
+def _tell(lo, hi, state, seen, goal, gates, bodies, observation, critic):
     for e in range(lo, hi):
         g = _next(e, state.payload_position[e, 0], gates)
         middle = (gates.x[g], gates.y[e, g], gates.level)
         told = critic[e, critic.shape[1] - 6 :]
         put(told[0:3], row(goal.velocity, e))
         put(told[3:6], sub(row(state.payload_position, e), middle))
-        room = min(max(_spread(e, g, state, gates, bodies), -0.5), 0.5)
+        room = min(max(_spread(e, g, seen, gates, bodies), -0.5), 0.5)
         for n in range(observation.shape[1]):
             c, s = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
             own = observation[e, n, observation.shape[2] - 7 :]
             put(own[0:3], turn(c, s, row(goal.velocity, e)))
-            put(own[3:6], turn(c, s, sub(vec(state.drone_position, e, n), middle)))
+            put(own[3:6], turn(c, s, sub(vec(seen.drone_position, e, n), middle)))
             own[6] = room
 
 
