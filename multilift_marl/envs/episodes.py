@@ -46,6 +46,8 @@ class Episodes:
 
     def read(self, options: Mapping[str, Any] | None, mask: np.ndarray) -> dict[str, Rows]:
         """Return what `options` fix, with a row for each environment in `mask`; see `read_options`."""
+        if not options:
+            return {"randomization": {}, "state": {}}
         fixed = read_options(options, mask, self._draw.values, self._world.state)
         check_delays(fixed["randomization"], self._longest)
         for name, rows in fixed["randomization"].items():
@@ -75,7 +77,7 @@ class Episodes:
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
         self._draw.draw(e, rng, seed, (*key, PARAMETERS))
         for name, rows in fixed["randomization"].items():
-            self._draw.values[name][e] = rows[row]
+            self._draw.fix(e, name, rows[row])
         self._world.state.cable_broken[e] = False
         self._place(e, rng)
         if fixed["state"]:
@@ -103,7 +105,7 @@ class Episodes:
     def load(self, mask: np.ndarray) -> None:
         """Make draw and start of the environments in `mask` the world's own."""
         world = self._world
-        world.set_parameters(mask, **self._draw.parameters._asdict())
+        world.set_parameters(mask, **self._draw.changed())
         broken = world.state.cable_broken & mask[:, None]
         world.load(mask)
         if broken.any():
@@ -114,8 +116,7 @@ class Episodes:
         """Restore the imperfections from copies of their arrays, and the draw from what the world has restored."""
         for name, array in self.imperfections.arrays().items():
             array[:] = saved[name]
-        for drawn, own in zip(self._draw.parameters, self._world.parameters, strict=True):
-            drawn[:] = own
+        self._draw.restore(self._world.parameters)
         self._tell()
 
     def _tell(self) -> None:

@@ -34,9 +34,7 @@ def check_seed(seed: Any) -> None:
         raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, but is {seed!r}")
 
 
-def read_options(
-    options: Mapping[str, Any] | None, mask: np.ndarray, drawn: Rows, state: SystemState
-) -> dict[str, Rows]:
+def read_options(options: Mapping[str, Any], mask: np.ndarray, drawn: Rows, state: SystemState) -> dict[str, Rows]:
     """Return the fixed draw and state of `options`, by option and name, with a row for each environment in `mask`.
 
     Args:
@@ -48,7 +46,6 @@ def read_options(
     Raises:
         ValueError: an unknown name, a wrong shape, or values that cannot be.
     """
-    options = options or {}
     for name in options:
         if name not in OPTIONS:
             raise ValueError(f"unknown reset option '{name}'{nearest(str(name), OPTIONS)}")

@@ -22,6 +22,7 @@ class Draw:
     Attributes:
         parameters: drawn, for `World.set_parameters`.
         values: all that is drawn or may be fixed, by name, environment first; live arrays.
+        changing: names of parameters that are not what they are configured to be in every episode.
     """
 
     def __init__(self, world: World, ranges: RandomizationConfig, imperfections: dict[str, np.ndarray]):
@@ -34,6 +35,7 @@ class Draw:
         for name in (*CONFIGURED, *(("payload_inertia",) if point else ())):
             if name not in world.system.varied:
                 del self.values[name]
+        self.changing = {"payload_mass", *world.system.varied.intersection(Parameters._fields)}
         self._more = bool(_OWN_STREAM & world.system.varied)
 
     def draw(self, env: int, rng: np.random.Generator, seed: int, key: tuple[int, ...]) -> None:
@@ -44,8 +46,8 @@ class Draw:
             rng: generator of this episode, for the payload's mass and force.
             seed, key: of a stream for what else there is, so that the episode stays what it is without.
         """
-        for array, nominal in zip(self.parameters, self._nominal, strict=True):
-            array[env] = nominal[0]
+        for name in self.changing:
+            getattr(self.parameters, name)[env] = getattr(self._nominal, name)[0]
         factor, magnitude, direction = rng.uniform(-1.0, 1.0), rng.uniform(), rng.uniform(-np.pi, np.pi)
         self.parameters.payload_mass[env] = self.system.payload_mass * (1.0 + self.ranges.payload_mass * factor)
         force = self.ranges.payload_force * magnitude
@@ -53,6 +55,24 @@ class Draw:
         self.values["wind"][env] = self.system.wind
         if self._more:
             self._draw_more(env, np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key))))
+
+    def fix(self, env: int, name: str, value: np.ndarray) -> None:
+        """Replace what was drawn for one environment."""
+        self.values[name][env] = value
+        if name in Parameters._fields:
+            self.changing.add(name)
+
+    def restore(self, parameters: Parameters) -> None:
+        """Take over the parameters of a world, drawn and fixed before."""
+        for name, nominal in self._nominal._asdict().items():
+            array = getattr(self.parameters, name)
+            array[:] = getattr(parameters, name)
+            if (array != nominal).any():
+                self.changing.add(name)
+
+    def changed(self) -> dict[str, np.ndarray]:
+        """Return those parameters that change, for `World.set_parameters`."""
+        return {name: getattr(self.parameters, name) for name in self.changing}
 
     def _draw_more(self, env: int, rng: np.random.Generator) -> None:
         """Draw what has a stream of its own; all of it, so that no part depends on which others are switched on."""
