@@ -4,10 +4,22 @@ from math import exp
 
 import numpy as np
 import pytest
-from conftest import GRAVITY, free_world, hover_thrust, make, make_system, mask, refuse_system, same, steady, zeros
+from conftest import (
+    GRAVITY,
+    bold_actions,
+    free_world,
+    hover_thrust,
+    make,
+    make_system,
+    mask,
+    refuse_system,
+    same,
+    steady,
+    zeros,
+)
 
 from multilift_marl.sim import World
-from multilift_marl.sim.parameters import Parameters, nominal_parameters
+from multilift_marl.sim.parameters import nominal_parameters
 
 SHARES = {  # key of `randomization`: width
     "payload_mass": 0.2, "payload_inertia": 0.3, "payload_drag": 0.5, "cable_length": 0.05, "cable_stiffness": 0.4,
@@ -87,13 +99,27 @@ def test_info_tells_the_draw_at_reset_and_at_every_step(task):
     assert (told["vehicle_mass"][1] != again["vehicle_mass"][1]).all()
 
 
-def test_nothing_is_shown_to_the_drones():
-    vec = make(num_drones=3, **ALL)
+def test_nothing_of_the_parameters_is_shown_to_the_drones(task):
+    settings = {key: value for key, value in ALL.items() if "second" not in key}
+    vec = make(task, num_drones=3, **settings)
     observation, _ = vec.reset(seed=1)
-    hidden = Parameters(*(array.copy() for array in vec.world.parameters))
-    vec.world.parameters.payload_inertia[:] = vec.world.parameters.vehicle_drag[:] = 2.0
+    for array in vec.world.parameters:
+        array[:] = 2.0 * array + 0.1
     vec.task.observe(0, 4, vec._action, vec._observation, vec._state)
-    assert same(observation, vec._observation) and not same(hidden, vec.world.parameters)
+    assert same(observation, vec._observation)
+
+
+def test_every_task_flies_with_everything_drawn_and_alike_alone(task):
+    batch = make(task, num_envs=4, num_drones=3, num_threads=2, **ALL)
+    alone = make(task, num_envs=1, num_drones=3, first_env=2, **ALL)
+    assert same(batch.reset(seed=5)[0][2], alone.reset(seed=5)[0][0])
+    for step in range(40):
+        action = 0.1 * bold_actions(batch, step)
+        if batch.ended.any():
+            break
+        first, second = batch.step(action), alone.step(action[2:3])
+        assert same(first[0][2], second[0][0]) and same(first[1][2], second[1][0])
+    assert step > 5 and not batch.world.diverged.any()
 
 
 @MODELS
