@@ -17,7 +17,7 @@ from multilift_marl.tasks.failures import CAUSES
 from multilift_marl.tasks.observations import OBSERVATION
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def python(code, cwd, **environment):
@@ -111,7 +111,7 @@ def test_the_table_of_hidden_parameters_is_complete():
     assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(RandomizationConfig.model_fields)
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_and_files_of_documents_exist(document):
     for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
         if not target.startswith("http"):
@@ -152,6 +152,8 @@ def test_commands_of_documents_run_in_order(tmp_path):
             command += f" {short}"
         if script == "evaluate.py":
             command = re.sub(r"episodes=\d+", "episodes=2", command) + " env.episode_seconds=0.4"
+        if script.startswith("examples/"):
+            command += " 1"  # iteration
         if script in ("bench/bench.py", "bench/randomization.py"):
             command += " repeats=1 seconds=0.05 env.num_envs=4"
         if script == "bench/disturbance.py":
@@ -161,7 +163,7 @@ def test_commands_of_documents_run_in_order(tmp_path):
 
 
 def test_configs_only_override_what_exists():
-    for name in ("hover",):
+    for name in (*ml.list_tasks(), "pose_easy"):
         values = yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text())
         assert values["task"] in ml.list_tasks()
         assert ml.load_config(name).task == values["task"]

@@ -206,7 +206,7 @@ class MultiliftVec:
         flown = through.applied if through.slow else self._action
         for shard in self.world.shards:
             span = (shard.lo, shard.hi)
-            act, follow = self.pilot.bind(*span, flown, self.task.goal, self.task.planner(*span))
+            act, follow = self.pilot.bind(*span, flown, self.task.way, self.task.planner(*span))
             after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
             before = (act,)
             if through.slow:

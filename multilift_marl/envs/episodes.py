@@ -85,7 +85,7 @@ class Episodes:
 
     def _place(self, e: int, rng: np.random.Generator) -> None:
         for _ in range(_MAX_REDRAWS):
-            if self._task.place(e, rng, self._draw.parameters):
+            if self._task.draw_start(e, rng, self._draw.parameters):
                 return
         raise ConfigError(
             f"no start of task {self._task.name} is free of failure ({CAUSES[self._task.cause[e]]}) in {_MAX_REDRAWS} "
