@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,17 @@ from multilift_marl.tasks.starts import make_hanging
 from multilift_marl.tasks.terms import Errors, measure
 
 INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
+
+
+class Box(NamedTuple):
+    """A box to look at."""
+
+    size: tuple[float, float, float]
+    """Half its edges [m]."""
+    position: tuple[float, float, float]
+    """Of its middle [m]."""
+    rgba: tuple[float, float, float, float]
+    """Colour and opacity, 0 to 1."""
 
 
 @kernel
@@ -105,6 +116,14 @@ class Task:
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None] | None:
         """Return what writes `EXTRA` and `EXTRA_STATE`, the last numbers of each row, of environments lo to hi."""
         return None
+
+    def route(self, env: int) -> np.ndarray:
+        """Return points (P, 3) of the way that the target takes in this episode, to draw it; none if it stays."""
+        return np.zeros((0, 3))
+
+    def scenery(self, env: int) -> list[Box]:
+        """Return what stands around in environment `env`, to draw it; what may be touched is `failures`' business."""
+        return []
 
     def begin(self, env: int) -> bool:
         """Reset the measurements of one environment to its drawn start; return whether that start is sound."""

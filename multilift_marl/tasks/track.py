@@ -34,6 +34,7 @@ from multilift_marl.tasks.starts import hang_team, in_ball
 from multilift_marl.tasks.terms import mean_change, tolerance
 
 AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
+_DRAWN = 400  # points of a path that is drawn
 
 
 class TrackOptions(Section):
@@ -79,6 +80,7 @@ class Track(Task):
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
+        self.seconds = config.env.episode_seconds
         self.path, self.worst = Path.zeros(world.num_envs), np.zeros(world.num_envs)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
@@ -108,6 +110,12 @@ class Track(Task):
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell how the target will move; see `Task.observer`."""
         return bind(_look_ahead, lo, hi, self.time, self.path, self.goal, observation, critic)
+
+    def route(self, env: int) -> np.ndarray:
+        """See `Task.route`."""
+        points = np.zeros((_DRAWN, 3))
+        _trace(env, self.seconds, self.path, points)
+        return points
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness to the moving target; see `Task.scorer`."""
@@ -148,6 +156,12 @@ def _plan(lo, hi, time, dt, path, goal, rig):
     for e in range(lo, hi):
         time[e] += dt
         _aim(e, time[e], path, goal, rig)
+
+
+@kernel
+def _trace(e, seconds, path, points):
+    for i in range(points.shape[0]):
+        put(points[i], place(e, seconds * i / (points.shape[0] - 1), path))
 
 
 @kernel
