@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from multilift_marl import sim
 from multilift_marl.config import load_config
 from multilift_marl.envs.core import make_vec
+from multilift_marl.envs.gymnasium_env import register as _register_with_gymnasium
 from multilift_marl.envs.multilift_v0 import parallel_env
 from multilift_marl.envs.multilift_v0 import register as _register_with_pettingzoo
 from multilift_marl.tasks import list_tasks
@@ -33,4 +34,5 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'multilift_marl' has no attribute '{name}'")
 
 
+_register_with_gymnasium()
 _register_with_pettingzoo()

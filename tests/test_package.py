@@ -16,7 +16,7 @@ from multilift_marl.tasks.failures import CAUSES
 from multilift_marl.tasks.observations import OBSERVATION
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def python(code, cwd, **environment):
@@ -105,7 +105,7 @@ def test_documents_name_everything_about_a_task(task):
         assert f"`{cause}`" in common, cause
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_and_files_of_documents_exist(document):
     for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
         if not target.startswith("http"):
@@ -146,6 +146,8 @@ def test_commands_of_documents_run_in_order(tmp_path):
             command += f" {short}"
         if script == "evaluate.py":
             command = re.sub(r"episodes=\d+", "episodes=2", command) + " env.episode_seconds=0.4"
+        if script.startswith("examples/"):
+            command += " 1"  # iteration
         if script == "bench/bench.py":
             command += " repeats=1 seconds=0.05 env.num_envs=4"
         if script == "bench/disturbance.py":

@@ -1,1 +1,1 @@
-"""Doors to the environment: the batched core, PettingZoo, TorchRL."""
+"""Doors to the environment: the batched core, Gymnasium, PettingZoo, TorchRL."""

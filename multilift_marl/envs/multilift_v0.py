@@ -11,11 +11,9 @@ from pettingzoo import ParallelEnv
 
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec, resolve_config
+from multilift_marl.envs.faces import RENDER_MODES, Pictures, solo_info
 from multilift_marl.errors import nearest
-from multilift_marl.rendering import Renderer
 from multilift_marl.tasks import list_tasks
-
-RENDER_MODES = ("rgb_array",)
 
 
 class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
@@ -44,8 +42,6 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     }
 
     def __init__(self, config: Config, render_mode: str | None = None):
-        if render_mode not in (None, *RENDER_MODES):
-            raise ValueError(f"unknown render_mode '{render_mode}'{nearest(str(render_mode), RENDER_MODES)}")
         config = resolve_config(config, num_envs=1, num_threads=1)
         self.vec = vec = MultiliftVec(config)
         self.metadata = {**type(self).metadata, "render_fps": config.env.policy_hz}
@@ -58,8 +54,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         self.state_space = Box(*unbounded, (vec.state_size,), np.float32)
         self._joint = np.zeros((1, vec.num_drones, vec.action_size))
         self._rows = list(zip(names, self._joint[0], strict=True))
-        self._renderer: Renderer | None = None
-        self._started = False
+        self._pictures = Pictures(vec, render_mode)
 
     def reset(
         self, seed: int | None = None, options: dict | None = None
@@ -77,7 +72,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
             ValueError: a negative seed.
         """
         observation, info = self.vec.reset(seed)
-        self.agents, self._started = self.possible_agents.copy(), True
+        self.agents = self.possible_agents.copy()
         return dict(zip(self.agents, observation[0], strict=True)), self._infos(info)
 
     def step(
@@ -143,39 +138,19 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
             RuntimeError: there is no `render_mode`, or no episode was ever started.
             RenderingError: there is no OpenGL that draws off-screen.
         """
-        if self.render_mode is None:
-            raise RuntimeError('render() needs an environment made with render_mode="rgb_array"')
-        if not self._started:
-            raise RuntimeError("there is nothing to draw yet: call reset() before render()")
-        if self._renderer is None:
-            self._renderer = Renderer(self.vec)
-        return self._renderer.frame()
+        return self._pictures.frame()
 
     def close(self) -> None:
         """Free the renderer; the environment itself holds nothing that must be closed."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._pictures.close()
 
     def __reduce__(self) -> tuple[type[MultiliftParallelEnv], tuple[Config, str | None]]:
         return type(self), (self.vec.config, self.render_mode)
 
     def _infos(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
         """Return a dict for each agent; none is shared, so that wrappers may write into theirs."""
-        vec = self.vec
-        terms = dict(zip(vec.reward_terms, vec.task.terms[0].tolist(), strict=True))
-        success, failure, diverged = bool(info["success"][0]), bool(info["failure"][0]), bool(info["diverged"][0])
-        cause = vec.failure_causes[info["failure_cause"][0]]
-        return {
-            name: {
-                "success": success,
-                "failure": failure,
-                "diverged": diverged,
-                "failure_cause": cause,
-                "reward_terms": terms.copy(),
-            }
-            for name in self.possible_agents
-        }
+        told = solo_info(self.vec, info)
+        return {name: {**told, "reward_terms": told["reward_terms"].copy()} for name in self.possible_agents}
 
     def _mismatch(self, actions: dict[str, Any]) -> ValueError:
         for name in self.possible_agents:

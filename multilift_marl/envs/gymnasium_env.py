@@ -1,0 +1,272 @@
+"""The Gymnasium doors: a team flown as one agent, alone or E of them on the batched core."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from multilift_marl.config.schema import Config
+from multilift_marl.envs.core import MultiliftVec, make_vec
+from multilift_marl.envs.faces import RENDER_MODES, Pictures, solo_info
+from multilift_marl.tasks import list_tasks
+
+
+class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A team of N drones as one agent: observations (N·D,) float32, actions (N·A,) in [-1, 1], the drones' mean reward.
+
+    Drone n has the n-th D numbers of an observation and the n-th A numbers of an action. Info holds `success`,
+    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one) and `reward_terms` {name: float}. A
+    copy, also by pickle, is a new environment of the same configuration, not yet reset.
+
+    Without a seed an environment starts with the configured one, so environments that are to fly different episodes
+    need different seeds.
+
+    Args:
+        task: a configuration's name, the path of one, or a Config.
+        render_mode: None, or "rgb_array" for `render`.
+        num_drones: N; None for the configured value, likewise the next.
+        seed: of the first reset.
+        **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
+
+    Attributes:
+        vec: the batched core underneath, of one environment.
+
+    Raises:
+        ConfigError: an unknown key, a wrong value or an impossible system.
+        ValueError: an unknown render mode.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES)}
+
+    def __init__(
+        self, task: str | Config = "hover", render_mode: str | None = None, *,
+        num_drones: int | None = None, seed: int | None = None, **overrides: Any,
+    ):  # fmt: skip
+        single = {"env.num_envs": 1, "env.num_threads": 1}
+        self.vec = make_vec(task, num_drones=num_drones, seed=seed, **overrides | single)
+        self.metadata = _metadata(type(self), self.vec)
+        self.render_mode = render_mode
+        self.observation_space, self.action_space = _joint_spaces(self.vec)
+        self._pictures = Pictures(self.vec, render_mode)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start a new episode.
+
+        Args:
+            seed: start at episode 0 of this seed; None goes to the next episode.
+            options: see `MultiliftVec.reset`.
+
+        Returns:
+            Observation (N·D,) float32 and info.
+
+        Raises:
+            ValueError: a negative seed or an unknown option.
+        """
+        observation, info = self.vec.reset(seed, options=options)
+        super().reset(seed=seed)  # for wrappers that draw from np_random; nothing here does
+        return observation.reshape(-1), solo_info(self.vec, info)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advance the episode by one policy step.
+
+        Args:
+            action: (N·A,) floating point; values beyond [-1, 1] are clipped.
+
+        Returns:
+            observation (N·D,) float32, reward, terminated, truncated, info.
+
+        Raises:
+            ValueError: an action of wrong shape or type, or not finite.
+            RuntimeError: the episode has ended or none was started.
+        """
+        if self.vec.ended[0]:
+            raise RuntimeError("the episode has ended or none was started: call reset() before step()")
+        joint = _split(self.vec, action, self.action_space)
+        observation, reward, terminated, truncated, info = self.vec.step(joint)
+        mean = float(_mean(reward)[0])
+        return observation.reshape(-1), mean, bool(terminated[0]), bool(truncated[0]), solo_info(self.vec, info)
+
+    def render(self) -> np.ndarray:
+        """Return a picture (H, W, 3) uint8 of the team and its target.
+
+        Raises:
+            RuntimeError: there is no `render_mode`, or no episode was ever started.
+            RenderingError: there is no OpenGL that draws off-screen.
+        """
+        return self._pictures.frame()
+
+    def close(self) -> None:
+        """Free the renderer; the environment itself holds nothing that must be closed."""
+        self._pictures.close()
+
+    def __reduce__(self) -> tuple[type[MultiliftGymnasiumEnv], tuple[Config, str | None]]:
+        return type(self), (self.vec.config, self.render_mode)
+
+
+class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """E teams of N drones on the batched core, each as one agent: observations (E, N·D), actions (E, N·A).
+
+    An environment that ends is reset in the same step (`AutoresetMode.SAME_STEP`): the observation and info returned
+    are the new episode's, the last ones of the old stand in `info["final_obs"]` and `info["final_info"]`, as in
+    Gymnasium's own vector environments. Each entry `key` of an info has its mask `_key` (E,).
+
+    Args:
+        task: a configuration's name, the path of one, or a Config.
+        num_envs: E; None for the configured value, likewise the next three.
+        num_threads: threads that step them; 0 for one on each CPU. Results do not depend on it.
+        num_drones: N.
+        seed: of the first reset.
+        first_env: number of the first environment, for replaying one of a larger batch.
+        render_mode: None, or "rgb_array" for `render`.
+        **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
+
+    Attributes:
+        vec: the batched core underneath.
+
+    Raises:
+        ConfigError: an unknown key, a wrong value or an impossible system.
+        ValueError: an unknown render mode.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": list(RENDER_MODES),
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+    closed = True  # until there is something to close: Gymnasium 1.1 closes what was refused, too
+
+    def __init__(
+        self, task: str | Config = "hover", *, num_envs: int | None = None, num_threads: int | None = None,
+        num_drones: int | None = None, seed: int | None = None, first_env: int = 0, render_mode: str | None = None,
+        **overrides: Any,
+    ):  # fmt: skip
+        self.vec = make_vec(
+            task, num_envs=num_envs, num_threads=num_threads, num_drones=num_drones, seed=seed, first_env=first_env,
+            **overrides,
+        )  # fmt: skip
+        self.num_envs = self.vec.num_envs
+        self.metadata = _metadata(type(self), self.vec)
+        self.render_mode = render_mode
+        self.single_observation_space, self.single_action_space = _joint_spaces(self.vec)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._pictures = Pictures(self.vec, render_mode)
+        self._causes = np.array(self.vec.failure_causes, dtype=object)
+        self.closed = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+            seed: start at episode 0 of this seed, environment e of it differing from all others; None goes to each
+                environment's next episode.
+            options: `reset_mask` (E,) bool chooses the environments; others see `MultiliftVec.reset`.
+
+        Returns:
+            Observations (E, N·D) float32 of all environments, and info of those that were reset.
+
+        Raises:
+            ValueError: a negative seed, a mask of wrong shape or type, or an unknown option.
+        """
+        options = dict(options or {})
+        mask = options.pop("reset_mask", None)
+        observation, info = self.vec.reset(seed, mask, options)
+        return self._joint(observation), self._told(info, np.ones(self.num_envs, bool) if mask is None else mask)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance all environments by one policy step and reset those that have ended.
+
+        Args:
+            actions: (E, N·A) floating point; values beyond [-1, 1] are clipped.
+
+        Returns:
+            observations (E, N·D) float32, rewards (E,) float64, terminated (E,), truncated (E,), info.
+
+        Raises:
+            ValueError: actions of wrong shape or type, or not finite.
+            RuntimeError: the environments were never reset.
+        """
+        joint = _split(self.vec, actions, self.action_space)
+        observation, reward, terminated, truncated, info = self.vec.step(joint)
+        over, infos = terminated | truncated, {}
+        if over.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            for e in np.flatnonzero(over):
+                final[e] = observation[e].reshape(-1)
+            infos = {"final_obs": final, "final_info": self._told(info, over)}
+            infos |= {f"_{key}": over.copy() for key in infos}
+            observation, info = self.vec.reset(mask=over)
+        infos |= self._told(info, np.ones(self.num_envs, bool))
+        return self._joint(observation), _mean(reward), terminated, truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...]:
+        """Return a picture (H, W, 3) uint8 of each environment.
+
+        Raises:
+            RuntimeError: there is no `render_mode`, or no episode was ever started.
+            RenderingError: there is no OpenGL that draws off-screen.
+        """
+        return tuple(self._pictures.frame(e) for e in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the renderer."""
+        self._pictures.close()
+
+    def _joint(self, observation: np.ndarray) -> np.ndarray:
+        return observation.reshape(self.num_envs, -1)
+
+    def _told(self, info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+        """Return the core's info in Gymnasium's form: a mask beside every entry, and nothing outside the mask."""
+        told: dict[str, Any] = {key: info[key] & mask for key in ("success", "failure", "diverged")}
+        told["failure_cause"] = np.where(mask, self._causes[info["failure_cause"]], None)
+        terms = {name: np.where(mask, value, 0.0) for name, value in info["reward_terms"].items()}
+        told["reward_terms"] = terms | {f"_{name}": mask.copy() for name in terms}
+        return told | {f"_{key}": mask.copy() for key in told}
+
+
+def _metadata(face: type, vec: MultiliftVec) -> dict[str, Any]:
+    return {**face.metadata, "render_fps": vec.config.env.policy_hz}
+
+
+def _joint_spaces(vec: MultiliftVec) -> tuple[Box, Box]:
+    """Return the spaces of the team's observations (N·D,) and actions (N·A,)."""
+    observed, acted = vec.num_drones * vec.observation_size, vec.num_drones * vec.action_size
+    return Box(-np.inf, np.inf, (observed,), np.float32), Box(-1.0, 1.0, (acted,), np.float32)
+
+
+def _split(vec: MultiliftVec, action: np.ndarray, space: Box) -> np.ndarray:
+    """Return a joint action as the core takes it (E, N, A)."""
+    action = np.asarray(action)
+    if action.shape != space.shape:
+        raise ValueError(
+            f"action has shape {action.shape}, expected {space.shape}: {vec.action_size} numbers for each of "
+            f"{vec.num_drones} drones in a row"
+        )
+    return action.reshape(vec.num_envs, vec.num_drones, vec.action_size)
+
+
+def _mean(reward: np.ndarray) -> np.ndarray:
+    """Return the mean (E,) over the drones, in float64: that of equal float32 numbers is then exactly each of them."""
+    return reward.mean(axis=1, dtype=np.float64)
+
+
+def register() -> None:
+    """Enter every task in Gymnasium's registry, `gymnasium.make("multilift_marl/Hover-v0")`; twice does nothing more.
+
+    A task `two_words` is entered as `multilift_marl/TwoWords-v0`.
+    """
+    for task in list_tasks():
+        name = f"multilift_marl/{''.join(word.capitalize() for word in task.split('_'))}-v0"
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point=f"{__name__}:{MultiliftGymnasiumEnv.__name__}",
+                vector_entry_point=f"{__name__}:{MultiliftVectorEnv.__name__}",
+                kwargs={"task": task},
+            )
