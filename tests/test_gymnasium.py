@@ -272,8 +272,8 @@ def test_a_wrong_action_is_refused(action, message):
 def test_wrong_settings_are_refused():
     assert "did you mean 'mass'" in refusal(gymnasium.make, "multilift_marl/Hover-v0", **{"payload.mas": 1.0})
     assert "no configuration named 'hove'" in refusal(MultiliftVectorEnv, "hove")
-    for face in (MultiliftGymnasiumEnv, MultiliftVectorEnv):
-        with pytest.raises(ValueError, match="unknown render_mode 'ascii'; known: rgb_array"):
+    for face, known in ((MultiliftGymnasiumEnv, "human, rgb_array"), (MultiliftVectorEnv, "rgb_array")):
+        with pytest.raises(ValueError, match=f"unknown render_mode 'ascii'; known: {known}"):
             face(render_mode="ascii")
 
 

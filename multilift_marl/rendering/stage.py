@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -58,8 +60,13 @@ class Stage:
         far = max(1.0, self.camera.view.distance / 6.0)
         fog.fogstart, fog.fogend = far * fog.fogstart, far * fog.fogend
 
-    def update(self, env: int) -> None:
-        """Show environment `env` as it is now; one that has diverged stays as last shown."""
+    def update(self, env: int, look: Callable[[mujoco.MjvCamera], None] | None = None) -> None:
+        """Show environment `env` as it is now; one that has diverged stays as last shown.
+
+        Args:
+            env: which.
+            look: called with a copy of the camera, to take the picture from elsewhere.
+        """
         vec = self._vec
         time = float(vec.steps[env]) * vec.task.dt
         episode = (env, int(vec.seeds[env]), int(vec.episodes[env]))
@@ -70,8 +77,12 @@ class Stage:
         path = vec.task.route(env)
         self._pose(env)
         self.camera.aim(env, path)
+        view = self.camera.view
+        if look is not None:
+            view = copy.copy(view)
+            look(view)
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self.model, self.data, self._option, None, self.camera.view, everything, self.scene)
+        mujoco.mjv_updateScene(self.model, self.data, self._option, None, view, everything, self.scene)
         for geom in self.scene.geoms[: self.scene.ngeom]:
             if geom.objtype == mujoco.mjtObj.mjOBJ_TENDON:
                 geom.emission = _GLOW

@@ -19,7 +19,8 @@ HOST = "127.0.0.1"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _FRAME = 1 / 25  # [s]
 _TRAIL = 2.0  # [s]
-_AMBIENT = 0.15  # of the light from all around; viser's own washes the colours out
+_GAMMA = 2.2  # browsers take the colours of many meshes at once for light, not for sRGB
+_AMBIENT = 1.5  # light from all around
 _GEOM = mujoco.mjtGeom
 _SLOTS = 64  # geoms of one shape that are sent at first; doubled as needed
 
@@ -100,7 +101,8 @@ class Page:
     def _build(self) -> None:
         server, camera = self._server, self._stage.camera.view
         server.gui.configure_theme(show_share_button=False, show_logo=False)
-        server.scene.configure_environment_map("studio", environment_intensity=_AMBIENT)
+        server.scene.configure_environment_map(None)  # its reflections wash the colours out
+        server.scene.add_light_ambient("/light", intensity=_AMBIENT)
         self._world = server.scene.add_frame("/world", show_axes=False)  # moves against the payload that is followed
         server.scene.add_grid(
             "/world/floor", 60.0, 60.0, cell_size=1.0, cell_color=(205, 210, 216), section_size=5.0,
@@ -190,17 +192,19 @@ class _Batch:
             while self._slots < count:
                 self._slots *= 2
             self._shown = None
+            if self._handle is not None:
+                self._handle.remove()
         spare = self._slots - count  # of no size
         place, turn, size, colour = (np.pad(array, ((0, spare), (0, 0))) for array in geoms)
         turn[count:, 0] = 1.0
-        colours, opacity = np.rint(255 * np.clip(colour[:, :3], 0, 1)).astype(np.uint8), colour[:, 3]
+        colours, opacity = np.rint(255 * np.clip(colour[:, :3], 0, 1) ** _GAMMA).astype(np.uint8), colour[:, 3]
         values = {"positions": place, "wxyzs": turn, "scales": size, "colors": colours}
         if self._clear:
             values["opacities"] = opacity
         if self._shown is None:
             self._handle = self._server.scene.add_batched_meshes_simple(
-                self._name, *self._mesh, turn, place, batched_scales=size, batched_colors=colours,
-                batched_opacities=values.get("opacities"), lod="off", cast_shadow=not self._clear,
+                f"{self._name}_{self._slots}", *self._mesh, turn, place, batched_scales=size, batched_colors=colours,
+                batched_opacities=values.get("opacities"), lod="off", flat_shading=True, cast_shadow=not self._clear,
             )  # fmt: skip
         else:
             for key, value in values.items():
