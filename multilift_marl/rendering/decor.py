@@ -12,30 +12,31 @@ _TRAIL_POINTS = 40  # of one trail
 _MAX_DASHES = 300
 
 
-def add_geom(scene: mujoco.MjvScene, kind: int, size: np.ndarray, position: np.ndarray, rgba: np.ndarray) -> None:
-    """Add an upright geom, which casts no shadow, to `scene`; where that is full, nothing."""
-    geom = _next_geom(scene)
-    if geom is not None:
-        mujoco.mjv_initGeom(geom, kind, np.asarray(size, float), np.asarray(position, float), np.eye(3).ravel(), rgba)
-        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-        scene.ngeom += 1
+def add_box(scene: mujoco.MjvScene, size: np.ndarray, position: np.ndarray, rgba: np.ndarray) -> None:
+    """Add an upright box of half edges `size` (3,) at `position` (3,) [m]; where the scene is full, nothing."""
+    _add(scene, _GEOM.mjGEOM_BOX, np.asarray(size, float), np.asarray(position, float), np.float32(rgba))
 
 
 def add_lines(scene: mujoco.MjvScene, starts: np.ndarray, ends: np.ndarray, radius: float, rgba: np.ndarray) -> None:
-    """Add straight lines from `starts` (K, 3) to `ends` (K, 3) [m] with colours `rgba` (K, 4), which cast no shadow."""
-    zero, upright = np.zeros(3), np.eye(3).ravel()
+    """Add straight lines from `starts` (K, 3) to `ends` (K, 3) [m] with colours `rgba` (K, 4)."""
     for start, end, colour in zip(starts, ends, rgba, strict=True):
-        geom = _next_geom(scene)
-        if geom is None:
-            return
-        mujoco.mjv_initGeom(geom, _GEOM.mjGEOM_CAPSULE, zero, zero, upright, colour)
-        mujoco.mjv_connector(geom, _GEOM.mjGEOM_CAPSULE, radius, start, end)
-        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-        scene.ngeom += 1
+        geom = _add(scene, _GEOM.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), colour)
+        if geom is not None:
+            mujoco.mjv_connector(geom, _GEOM.mjGEOM_CAPSULE, radius, start, end)
 
 
-def _next_geom(scene: mujoco.MjvScene) -> mujoco.MjvGeom | None:
-    return scene.geoms[scene.ngeom] if scene.ngeom < scene.maxgeom else None
+def _add(
+    scene: mujoco.MjvScene, kind: int, size: np.ndarray, position: np.ndarray, rgba: np.ndarray
+) -> mujoco.MjvGeom | None:
+    """Add a geom that casts no shadow, and return it; None where the scene is full."""
+    if scene.ngeom == scene.maxgeom:
+        return None
+    geom = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), rgba)
+    geom.objtype, geom.objid, geom.segid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1, -1  # left as they were by mjv_initGeom
+    geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, False
+    scene.ngeom += 1
+    return geom
 
 
 def dashes(points: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:

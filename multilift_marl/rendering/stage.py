@@ -12,7 +12,7 @@ import numpy as np
 from multilift_marl.math3d import mat_to_quat
 from multilift_marl.rendering.cameras import Camera
 from multilift_marl.rendering.colours import tension_colours
-from multilift_marl.rendering.decor import Trail, add_geom, add_lines, dashes
+from multilift_marl.rendering.decor import Trail, add_box, add_lines, dashes
 from multilift_marl.sim.scene import DRONE_COLOURS, PAYLOAD_COLOUR, build_model
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class Stage:
         task, state, scene = self._vec.task, self._vec.world.state, self.scene
         line, dash = _LINE * self.camera.view.distance, _DASH * self.camera.view.distance
         for box in task.scenery(env):
-            add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, box.size, box.position, np.array(box.rgba, np.float32))
+            add_box(scene, *box)
         if len(path):
             starts, ends = dashes(path, dash)
             add_lines(scene, starts, ends, line, np.tile(np.float32(_PATH_COLOUR), (len(starts), 1)))
