@@ -12,6 +12,7 @@ from multilift_marl.rendering.colours import DOUBLE, RESTING, SLACK, from_oklab,
 from multilift_marl.rendering.decor import dashes
 from multilift_marl.sim.scene import DRONE_COLOURS
 from multilift_marl.tasks.base import Box
+from multilift_marl.tasks.paths import own_time
 
 TENDON, GEOM = int(mujoco.mjtObj.mjOBJ_TENDON), int(mujoco.mjtObj.mjOBJ_GEOM)
 # Dichromats' view of linear sRGB: Viénot, Brettel and Mollon 1999 (protan, deutan); Brettel's tritan, one half-plane
@@ -143,10 +144,20 @@ def test_the_path_of_a_track_is_dashed_through_its_targets():
             assert np.linalg.norm(lines - vec.task.goal.position[0], axis=1).min() < 0.25
         vec.step(zeros(vec))
     route = vec.task.route(0)
-    assert np.allclose(
-        np.linalg.norm(route - route.mean(axis=0), axis=1).max(), np.ptp(route, axis=0).max() / 2, rtol=1
-    )
     assert np.linalg.norm(lines[:, None] - route[None], axis=2).min(axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("path, closes", [("circle", True), ("figure8", True), ("lemniscate", True), ("random", False)])
+def test_a_path_that_repeats_is_drawn_once(path, closes):
+    options = {"task_options.path": path, "task_options.acceleration": 2.0, "task_options.rate": 0.8}
+    vec = make("track", num_envs=1, **options)
+    vec.reset(seed=0)
+    route = vec.task.route(0)
+    if closes:  # more than a round is flown
+        assert vec.task.path.rate[0] * own_time(vec.config.env.episode_seconds) > 2.2 * np.pi
+    assert (np.linalg.norm(route[-1] - route[0]) < 1e-6 * np.ptp(route, axis=0).max()) == closes
+    if path == "circle":
+        assert np.linalg.norm(np.diff(route, axis=0), axis=1).sum() == pytest.approx(10 * np.pi, rel=1e-3)
 
 
 def test_dashes_are_as_long_as_their_gaps():

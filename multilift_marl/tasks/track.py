@@ -22,6 +22,8 @@ from multilift_marl.tasks.paths import (
     HELIX,
     LEMNISCATE,
     PATHS,
+    RAMP,
+    RANDOM,
     Path,
     draw_curve,
     largest_rates,
@@ -112,9 +114,11 @@ class Track(Task):
         return bind(_look_ahead, lo, hi, self.time, self.path, self.goal, observation, critic)
 
     def route(self, env: int) -> np.ndarray:
-        """See `Task.route`."""
-        points = np.zeros((_DRAWN, 3))
-        _trace(env, self.seconds, self.path, points)
+        """Return the path, one round of it if it repeats; see `Task.route`."""
+        points, kind = np.zeros((_DRAWN, 3)), self.path.kind[env]
+        turns = 4 if kind == HELIX else 1
+        lap = np.inf if kind == RANDOM else turns * 2 * pi / self.path.rate[env] + RAMP / 2  # half the ramp is lost
+        _trace(env, min(self.seconds, lap), self.path, points)
         return points
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
