@@ -14,6 +14,7 @@ from multilift_marl.control.formation import place_formation
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
 from multilift_marl.sim import World
+from multilift_marl.tasks import find_task
 
 TASKS = ml.list_tasks()
 NUM_DRONES = (1, 2, 3, 6)
@@ -33,6 +34,16 @@ def pytest_generate_tests(metafunc):
     for name, values in (("task", TASKS), ("num_drones", NUM_DRONES)):
         if name in metafunc.fixturenames and name not in own:
             metafunc.parametrize(name, values)
+
+
+@pytest.fixture(autouse=True)
+def _enough_drones(request):
+    """Skip a task's tests with fewer drones than it makes sense with."""
+    asked = getattr(request.node, "callspec", None)
+    if asked is not None and {"task", "num_drones"} <= asked.params.keys():
+        least = find_task(asked.params["task"]).LEAST_DRONES
+        if asked.params["num_drones"] < least:
+            pytest.skip(f"{asked.params['task']} needs {least} drones")
 
 
 def _names(argument: str | tuple[str, ...]) -> list[str]:
@@ -67,6 +78,11 @@ def bold_actions(vec: MultiliftVec, step: int, first_env: int = 0, hold: int = 2
     return np.stack(
         [np.random.default_rng((first_env + e, step // hold)).choice([-1.0, 1.0], shape) for e in range(vec.num_envs)]
     )
+
+
+def mixed_actions(vec: MultiliftVec, step: int, hold: int = 25) -> np.ndarray:
+    """Return bold actions (E, N, A), timid ones in every other environment, so that some episodes reach their end."""
+    return bold_actions(vec, step, hold=hold) * np.where(np.arange(vec.num_envs) % 2, 0.1, 1.0)[:, None, None]
 
 
 def same(first, second) -> bool:

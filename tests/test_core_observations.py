@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import bold_actions, make
+from conftest import bold_actions, make, mixed_actions
 
 import multilift_marl as ml
 
@@ -12,11 +12,12 @@ import multilift_marl as ml
 @pytest.fixture(scope="module", params=ml.list_tasks())
 def ensemble(request):
     """Return observations (K, D) and states (K, S) of many moments of many episodes of four drones, and the names."""
-    vec = make(request.param, num_envs=64, num_drones=4)
+    varied = {"task_options.path": "random"} if request.param == "track" else {}  # others stay at one height
+    vec = make(request.param, num_envs=64, num_drones=4, **varied)
     observation, _ = vec.reset(seed=0)
     seen, states = [observation], [vec.state()]
-    for step in range(150):
-        observation, _, terminated, truncated, _ = vec.step(0.6 * bold_actions(vec, step, hold=10))
+    for step in range(max(150, vec.max_steps)):  # all phases of an episode
+        observation, _, terminated, truncated, _ = vec.step(0.6 * mixed_actions(vec, step, hold=10))
         if step % 5 == 4:
             seen.append(observation)
             states.append(vec.state())
@@ -39,7 +40,7 @@ def test_no_number_of_an_observation_repeats_another(ensemble):
 
 
 def test_the_state_tells_what_is_hidden_from_the_drones(task):
-    vec = make(task, num_envs=64)
+    vec = make(task, num_envs=64, **{"randomization.payload_mass": 0.2, "randomization.payload_force": 1.5})
     observation, _ = vec.reset(seed=0)
     state, plant = vec.state(), vec.world.plant
     excess = (plant.payload_mass / vec.world.system.payload_mass - 1)[:, None]
@@ -52,11 +53,15 @@ def test_the_state_tells_what_is_hidden_from_the_drones(task):
 def test_reward_is_the_sum_of_its_named_terms_for_every_drone(task, num_drones):
     vec, paid = make(task, num_drones=num_drones), set()
     vec.reset(seed=0)
-    for step in range(20):
-        _, reward, *_, info = vec.step(0.5 * bold_actions(vec, step, hold=3))
+    for step in range(vec.max_steps):
+        _, reward, terminated, truncated, info = vec.step(0.2 * bold_actions(vec, step, hold=3))
         total = sum(info["reward_terms"].values())
         np.testing.assert_allclose(reward, np.broadcast_to(total[:, None], reward.shape), rtol=1e-6)
         paid |= {name for name, values in info["reward_terms"].items() if values.any()}
+        if step >= 20 and paid == set(vec.reward_terms):
+            break
+        if (terminated | truncated).any():
+            vec.reset(mask=terminated | truncated)
     assert paid == set(vec.reward_terms)
 
 

@@ -9,7 +9,7 @@ import multilift_marl as ml
 from multilift_marl.agents.trainer import Trainer, new_run
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.config import load_config
-from multilift_marl.control.scripted import make_scripted
+from multilift_marl.control.scripted import SCRIPTED, make_scripted
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.evaluation import rollout
 from multilift_marl.evaluation.metrics import bootstrap, compare, summarize, wilson
@@ -146,12 +146,39 @@ def test_command_writes_metrics_plots_and_table(run, tmp_path, capsys):
     report = json.loads((tmp_path / "metrics.json").read_text())
     assert report["episodes"] == 4 and report["seed"] == 1000
     assert report["config"]["env"]["num_drones"] == 3 and report["config"]["payload"]["mass"] == 1.2
-    assert set(report["baselines"]) == {"formation", "formation_integral"} == set(report["paired"])
+    assert set(report["baselines"]) == set(SCRIPTED) == set(report["paired"])
     for summary in (report["policy"], *report["baselines"].values()):
         assert set(summary) >= CONTRACT
         for value in summary.values():
             assert value["ci95"][0] <= value["mean"] <= value["ci95"][1]
     assert {"errors.png", "tensions.png", "paths.png", "training.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_command_flies_a_script_in_place_of_a_policy(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    short = ["episodes=2", "env.episode_seconds=0.4"]
+    assert evaluate(["policy=formation", "baseline=payload_geometric", "config=pose_easy", *short]) == 0
+    assert "formation on pose_easy: 2 episodes" in capsys.readouterr().out
+    (folder,) = (tmp_path / "runs" / "formation-pose_easy" / "eval").iterdir()
+    report = json.loads((folder / "metrics.json").read_text())
+    assert report["config"]["task"] == "pose" and set(report["baselines"]) == set(SCRIPTED) - {"formation"}
+    assert {"errors.png", "tensions.png", "paths.png"} <= {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["policy=formatoin"], "unknown policy 'formatoin'; did you mean 'formation'?"),
+        (["policy=formation", "run=latest"], "policy=formation is a script and has no run"),
+        (["policy=formation", "checkpoint=last"], "policy=formation is a script and has no checkpoint"),
+        (["run=hover", "config=hover"], "a run brings its own configuration"),
+        (["policy=formation", "config=pose_eas"], "no configuration named 'pose_eas'; did you mean 'pose_easy'?"),
+        (["policy=formation", "control.action=ctbr", "baseline=none"], "cannot fly control.action=ctbr"),
+    ],
+)
+def test_command_line_errors_of_scripts(capsys, arguments, message):
+    assert evaluate(arguments) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_command_films_the_first_episode(run, tmp_path):

@@ -102,6 +102,6 @@ def test_drones_are_told_the_gap_and_their_room():
         for n in range(4):
             c, s = task.goal.slot_frame[e, n]
             away = state.drone_position[e, n] - [0.0, task.gap_y[e, 0], 1.3]
-            expected = [c * away[0] + s * away[1], c * away[1] - s * away[0], away[2]]
-            np.testing.assert_allclose(observation[e, n, at : at + 3], expected, atol=1e-5)
+            expected = [c * away[0] + s * away[1], c * away[1] - s * away[0]]
+            np.testing.assert_allclose(observation[e, n, at : at + 2], expected, atol=1e-5)
     assert (observation[..., names.index("clearance_0")] < -0.1).all()

@@ -157,7 +157,7 @@ def test_commands_of_documents_run_in_order(tmp_path):
 
 
 def test_configs_only_override_what_exists():
-    for name in ("hover",):
+    for name in (*ml.list_tasks(), "pose_easy"):
         values = yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text())
         assert values["task"] in ml.list_tasks()
         assert ml.load_config(name).task == values["task"]

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from multilift_marl.cli.common import run_command
-from multilift_marl.config.load import build_config
+from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.control.scripted import SCRIPTED, check_interface, make_scripted
+from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError, nearest
 from multilift_marl.evaluation.report import format_table, make_report, write_report
 from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
 from multilift_marl.rendering import CAMERAS
 
-_USAGE = """Judge a trained team on fixed seeds, beside the scripted ones on the same episodes.
+_USAGE = """Judge a team on fixed seeds, beside the scripted ones on the same episodes.
 
   python evaluate.py run=latest episodes=200 seed=1000 baseline=formation_integral video=true [key=value ...]
+  python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
   run         a run folder, its name, "latest", or the name of a shipped policy ("hover")     (latest)
+  policy      script in place of a run: formation, formation_integral or payload_geometric    (none)
+  config      environment of that script, a configuration's name or path                      (hover)
   checkpoint  best, last, or a file                                                           (best)
   episodes    how many                                                                        (200)
   seed        evaluation seed: episode i is the same for every policy                         (1000)
@@ -30,13 +34,13 @@ _USAGE = """Judge a trained team on fixed seeds, beside the scripted ones on the
   video       true: also an mp4 of the first episode                                          (false)
   camera      of the video: side, top or chase                                                (side)
   trail       seconds of flight that drones and payload draw behind them in the video         (2)
-  out         folder for metrics.json, plots and video                                        (<run>/eval/<time>)
+  out         folder for metrics.json, plots and video      (<run>/eval/<time>, of a script runs/<policy>-<config>/…)
 
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
 
 _DEFAULTS = {
-    "run": "latest", "checkpoint": "best", "episodes": 200, "seed": 1000, "baseline": "formation_integral",
-    "video": False, "camera": "side", "trail": 2.0, "out": None,
+    "run": "latest", "policy": None, "config": None, "checkpoint": "best", "episodes": 200, "seed": 1000,
+    "baseline": "formation_integral", "video": False, "camera": "side", "trail": 2.0, "out": None,
 }  # fmt: skip
 
 
@@ -46,27 +50,64 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(values: dict[str, Any]) -> int:
+    _check_source(values)
     own = {key: values.pop(key, default) for key, default in _DEFAULTS.items()}
     _check(own)
-    policy, folder = _find_policy(str(own["run"]), str(own["checkpoint"]))
-    config = build_config(policy.config.model_dump(), {"env.num_threads": 0} | values)
+    flown = _find_script(own) if own["policy"] is not None else _find_policy(str(own["run"]), str(own["checkpoint"]))
+    config = build_config(flown.config.model_dump(), {"env.num_threads": 0} | values)
     _ = config.system
-    _check_interfaces(policy, config, own["baseline"])
-    makers = {"policy": lambda vec: policy}
+    _check_interfaces(flown, config, own["baseline"])
+    makers = {flown.name: flown.make}
     if own["baseline"] != "none":
-        makers |= {name: lambda vec, name=name: make_scripted(name, vec) for name in SCRIPTED}
-    out = Path(own["out"]) if own["out"] else folder / "eval" / time.strftime("%Y%m%d-%H%M%S")
+        makers |= {name: _script(name) for name in SCRIPTED if name != flown.name}
+    out = Path(own["out"]) if own["out"] else flown.folder / "eval" / time.strftime("%Y%m%d-%H%M%S")
     out.mkdir(parents=True, exist_ok=True)
 
-    flown = {name: _fly(config, maker, name, own) for name, maker in makers.items()}
-    learned = flown.pop("policy")
-    report = make_report(config, own["seed"], learned, flown)
+    episodes = {name: _fly(config, maker, name, own) for name, maker in makers.items()}
+    judged = episodes.pop(flown.name)
+    report = make_report(config, own["seed"], judged, episodes)
     write_report(out / "metrics.json", report)
-    print(f"\n{policy.source}: {own['episodes']} episodes, seed {own['seed']}; mean (95 % interval)\n")
-    print(format_table(report))
+    print(f"\n{flown.source}: {own['episodes']} episodes, seed {own['seed']}; mean (95 % interval)\n")
+    print(format_table(report, flown.name))
     print(f"\nwrote {out / 'metrics.json'}")
-    _draw(config, makers, own, out, folder)
+    _draw(config, makers, flown, own, out)
     return 0
+
+
+class _Flown(NamedTuple):
+    """What is judged."""
+
+    name: str
+    """Of its column: "policy" for a learned one, else the script's."""
+    source: str
+    config: Config
+    make: Callable[[MultiliftVec], Any]
+    folder: Path
+    """That its evaluations belong to."""
+
+
+def _script(name: str) -> Callable[[MultiliftVec], Any]:
+    return lambda vec: make_scripted(name, vec)
+
+
+def _check_source(values: dict[str, Any]) -> None:
+    """Refuse keys of a run beside a script, and the other way round."""
+    script = values.get("policy") is not None
+    wrong = [key for key in (("run", "checkpoint") if script else ("config",)) if key in values]
+    if wrong and script:
+        raise ConfigError(f"policy={values['policy']} is a script and has no {wrong[0]}; leave out one of the two")
+    if wrong:
+        raise ConfigError("a run brings its own configuration: leave out config, or fly a script by policy=formation")
+
+
+def _find_script(own: dict[str, Any]) -> _Flown:
+    name, config = str(own["policy"]), str(own["config"] or "hover")
+    if name not in SCRIPTED:
+        raise ConfigError(
+            f"unknown policy '{name}'{nearest(name, SCRIPTED)}: give a script, or a learned team by run=<run>"
+        )
+    folder = Path("runs") / f"{name}-{Path(config).stem}"
+    return _Flown(name, f"{name} on {config}", load_config(config), _script(name), folder)
 
 
 def _check(own: dict[str, Any]) -> None:
@@ -92,27 +133,30 @@ def _check(own: dict[str, Any]) -> None:
         raise ConfigError(f"trail must be a number of seconds from 0 to 1000, but is {own['trail']!r}")
 
 
-def _check_interfaces(policy: Any, config: Config, baseline: str) -> None:
-    trained, asked = policy.config.control.action, config.control.action
-    if trained != asked:
+def _check_interfaces(flown: _Flown, config: Config, baseline: str) -> None:
+    trained, asked = flown.config.control.action, config.control.action
+    if flown.name in SCRIPTED:
+        check_interface(flown.name, asked)
+    elif trained != asked:
         raise ConfigError(
-            f"{policy.source} was trained with control.action={trained} and cannot fly control.action={asked}; "
+            f"{flown.source} was trained with control.action={trained} and cannot fly control.action={asked}; "
             "leave control.action as it was"
         )
     if baseline != "none":
         check_interface(baseline, asked)
 
 
-def _find_policy(run: str, checkpoint: str) -> tuple[Any, Path]:
-    """Return the policy and the folder that its evaluations belong to."""
+def _find_policy(run: str, checkpoint: str) -> _Flown:
     from multilift_marl.agents.checkpoint import find_run
     from multilift_marl.agents.policy import load_policy, shipped_policies
 
     if run in shipped_policies() and not Path(run).exists():
-        return load_policy(run), Path("runs") / f"shipped-{run}"
-    folder = find_run(run)
-    file = folder / "checkpoints" / f"{checkpoint}.pt" if checkpoint in ("best", "last") else Path(checkpoint)
-    return load_policy(folder if checkpoint == "best" else file), folder
+        policy, folder = load_policy(run), Path("runs") / f"shipped-{run}"
+    else:
+        folder = find_run(run)
+        file = folder / "checkpoints" / f"{checkpoint}.pt" if checkpoint in ("best", "last") else Path(checkpoint)
+        policy = load_policy(folder if checkpoint == "best" else file)
+    return _Flown("policy", policy.source, policy.config, lambda vec: policy, folder)
 
 
 def _fly(config: Config, maker: Any, name: str, own: dict[str, Any]) -> dict:
@@ -122,23 +166,24 @@ def _fly(config: Config, maker: Any, name: str, own: dict[str, Any]) -> dict:
         return fly_episodes(config, maker, own["episodes"], own["seed"], progress=lambda n: bar.update(n - bar.n))
 
 
-def _draw(config: Config, makers: dict[str, Any], own: dict[str, Any], out: Path, folder: Path) -> None:
+def _draw(config: Config, makers: dict[str, Any], flown: _Flown, own: dict[str, Any], out: Path) -> None:
     """Plot the first episode of policy and baseline, and the training; film the policy if asked."""
-    from multilift_marl.agents.logging import read_metrics
     from multilift_marl.evaluation import plots
 
-    traces = {"policy": trace_episode(config, makers["policy"], 0, own["seed"])}
-    if own["baseline"] != "none":
-        traces[own["baseline"]] = trace_episode(config, makers[own["baseline"]], 0, own["seed"])
+    names = dict.fromkeys([flown.name] + ([] if own["baseline"] == "none" else [own["baseline"]]))
+    traces = {name: trace_episode(config, makers[name], 0, own["seed"]) for name in names}
     plots.plot_errors(out / "errors.png", traces)
-    plots.plot_tensions(out / "tensions.png", traces["policy"], "policy, episode 0")
-    plots.plot_paths(out / "paths.png", traces["policy"], "policy, episode 0")
-    if rows := read_metrics(folder):
-        plots.plot_training(out / "training.png", rows)
+    plots.plot_tensions(out / "tensions.png", traces[flown.name], f"{flown.name}, episode 0")
+    plots.plot_paths(out / "paths.png", traces[flown.name], f"{flown.name}, episode 0")
+    if flown.name not in SCRIPTED:
+        from multilift_marl.agents.logging import read_metrics
+
+        if rows := read_metrics(flown.folder):
+            plots.plot_training(out / "training.png", rows)
     print(f"wrote plots in {out}")
     if own["video"]:
         try:
-            _film(config, makers["policy"], own, out / "episode_0.mp4")
+            _film(config, flown.make, own, out / "episode_0.mp4")
         except RenderingError as error:
             print(f"no video: {error}", file=sys.stderr)
 

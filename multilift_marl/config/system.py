@@ -19,6 +19,7 @@ from multilift_marl.config.rig import (
 )
 from multilift_marl.config.vehicles import GRAVITY, PRESETS, Vehicle, check_rotors, resolve_vehicle
 from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import quat_to_mat
 
 if TYPE_CHECKING:
     from multilift_marl.config.schema import Config, WindConfig
@@ -107,6 +108,12 @@ class System:
         """Tension of each resting cable where it is measured, in its segment next to the drone (N,) [N]."""
         last = self.cable_mass * (1 - 1 / self.cable_segments)
         return np.linalg.norm(self.formation_force + GRAVITY * last[:, None] * [0, 0, 1], axis=1)
+
+    @property
+    def inertia_matrix(self) -> tuple[float, ...]:
+        """Return the payload's nominal inertia about its centre of mass, in its frame, row by row (9,) [kg m²]."""
+        axes = np.reshape(quat_to_mat(*(float(q) for q in self.payload_axes)), (3, 3))
+        return tuple(float(moment) for moment in ((axes * self.payload_inertia) @ axes.T).ravel())
 
 
 def resolve_system(config: Config) -> System:

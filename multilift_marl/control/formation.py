@@ -36,13 +36,22 @@ class Goal(NamedTuple):
     """(E, 3) [m/s³]."""
     drone_yaw_rate: np.ndarray
     """(E,) [rad/s]."""
+    angular_velocity: np.ndarray
+    """(E, 3) of a target that turns, world frame [rad/s]."""
+    slot_velocity: np.ndarray
+    """(E, N, 3) of each slot beside the target's, where the formation turns or changes [m/s]."""
+    slot_acceleration: np.ndarray
+    """(E, N, 3) likewise [m/s²]."""
+    slot_jerk: np.ndarray
+    """(E, N, 3) likewise [m/s³]."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> Goal:
         """Return empty goals."""
         e, n = num_envs, num_drones
         placed = ((e, 3), (e, 3, 3), (e,), (e, n, 3), (e, n, 2), (e, n, 3), (e,))
-        return cls(*(np.zeros(shape) for shape in (*placed, (e, 3), (e, 3), (e, 3), (e,))))
+        moving = ((e, 3), (e, 3), (e, 3), (e,), (e, 3), (e, n, 3), (e, n, 3), (e, n, 3))
+        return cls(*(np.zeros(shape) for shape in (*placed, *moving)))
 
 
 class Rig(NamedTuple):
@@ -154,8 +163,10 @@ def leave_goal(lo, hi, reference, goal):
         velocity, acceleration = row(goal.velocity, e), row(goal.acceleration, e)
         for n in range(reference.yaw.shape[1]):
             put(reference.position[e, n], sub(vec(reference.position, e, n), vec(goal.slots, e, n)))
-            put(reference.velocity[e, n], sub(vec(reference.velocity, e, n), velocity))
-            put(reference.acceleration[e, n], sub(vec(reference.acceleration, e, n), acceleration))
+            own_velocity = add(velocity, vec(goal.slot_velocity, e, n))
+            own_acceleration = add(acceleration, vec(goal.slot_acceleration, e, n))
+            put(reference.velocity[e, n], sub(vec(reference.velocity, e, n), own_velocity))
+            put(reference.acceleration[e, n], sub(vec(reference.acceleration, e, n), own_acceleration))
             reference.yaw[e, n] -= goal.drone_yaw[e]
             reference.yaw_rate[e, n] -= goal.drone_yaw_rate[e]
 
@@ -171,9 +182,11 @@ def smooth_moving(lo, hi, reference, goal, frequency, speed, dt):
     for e in range(lo, hi):
         velocity, acceleration, jerk = row(goal.velocity, e), row(goal.acceleration, e), row(goal.jerk, e)
         for n in range(reference.yaw.shape[1]):
-            put(reference.velocity[e, n], add(vec(reference.velocity, e, n), velocity))
-            put(reference.acceleration[e, n], add(vec(reference.acceleration, e, n), acceleration))
-            put(reference.jerk[e, n], add(vec(reference.jerk, e, n), jerk))
+            own_velocity = add(velocity, vec(goal.slot_velocity, e, n))
+            own_acceleration = add(acceleration, vec(goal.slot_acceleration, e, n))
+            put(reference.velocity[e, n], add(vec(reference.velocity, e, n), own_velocity))
+            put(reference.acceleration[e, n], add(vec(reference.acceleration, e, n), own_acceleration))
+            put(reference.jerk[e, n], add(vec(reference.jerk, e, n), add(jerk, vec(goal.slot_jerk, e, n))))
             reference.yaw_rate[e, n] += goal.drone_yaw_rate[e]
 
 

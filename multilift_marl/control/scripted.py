@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from multilift_marl.control.payload_geometric import PayloadGeometric
 from multilift_marl.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -45,10 +46,15 @@ class FormationIntegral(Formation):
         return matrix
 
 
-SCRIPTED: dict[str, type[Formation]] = {"formation": Formation, "formation_integral": FormationIntegral}
+SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {
+    "formation": Formation,
+    "formation_integral": FormationIntegral,
+    "payload_geometric": PayloadGeometric,
+}
+LINEAR = tuple(name for name, script in SCRIPTED.items() if issubclass(script, Formation))  # maps of the observation
 
 
-def make_scripted(name: str, vec: MultiliftVec) -> Formation:
+def make_scripted(name: str, vec: MultiliftVec) -> Formation | PayloadGeometric:
     """Return the scripted policy `name` for the environments `vec`.
 
     Raises:
@@ -77,4 +83,5 @@ def residual_matrix(name: str, vec: MultiliftVec) -> np.ndarray:
     """
     if name == "formation":
         return np.zeros((vec.action_size, vec.observation_size), np.float32)
-    return make_scripted(name, vec).matrix()
+    check_interface(name, vec.config.control.action)
+    return SCRIPTED[name](vec).matrix()

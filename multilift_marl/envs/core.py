@@ -189,7 +189,7 @@ class MultiliftVec:
         self._calls: dict[int, tuple] = {}
         for shard in self.world.shards:
             span = (shard.lo, shard.hi)
-            act, follow = self.pilot.bind(*span, self._action, self.task.goal, self.task.planner(*span))
+            act, follow = self.pilot.bind(*span, self._action, self.task.way, self.task.planner(*span))
             after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
             self._calls[shard.lo] = (act, follow, after)
 

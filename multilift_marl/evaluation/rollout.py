@@ -13,7 +13,6 @@ from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.tasks.failures import MAX_DISTANCE
 
 SETTLED = 0.05  # [m] settling time counts until the payload stays within this
-FINAL_SECONDS = 2.0  # errors are means over these last seconds
 _BATCH = 256
 
 
@@ -97,7 +96,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
             square += running * errors.distance**2
             counted += running
         settling = np.where(running & (errors.distance > SETTLED), (step + 1) * dt, settling)
-        if step >= vec.max_steps - round(FINAL_SECONDS / dt):
+        if vec.task.counts((step + 1) * dt, vec.max_steps * dt):
             final_distance += running * errors.distance
             final_angle += running * np.rad2deg(errors.angle)
             final_steps += running

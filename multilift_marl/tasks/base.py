@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
@@ -18,6 +19,7 @@ from multilift_marl.tasks.observations import Component, observe_team
 from multilift_marl.tasks.starts import make_hanging
 from multilift_marl.tasks.terms import Errors, measure
 
+FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
 INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
 
 
@@ -33,9 +35,9 @@ class Box(NamedTuple):
 
 
 @kernel
-def check_team(lo, hi, state, goal, errors, dt, limits, watch, cause, min_separation):
+def check_team(lo, hi, state, goal, way, led, errors, dt, limits, watch, cause, min_separation):
     """Measure the errors of environments lo to hi, integrate them over `dt` [s], look for failures."""
-    measure(lo, hi, state, goal, errors, dt, INTEGRAL_LIMIT)
+    measure(lo, hi, state, goal, way, led, errors, dt, INTEGRAL_LIMIT)
     find_failures(lo, hi, state, errors, limits, watch, cause, min_separation)
 
 
@@ -53,10 +55,12 @@ class Task:
         EXTRA: what its observations have beside the common components.
         EXTRA_STATE: how many numbers it adds to the global state.
         RMSE_AFTER: time from which `payload_rmse_m` counts [s].
+        LEAST_DRONES: with fewer it makes no sense.
         KEPT: names of further arrays, environment first, that outlive a step.
 
     Attributes:
         goal, errors: Goal, Errors; live arrays.
+        way: Goal that the drones fly about: `goal` itself, unless a task leads the team there.
         cause: failure cause (E,), an index into `failures.CAUSES`.
         terms: weighted reward terms (E, T) in the order of `REWARD`.
         good_time: time since the payload was last outside the success region (E,) [s].
@@ -71,15 +75,21 @@ class Task:
     EXTRA: ClassVar[tuple[Component, ...]] = ()
     EXTRA_STATE: ClassVar[int] = 0
     RMSE_AFTER: ClassVar[float] = 0.0
+    LEAST_DRONES: ClassVar[int] = 1
     KEPT: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: Config, world: World, reference: Reference):
         e, n, system = world.num_envs, world.num_drones, world.system
         self.world, self.reference = world, reference
+        if n < self.LEAST_DRONES:
+            raise ConfigError(
+                f"task {self.name} needs more drones; raise env.num_drones to {self.LEAST_DRONES} or more"
+            )
         self.options = validate(self.Options, config.task_options, "task_options")
         self.weights = self._weights(config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
+        self.way = self.goal
         self.rig = Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull)
         self.limits, self.hanging = make_limits(system), make_hanging(system)
         tension = system.resting_tension
@@ -112,6 +122,10 @@ class Task:
         It adds `control_dt` to `time` and writes goal and its velocities for that moment.
         """
         return None
+
+    def counts(self, time: float, length: float) -> bool:
+        """Return whether errors at `time` [s] of an episode of `length` [s] belong to those that are reported."""
+        return time > length - FINAL_SECONDS + 1e-9
 
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None] | None:
         """Return what writes `EXTRA` and `EXTRA_STATE`, the last numbers of each row, of environments lo to hi."""
@@ -155,8 +169,9 @@ class Task:
         ]
 
     def _checked(self, lo: int, hi: int, dt: float) -> tuple:
-        state, errors = self.world.state, self.errors
-        return lo, hi, state, self.goal, errors, dt, self.limits, self.watch, self.cause, self.min_separation
+        state, goal, way, errors = self.world.state, self.goal, self.way, self.errors
+        found = (self.limits, self.watch, self.cause, self.min_separation)
+        return lo, hi, state, goal, way, way is not goal, errors, dt, *found
 
     def _observed(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> tuple:
         state, plant, goal, reference = self.world.state, self.world.plant, self.goal, self.reference
@@ -165,8 +180,8 @@ class Task:
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""
         kept = ("cause", "good_time", "min_separation", "time", *self.KEPT)
-        saved = {name: getattr(self, name).copy() for name in kept}
-        for group in ("goal", "errors", "watch"):
+        saved = {name: operator.attrgetter(name)(self).copy() for name in kept}
+        for group in ("goal", "errors", "watch", *(() if self.way is self.goal else ("way",))):
             saved |= {f"{group}.{name}": array.copy() for name, array in getattr(self, group)._asdict().items()}
         return saved
 

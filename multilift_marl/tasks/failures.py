@@ -30,7 +30,7 @@ LOAD_GROUND = 0  # the payload's contact with the ground, to be forgiven apart f
 
 MAX_DISTANCE = 3.0  # [m]
 _CABLE_DISTANCE = 0.1  # [m] for the span of a falcon
-_TOUCH = 0.005  # [m]
+TOUCH = 0.005  # [m] what is no higher touches the ground
 _MIN_UP = cos(radians(80.0))
 _MIN_CABLE_PAYLOAD = cos(radians(135.0))
 
@@ -114,9 +114,7 @@ def _cause(e, state, errors, limits, watch, min_separation):
     count = state.drone_position.shape[1]
     if not errors.distance[e] <= MAX_DISTANCE:
         return RANGE
-    half, center = limits.payload_half, add(payload, mul(attitude, limits.payload_center))
-    below = _round_extent(attitude, half) if limits.payload_round else _extent(attitude, half)
-    if center[2] - below < _TOUCH and _counts(LOAD_GROUND, forgiven):
+    if payload_height(payload, attitude, limits) < TOUCH and _counts(LOAD_GROUND, forgiven):
         return GROUND
     for n in range(count):
         if watch.lost[e, n]:
@@ -124,7 +122,7 @@ def _cause(e, state, errors, limits, watch, min_separation):
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
         anchor = add(payload, mul(attitude, (limits.anchors[n, 0], limits.anchors[n, 1], limits.anchors[n, 2])))
         cable = unit(sub(drone, anchor))
-        if drone[2] - _extent(frame, limits.drone_half) < _TOUCH and _counts(GROUND, forgiven):
+        if drone[2] - _extent(frame, limits.drone_half) < TOUCH and _counts(GROUND, forgiven):
             return GROUND
         if state.cable_broken[e, n] and _counts(BROKEN, forgiven):
             return BROKEN
@@ -147,6 +145,13 @@ def _cause(e, state, errors, limits, watch, min_separation):
             if segment_distance(anchor, drone, foot, other) < limits.cables[n, m] and _counts(CROSSING, forgiven):
                 return CROSSING
     return 0
+
+
+@kernel
+def payload_height(payload, attitude, limits):
+    """Return the height of the lowest point of a payload [m] at `payload` [m] with `attitude`, 9 numbers."""
+    half, center = limits.payload_half, add(payload, mul(attitude, limits.payload_center))
+    return center[2] - (_round_extent(attitude, half) if limits.payload_round else _extent(attitude, half))
 
 
 @kernel

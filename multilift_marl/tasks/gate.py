@@ -85,8 +85,8 @@ class Gate(Task):
         "action_rate": -0.05,
     }
     EXTRA: ClassVar[tuple[Component, ...]] = (
-        Component("target_velocity", 3, "slot", "m/s", "velocity of the target"),
-        Component("gap", 3, "slot", "m", "own position minus the next gap's middle at the target's height"),
+        Component("target_velocity", 2, "slot", "m/s", "horizontal velocity of the target"),
+        Component("gap", 2, "slot", "m", "own position minus the middle of the next gap, from above"),
         Component("clearance", 1, "-", "m", "least room between the team and the next wall's edges, within ± 0.5"),
     )
     EXTRA_STATE: ClassVar[int] = 6
@@ -260,10 +260,10 @@ def _tell(lo, hi, state, goal, gates, bodies, observation, critic):
         room = min(max(_spread(e, g, state, gates, bodies), -0.5), 0.5)
         for n in range(observation.shape[1]):
             c, s = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
-            own = observation[e, n, observation.shape[2] - 7 :]
-            put(own[0:3], turn(c, s, row(goal.velocity, e)))
-            put(own[3:6], turn(c, s, sub(vec(state.drone_position, e, n), middle)))
-            own[6] = room
+            own = observation[e, n, observation.shape[2] - 5 :]
+            own[0], own[1] = turn(c, s, row(goal.velocity, e))[:2]
+            own[2], own[3] = turn(c, s, sub(vec(state.drone_position, e, n), middle))[:2]
+            own[4] = room
 
 
 @kernel

@@ -13,13 +13,10 @@ from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section
 from multilift_marl.control.formation import Reference
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import (
-    norm,
-)
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.starts import StartRanges, start_near_target
-from multilift_marl.tasks.terms import mean_change, tolerance
+from multilift_marl.tasks.terms import mean_change, pay_pose
 
 
 class HoverOptions(Section):
@@ -69,7 +66,7 @@ class Hover(Task):
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
         success = (self.options.success_distance, radians(self.options.success_angle))
         return bind(
-            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights, success, self.dt,
+            _score, lo, hi, self.world.state, self.goal, self.errors, action, previous, self.weights, success, self.dt,
             self.terms, self.good_time,
         )  # fmt: skip
 
@@ -79,16 +76,9 @@ class Hover(Task):
 
 
 @kernel
-def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms, good_time):
+def _score(lo, hi, state, goal, errors, action, previous, weights, success, dt, terms, good_time):
     for e in range(lo, hi):
-        distance, angle = errors.distance[e], errors.angle[e]
-        speed = norm((state.payload_velocity[e, 0], state.payload_velocity[e, 1], state.payload_velocity[e, 2]))
-        spin = norm((state.payload_body_rates[e, 0], state.payload_body_rates[e, 1], state.payload_body_rates[e, 2]))
-        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
-        terms[e, 1] = weights[1] * tolerance(distance, 0.01)
-        terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
-        terms[e, 3] = weights[3] * tolerance(angle, radians(1.0))
-        terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
+        pay_pose(e, state, goal, errors, 1.0, weights, terms)
         terms[e, 5] = weights[5] * mean_change(e, action, previous)
-        good = distance <= success[0] and angle <= success[1]
+        good = errors.distance[e] <= success[0] and errors.angle[e] <= success[1]
         good_time[e] = good_time[e] + dt if good else 0.0

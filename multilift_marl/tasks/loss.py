@@ -57,6 +57,7 @@ class Loss(Task):
         Component("lost_direction", 2, "slot", "-", "cosine and sine of its azimuth from the own one; 0 before"),
     )
     EXTRA_STATE: ClassVar[int] = 3
+    LEAST_DRONES: ClassVar[int] = 2
     KEPT: ClassVar[tuple[str, ...]] = ("when", "who")
 
     def __init__(self, config: Config, world: World, reference: Reference):
@@ -64,8 +65,6 @@ class Loss(Task):
         early, late = self.options.loss_time
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={self.options.loss_time} must list the earlier one first")
-        if world.num_drones < 2:
-            raise ConfigError("task loss needs a drone that is left; raise env.num_drones to 2 or more")
         self.when, self.who = np.zeros(world.num_envs), np.zeros(world.num_envs, np.int64)
         world.breakable = world.breakable or self.options.snap
         self._angle = radians(self.options.success_angle) if world.num_drones >= LEVEL_FROM else np.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import radians
 from typing import NamedTuple
 
 import numpy as np
@@ -38,9 +39,9 @@ class Errors(NamedTuple):
     angle: np.ndarray
     """(E,) [rad]."""
     position_integral: np.ndarray
-    """(E, 3) ∫ position dt, each component clipped [m s]."""
+    """(E, 3) ∫ position dt, each component clipped, of the way where one leads to the goal [m s]."""
     rotation_integral: np.ndarray
-    """(E, 3) ∫ rotation dt, each component clipped [rad s]."""
+    """(E, 3) ∫ rotation dt, likewise [rad s]."""
 
     @classmethod
     def zeros(cls, num_envs: int) -> Errors:
@@ -50,16 +51,40 @@ class Errors(NamedTuple):
 
 
 @kernel
-def measure(lo, hi, state, goal, errors, dt, largest):
-    """Update the errors of environments lo to hi and integrate them over `dt` [s], each integral within ± `largest`."""
+def measure(lo, hi, state, goal, way, led, errors, dt, largest):
+    """Update the errors of environments lo to hi and integrate them over `dt` [s], each integral within ± `largest`.
+
+    If the team is `led`, it is the distance from the way that is integrated: that from a goal still far away would
+    only wind the integrals up.
+    """
     for e in range(lo, hi):
         put(errors.position[e], sub(row(state.payload_position, e), row(goal.position, e)))
         turned = matmul(matrow(state.payload_rotation, e), transpose(matrow(goal.rotation, e)))
         put(errors.rotation[e], rotation_vector(turned))
         errors.distance[e] = norm(row(errors.position, e))
         errors.angle[e] = norm(row(errors.rotation, e))
+        apart, twisted = row(errors.position, e), row(errors.rotation, e)
+        if led:
+            apart = sub(row(state.payload_position, e), row(way.position, e))
+            twisted = rotation_vector(matmul(matrow(state.payload_rotation, e), transpose(matrow(way.rotation, e))))
         for j in range(3):
-            moved = errors.position_integral[e, j] + dt * errors.position[e, j]
+            moved = errors.position_integral[e, j] + dt * apart[j]
             errors.position_integral[e, j] = clip(moved, -largest, largest)
-            moved = errors.rotation_integral[e, j] + dt * errors.rotation[e, j]
+            moved = errors.rotation_integral[e, j] + dt * twisted[j]
             errors.rotation_integral[e, j] = clip(moved, -largest, largest)
+
+
+@kernel
+def pay_pose(e, state, goal, errors, share, weights, terms):
+    """Write the first five reward terms of environment e, those of a payload that is to be at its target.
+
+    They are position, precision, attitude, level and stillness, each times its weight and `share`.
+    """
+    distance, angle = errors.distance[e], errors.angle[e]
+    speed = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
+    spin = norm(row(state.payload_body_rates, e))
+    terms[e, 0] = weights[0] * tolerance(distance, 0.25) * share
+    terms[e, 1] = weights[1] * tolerance(distance, 0.01) * share
+    terms[e, 2] = weights[2] * tolerance(angle, radians(6.0)) * share
+    terms[e, 3] = weights[3] * tolerance(angle, radians(1.0)) * share
+    terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3) * share

@@ -77,7 +77,7 @@ class Track(Task):
         ),
     )
     EXTRA_STATE: ClassVar[int] = 6 + 3 * len(AHEAD)
-    KEPT: ClassVar[tuple[str, ...]] = ("worst",)
+    KEPT: ClassVar[tuple[str, ...]] = ("worst", *(f"path.{name}" for name in Path._fields))
     RMSE_AFTER: ClassVar[float] = 5.0
 
     def __init__(self, config: Config, world: World, reference: Reference):

@@ -1,0 +1,168 @@
+"""The pulls with which the cables exert a wrench on the payload, and where the drones are that pull so."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.system import GRAVITY
+from multilift_marl.control.formation import place_formation
+from multilift_marl.math3d import add, cross, dot, matmul, matrow, mul, norm, put, row, scale, sub, transpose, unit, vec
+from multilift_marl.sim.cables import cable_end
+
+LEAST = 0.2  # of its tension in the level formation, with which every cable is to pull
+BALANCED = 1e-6  # [N] and [N m] for each N of weight: balance to within rounding
+_DAMPING = 1e-9  # relative; makes moments that no pulls can exert harmless
+_ITERATIONS = 20
+_STILL = (0.0, 0.0, 0.0)
+
+
+@kernel
+def solve_pulls(force, moment, attitude, anchors, least, pull):
+    """Replace the pulls (N, 3) by the nearest ones that exert a wrench, every cable pulling; return the imbalance.
+
+    Pulls f_i minimise Σ |f_i - n_i|² subject to Σ f_i = F, Σ r_i × f_i = M and u_i · f_i ≥ t_i, with n_i the given
+    ones, u_i = n_i/|n_i|, t_i = `least` |n_i|. By the conditions of Karush, Kuhn and Tucker f_i = v_i +
+    max(0, t_i - u_i · v_i) u_i with v_i = n_i + λ + μ × r_i, so that only six numbers are sought, which Newton's method
+    finds exactly in a few steps: the six equations are linear while the same cables are at their bounds.
+
+    Args:
+        force, moment: F on the payload [N], M about its centre of mass [N m], world frame.
+        attitude: of the payload, 9 numbers.
+        anchors: (N, 3) in its frame [m].
+        least: tension of every cable over that of its given pull, at least; -inf for no bound.
+        pull: (N, 3) n_i, world frame [N]; written.
+
+    Returns:
+        What is left of F and M, the largest component [N], [N m]; of a moment that these cables cannot exert, most.
+    """
+    linear, angular = _STILL, _STILL
+    imbalance, exact = np.inf, 1e-13 * max(_largest(force), 1.0)
+    for _ in range(_ITERATIONS):
+        lacking, twisting, a, b, c = _balance(force, moment, attitude, anchors, least, pull, linear, angular)
+        left = max(_largest(lacking), _largest(twisting))
+        stalled = abs(left - imbalance) < 0.01 * imbalance
+        imbalance = left
+        if stalled or left <= exact:
+            break
+        inverse = _inverse(a, _DAMPING * (a[0] + a[4] + a[8]))
+        # a symmetric system in blocks: a Δλ + b Δμ = lacking, bᵀ Δλ + c Δμ = twisting
+        through = matmul(transpose(b), inverse)
+        schur = _minus(c, matmul(through, b))
+        change = mul(_inverse(schur, _DAMPING * (c[0] + c[4] + c[8])), sub(twisting, mul(through, lacking)))
+        linear = add(linear, mul(inverse, sub(lacking, mul(b, change))))
+        angular = add(angular, change)
+    for i in range(pull.shape[0]):
+        given = (pull[i, 0], pull[i, 1], pull[i, 2])
+        arm = mul(attitude, (anchors[i, 0], anchors[i, 1], anchors[i, 2]))
+        put(pull[i], _pull(given, arm, least, linear, angular)[0])
+    return imbalance
+
+
+@kernel
+def _pull(given, arm, least, linear, angular):
+    """Return f_i and whether the cable is at its bound."""
+    free = add(add(given, linear), cross(angular, arm))
+    size = norm(given)
+    along = scale(1.0 / size, given)
+    short = least * size - dot(along, free)
+    if short > 0.0:
+        return add(free, scale(short, along)), True
+    return free, False
+
+
+@kernel
+def _balance(force, moment, attitude, anchors, least, pull, linear, angular):
+    """Return what is left of force and moment, and the blocks a, b, c of their derivative by λ and μ."""
+    a = b = c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for i in range(pull.shape[0]):
+        given = (pull[i, 0], pull[i, 1], pull[i, 2])
+        arm = mul(attitude, (anchors[i, 0], anchors[i, 1], anchors[i, 2]))
+        own, bound = _pull(given, arm, least, linear, angular)
+        force, moment = sub(force, own), sub(moment, cross(arm, own))
+        u = scale(1.0 if bound else 0.0, unit(given))
+        p = (
+            1.0 - u[0] * u[0], -u[0] * u[1], -u[0] * u[2],
+            -u[1] * u[0], 1.0 - u[1] * u[1], -u[1] * u[2],
+            -u[2] * u[0], -u[2] * u[1], 1.0 - u[2] * u[2],
+        )  # fmt: skip
+        x = (0.0, arm[2], -arm[1], -arm[2], 0.0, arm[0], arm[1], -arm[0], 0.0)  # x μ = μ × r
+        px = matmul(p, x)
+        a, b, c = _plus(a, p), _plus(b, px), _plus(c, matmul(transpose(x), px))
+    return force, moment, a, b, c
+
+
+@kernel
+def _largest(v):
+    return max(abs(v[0]), abs(v[1]), abs(v[2]))
+
+
+@kernel
+def _plus(p, q):
+    return (
+        p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3], p[4] + q[4], p[5] + q[5], p[6] + q[6], p[7] + q[7],
+        p[8] + q[8],
+    )  # fmt: skip
+
+
+@kernel
+def _minus(p, q):
+    return (
+        p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3], p[4] - q[4], p[5] - q[5], p[6] - q[6], p[7] - q[7],
+        p[8] - q[8],
+    )  # fmt: skip
+
+
+@kernel
+def _inverse(m, damping):
+    """Return the inverse of a symmetric, positive semidefinite matrix with `damping` added to its diagonal."""
+    damping = max(damping, 1e-30)
+    x = (m[0] + damping, m[3], m[6])
+    y = (m[1], m[4] + damping, m[7])
+    z = (m[2], m[5], m[8] + damping)
+    r0, r1, r2 = cross(y, z), cross(z, x), cross(x, y)
+    k = 1.0 / dot(x, r0)
+    return (k * r0[0], k * r0[1], k * r0[2], k * r1[0], k * r1[1], k * r1[2], k * r2[0], k * r2[1], k * r2[2])
+
+
+@kernel
+def reach(n, pull, hanging):
+    """Return where the drone is, from its anchor, that pulls the payload by `pull` [N] through cable n at rest [m]."""
+    middle = add(pull, (0.0, 0.0, 0.5 * hanging.weight[n]))
+    size = norm(middle)
+    return cable_end(
+        scale(1.0 / size, middle), size, hanging.length[n], hanging.stiffness[n], hanging.segments[n], hanging.weight[n]
+    )
+
+
+@kernel
+def place_slots(e, goal, rig, hanging):
+    """Write the slots of environment e from which drones pull as `goal.pull`, there with the payload's pulls, says.
+
+    The pulls become those of the drones, which carry the cables too.
+    """
+    target, position = matrow(goal.rotation, e), row(goal.position, e)
+    for n in range(rig.anchors.shape[0]):
+        pull = vec(goal.pull, e, n)
+        anchor = add(position, mul(target, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
+        put(goal.slots[e, n], add(anchor, reach(n, pull, hanging)))
+        goal.pull[e, n, 2] += hanging.weight[n]
+
+
+@kernel
+def place_balanced(e, goal, rig, hanging):
+    """Do as `place_formation`, for tilted targets too; return whether the team can hold the payload there.
+
+    Over a level target the formation balances. Over a tilted one, its pulls are changed as little as balances weight
+    and moment with every cable pulling, and the slots follow from them.
+    """
+    place_formation(e, goal, rig)
+    target = matrow(goal.rotation, e)
+    if target[8] > 1.0 - 1e-12 or not np.any(rig.anchors != 0.0):
+        return True
+    for n in range(rig.anchors.shape[0]):
+        goal.pull[e, n, 2] -= hanging.weight[n]
+    weight = hanging.payload_mass * GRAVITY
+    left = solve_pulls((0.0, 0.0, weight), _STILL, target, rig.anchors, LEAST, goal.pull[e])
+    place_slots(e, goal, rig, hanging)
+    return left <= BALANCED * weight

@@ -1,0 +1,179 @@
+"""Pose: bring the payload to one pose after the other, tilted ones too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil, cos, radians, sin
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from multilift_marl._jit import bind, kernel
+from multilift_marl.config.schema import Config, Float, Section
+from multilift_marl.control.formation import Goal, Reference
+from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import matmul, matrow, norm, put, rotation_vector, row, sub, transpose, turn
+from multilift_marl.sim.world import World
+from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.starts import hang_team
+from multilift_marl.tasks.targets import draw_plan, make_bounds
+from multilift_marl.tasks.terms import mean_change, tolerance
+from multilift_marl.tasks.way import Plan, aim, lead
+
+
+class PoseOptions(Section):
+    """Ranges of the targets and bounds of success."""
+
+    target_xy: Float = Field(1.0, ge=0, description="[m] target x and y within ± this")
+    target_height: tuple[Float, Float] = Field((1.0, 2.0), description="[m] lowest and highest target")
+    target_tilt: Float = Field(45.0, ge=0, lt=60, description="[deg] target roll and pitch within ± this")
+    target_yaw: Float = Field(180.0, ge=0, le=180, description="[deg] target heading within ± this")
+    target_seconds: Float = Field(4.0, gt=0, description="[s] until the next target")
+    way_seconds: Float = Field(2.8, gt=0, description="[s] that the planned way to a target takes")
+    success_distance: Float = Field(0.05, gt=0, description="[m] payload within this of each target ...")
+    success_angle: Float = Field(5.0, gt=0, description="[deg] ... and within this of its attitude ...")
+    success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout its last seconds, or a shorter one's all")
+
+
+class Pose(Task):
+    """Bring the payload to poses that change; see docs/pose.md."""
+
+    name: ClassVar[str] = "pose"
+    Options: ClassVar[type[Section]] = PoseOptions
+    REWARD: ClassVar[dict[str, float]] = {
+        "position": 0.3,
+        "precision": 0.25,
+        "attitude": 0.2,
+        "alignment": 0.15,
+        "stillness": 0.1,
+        "action_rate": -0.05,
+    }
+    EXTRA: ClassVar[tuple[Component, ...]] = (
+        Component("way_position", 3, "slot", "m", "the planned way's present position minus target"),
+        Component("way_rotation", 3, "slot", "rad", "rotation vector from target to the planned way's attitude"),
+        Component("time_left", 1, "-", "-", "until the next target, over the time that each one has"),
+    )
+    EXTRA_STATE: ClassVar[int] = 7
+    KEPT: ClassVar[tuple[str, ...]] = ("reached", "_pose", "_pull", "_stage")
+
+    def __init__(self, config: Config, world: World, reference: Reference):
+        super().__init__(config, world, reference)
+        option, system, e = self.options, world.system, world.num_envs
+        if option.target_height[0] > option.target_height[1]:
+            raise ConfigError(f"task_options.target_height={option.target_height} must list the lower one first")
+        if option.way_seconds > option.target_seconds:
+            raise ConfigError(
+                f"task_options.way_seconds={option.way_seconds:g} must not exceed target_seconds="
+                f"{option.target_seconds:g}: the way would never end"
+            )
+        self._length, self._hold = config.env.episode_seconds, min(option.target_seconds, config.env.episode_seconds)
+        self.targets = ceil(self._length / self._hold - 1e-9)
+        self.reached = np.zeros((e, self.targets), bool)
+        self.plan = Plan.zeros(e, self.targets, world.num_drones)
+        self._pose, self._pull, self._stage = self.plan
+        way = Goal.zeros(e, world.num_drones)
+        self.way = way._replace(slot_frame=self.goal.slot_frame)  # actions point as the observations do
+        self._bounds = make_bounds(system, self.limits, 1 + config.randomization.payload_mass)
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw a level pose to start from and the targets; the team hangs there at rest; see `Task.start`."""
+        option, tilt = self.options, radians(self.options.target_tilt)
+        ranges = (option.target_xy, *option.target_height, radians(option.target_yaw), tilt)
+        drawn = draw_plan(env, rng, ranges, self.plan, self.goal, self.rig, self.hanging, self._bounds)
+        if drawn < 0:
+            raise ConfigError(
+                "this team can hold hardly any of the poses of task pose; lower task_options.target_tilt, raise "
+                "target_height or change the rig"
+            )
+        _start(env, self.world.state, self.plan, self.goal, self.way, self.rig, self.hanging, mass)
+        self.reached[env] = False
+
+    def planner(self, lo: int, hi: int) -> Callable[[], None]:
+        """Lead the way to each target in turn; see `Task.planner`."""
+        return bind(
+            lead, lo, hi, self.time, self.control_dt, self.plan, self.goal, self.way, self.rig, self.hanging,
+            self.world.system.inertia_matrix, self.world.state.payload_rotation, self._hold, self.options.way_seconds,
+        )  # fmt: skip
+
+    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+        """Pay for closeness, attitude and stillness; note which targets were reached; see `Task.scorer`."""
+        option = self.options
+        success = (option.success_distance, radians(option.success_angle), option.success_seconds)
+        clock = (self.dt, self._hold, self._length)
+        return bind(
+            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights, success, clock, self.time,
+            self.plan, self.terms, self.good_time, self.reached,
+        )  # fmt: skip
+
+    def succeeded(self) -> np.ndarray:
+        """Within the success region throughout the last second of every target."""
+        return self.reached.all(axis=1)
+
+    def counts(self, time: float, length: float) -> bool:
+        """Count the last second of every target."""
+        gone = time - self._hold * (ceil(time / self._hold - 1e-9) - 1)
+        return (
+            time > length - self.options.success_seconds + 1e-9
+            or gone > self._hold - self.options.success_seconds + 1e-9
+        )
+
+    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+        """Tell where the way is; see `Task.observer`."""
+        return bind(_observe, lo, hi, self.goal, self.way, self.time, self.plan, self._hold, observation, critic)
+
+
+@kernel
+def _start(e, state, plan, goal, way, rig, hanging, mass):
+    aim(e, 0, plan, way, rig, hanging)
+    for moving in (way.velocity, way.acceleration, way.jerk, way.angular_velocity):
+        moving[e] = 0.0
+    for moving in (way.slot_velocity, way.slot_acceleration, way.slot_jerk):
+        moving[e] = 0.0
+    way.drone_yaw_rate[e] = 0.0
+    still = (0.0, 0.0, 0.0)
+    hang_team(e, state, way, rig, hanging, mass, row(way.position, e), matrow(way.rotation, e), still, still)
+    plan.stage[e] = 0
+    aim(e, 1, plan, goal, rig, hanging)  # last, since it shares the slot frames with the way
+
+
+@kernel
+def _score(lo, hi, state, errors, action, previous, weights, success, clock, time, plan, terms, good_time, reached):
+    dt, hold, length = clock
+    for e in range(lo, hi):
+        distance, angle = errors.distance[e], errors.angle[e]
+        speed, spin = norm(row(state.payload_velocity, e)), norm(row(state.payload_body_rates, e))
+        terms[e, 0] = weights[0] * tolerance(distance, 0.5)
+        terms[e, 1] = weights[1] * tolerance(distance, 0.02)
+        terms[e, 2] = weights[2] * tolerance(angle, radians(20.0))
+        terms[e, 3] = weights[3] * tolerance(angle, radians(2.0))
+        terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
+        terms[e, 5] = weights[5] * mean_change(e, action, previous)
+        good = distance <= success[0] and angle <= success[1]
+        good_time[e] = good_time[e] + dt if good else 0.0
+        begun = plan.stage[e] * hold
+        ends = min(begun + hold, length)
+        if time[e] > ends - 0.5 * dt:
+            reached[e, plan.stage[e]] = good_time[e] >= min(success[2], ends - begun) - 1e-9
+
+
+@kernel
+def _observe(lo, hi, goal, way, time, plan, hold, observation, critic):
+    size, state = observation.shape[2], critic.shape[1]
+    for e in range(lo, hi):
+        ahead = sub(row(way.position, e), row(goal.position, e))
+        twisted = rotation_vector(matmul(matrow(way.rotation, e), transpose(matrow(goal.rotation, e))))
+        left = (plan.stage[e] + 1) - time[e] / hold
+        for n in range(observation.shape[1]):
+            c, s = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]  # world to slot frame
+            _tell(observation[e, n, size - 7 :], turn(c, s, ahead), turn(c, s, twisted), left)
+        c, s = cos(goal.yaw[e]), -sin(goal.yaw[e])
+        _tell(critic[e, state - 7 :], turn(c, s, ahead), turn(c, s, twisted), left)
+
+
+@kernel
+def _tell(out, ahead, twisted, left):
+    put(out[0:3], ahead)
+    put(out[3:6], twisted)
+    out[6] = left

@@ -1,0 +1,114 @@
+"""Targets of the payload, tilted ones too, drawn where the team can hold it at rest."""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.control.pulls import place_balanced
+from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, row, scale, segment_distance, sub, turn, vec
+from multilift_marl.tasks.failures import MAX_DISTANCE, Limits
+from multilift_marl.tasks.way import attitude_of
+
+MAX_LEAP = MAX_DISTANCE - 0.25  # [m] from a target to the next one: nearer than what counts as failure
+CLEARANCE = 0.1  # [m] of the payload from the ground at a target
+MARGIN = 1.2  # of distances between drones and cables at rest over those that count as failures
+MAX_REDRAWS = 1000
+
+
+class Bounds(NamedTuple):
+    """What a team can hold at rest."""
+
+    tilts: bool
+    """Whether it can hold a tilted payload at all: it takes three anchors that are not in line."""
+    thrust: float
+    """Of a drone [N]."""
+    drone_mass: float
+    load: float
+    """Heaviest payload over the nominal one."""
+    separation: float
+    """Of drones [m]."""
+    cables: np.ndarray
+    """(N, N) distance between cables [m]."""
+    half: np.ndarray
+    """(3,) half edges of the payload [m]."""
+
+
+def make_bounds(system: System, limits: Limits, load: float) -> Bounds:
+    """Return the bounds of a team whose payload may be `load` times the nominal mass, some margin left."""
+    spread = system.anchors - system.anchors.mean(axis=0)
+    return Bounds(
+        tilts=bool(np.linalg.matrix_rank(spread, tol=1e-6) >= 2),
+        thrust=0.9 * 4 * system.vehicle.rotor_thrust_max,
+        drone_mass=system.vehicle.mass,
+        load=load,
+        separation=MARGIN * limits.separation,
+        cables=MARGIN * limits.cables,
+        half=limits.payload_half,
+    )
+
+
+@kernel
+def draw_plan(e, rng, ranges, plan, goal, rig, hanging, bounds):
+    """Draw the poses of environment e, each anew until the team can hold it; return how many were drawn in vain, or -1.
+
+    Args:
+        e: the environment.
+        rng: generator of the episode.
+        ranges: of x and y [m], lowest and highest z [m], of yaw [rad], of roll and pitch [rad]; the start is level.
+        plan: written.
+        goal: overwritten.
+        rig, hanging, bounds: Rig, Hanging, Bounds.
+    """
+    xy, low, high, yaw, tilt = ranges
+    vain, k = 0, 0
+    while k < plan.pose.shape[1]:
+        lean = tilt if k > 0 and bounds.tilts else 0.0
+        pose = plan.pose[e, k]
+        pose[0], pose[1], pose[2] = rng.uniform(-xy, xy), rng.uniform(-xy, xy), rng.uniform(low, high)
+        pose[3], pose[4], pose[5] = rng.uniform(-yaw, yaw), rng.uniform(-lean, lean), rng.uniform(-lean, lean)
+        put(goal.position[e], (pose[0], pose[1], pose[2]))
+        putmat(goal.rotation[e], attitude_of(pose[3], pose[4], pose[5]))
+        last = plan.pose[e, max(k - 1, 0)]
+        leap = norm((pose[0] - last[0], pose[1] - last[1], pose[2] - last[2]))
+        held = place_balanced(e, goal, rig, hanging)
+        if leap > MAX_LEAP or not (held and _within(e, goal, rig, hanging, bounds)):
+            vain += 1
+            if vain > MAX_REDRAWS:
+                return -1
+            continue
+        c, s = cos(pose[3]), -sin(pose[3])
+        for n in range(rig.slots.shape[0]):
+            pull = sub(vec(goal.pull, e, n), (0.0, 0.0, hanging.weight[n]))
+            put(plan.pull[e, k, n], turn(c, s, pull))
+        k += 1
+    return vain
+
+
+@kernel
+def _within(e, goal, rig, hanging, bounds):
+    """Return whether the team is within `bounds` at its goal."""
+    target, position = matrow(goal.rotation, e), row(goal.position, e)
+    half = bounds.half
+    below = abs(target[6]) * half[0] + abs(target[7]) * half[1] + abs(target[8]) * half[2]
+    if position[2] - below < CLEARANCE:
+        return False
+    for n in range(rig.slots.shape[0]):
+        slot, rope = vec(goal.slots, e, n), (0.0, 0.0, hanging.weight[n])
+        pull = sub(vec(goal.pull, e, n), rope)
+        carried = add(scale(bounds.load, pull), add(rope, (0.0, 0.0, bounds.drone_mass * GRAVITY)))
+        if norm(carried) > bounds.thrust:
+            return False
+        anchor = add(position, mul(target, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
+        for m in range(n):
+            other = vec(goal.slots, e, m)
+            foot = add(position, mul(target, (rig.anchors[m, 0], rig.anchors[m, 1], rig.anchors[m, 2])))
+            if norm(sub(slot, other)) < bounds.separation:
+                return False
+            if segment_distance(anchor, slot, foot, other) < bounds.cables[n, m]:
+                return False
+    return True

@@ -1,0 +1,173 @@
+"""The planned way of a payload from pose to pose, from rest to rest, and of the formation that carries it so.
+
+Slots that merely moved to a target half a turn away would meet in the middle. Here the target itself moves and turns
+smoothly, and the slots are where the drones pull the payload just so: its motion tells the force and the moment that
+it needs, these the pulls, these the slots (differential flatness, Sreenath and Kumar, RSS 2013).
+"""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.system import GRAVITY
+from multilift_marl.control.formation import place_formation, wrap
+from multilift_marl.control.pulls import place_slots, solve_pulls
+from multilift_marl.math3d import (
+    add,
+    cross,
+    matmul,
+    mul,
+    put,
+    putmat,
+    rot_z,
+    row,
+    scale,
+    sub,
+    transpose,
+    turn,
+    vec,
+)
+
+NO_BOUND = -np.inf
+
+
+class Plan(NamedTuple):
+    """The poses of an episode: K targets, before them the start."""
+
+    pose: np.ndarray
+    """(E, K + 1, 6) x, y, z [m], yaw, roll, pitch [rad]; the attitude is Rz(yaw) Rx(roll) Ry(pitch)."""
+    pull: np.ndarray
+    """(E, K + 1, N, 3) of the cables on the payload at rest there, in the frame turned by the yaw alone [N]."""
+    stage: np.ndarray
+    """(E,) int64, which target is the present one, from 0."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, targets: int, num_drones: int) -> Plan:
+        """Return empty plans."""
+        e, k = num_envs, targets + 1
+        return cls(np.zeros((e, k, 6)), np.zeros((e, k, num_drones, 3)), np.zeros(num_envs, np.int64))
+
+
+@kernel
+def attitude_of(yaw, roll, pitch):
+    """Return Rz(yaw) Rx(roll) Ry(pitch), whose heading is `yaw`."""
+    return matmul(rot_z(yaw), _tilt(roll, pitch))
+
+
+@kernel
+def _tilt(roll, pitch):
+    cr, sr, cp, sp = cos(roll), sin(roll), cos(pitch), sin(pitch)
+    return (cp, 0.0, sp, sr * sp, cr, -sr * cp, -cr * sp, sr, cr * cp)
+
+
+@kernel
+def ease(x):
+    """Return s(x) from 0 to 1 and its first three derivatives; these and the fourth vanish at both ends."""
+    u, v = x * (1.0 - x), 1.0 - 2.0 * x
+    s = x * x * x * x * x * (126.0 - x * (420.0 - x * (540.0 - x * (315.0 - 70.0 * x))))
+    u2 = u * u
+    return s, 630.0 * u2 * u2, 2520.0 * u2 * u * v, 2520.0 * u2 * (3.0 * v * v - 2.0 * u)
+
+
+@kernel
+def aim(e, k, plan, goal, rig, hanging):
+    """Let pose k of the plan be the goal of environment e: its slots and pulls too."""
+    pose = plan.pose[e, k]
+    put(goal.position[e], (pose[0], pose[1], pose[2]))
+    putmat(goal.rotation[e], attitude_of(pose[3], pose[4], pose[5]))
+    place_formation(e, goal, rig)
+    c, s = cos(pose[3]), sin(pose[3])
+    for n in range(rig.slots.shape[0]):
+        put(goal.pull[e, n], turn(c, s, mat_row(plan.pull, e, k, n)))
+    place_slots(e, goal, rig, hanging)
+
+
+@kernel
+def mat_row(a, i, j, n):
+    """Return row (i, j, n) of an array of four axes."""
+    return (a[i, j, n, 0], a[i, j, n, 1], a[i, j, n, 2])
+
+
+@kernel
+def lead(lo, hi, time, dt, plan, goal, way, rig, hanging, inertia, payload_rotation, hold, seconds):
+    """Go on by one control step: the way of environments lo to hi, and their goals where a new target's time has come.
+
+    Args:
+        lo, hi: the environments.
+        time: (E,) since the start, advanced by dt [s].
+        dt: control step [s].
+        plan: Plan.
+        goal: the present target.
+        way: Goal that the drones fly about.
+        rig, hanging: Rig, Hanging.
+        inertia: of the payload in its frame, 9 numbers [kg m²].
+        payload_rotation: (E, 3, 3) written if the payload is a point, which is turned as its way is.
+        hold: how long each target stays [s].
+        seconds: how long the way to it takes [s].
+    """
+    point = not np.any(rig.anchors != 0.0)
+    for e in range(lo, hi):
+        time[e] += dt
+        stage = min(int((time[e] - 0.5 * dt) / hold), plan.pose.shape[1] - 2)
+        if stage != plan.stage[e]:
+            plan.stage[e] = stage
+            aim(e, stage + 1, plan, goal, rig, hanging)
+        gone = time[e] - stage * hold
+        if gone < seconds + 4.5 * dt:  # a little longer, until the differences of the slots are zero
+            _go(e, stage, min(gone / seconds, 1.0), dt, plan, way, rig, hanging, inertia, seconds)
+        if point:
+            payload_rotation[e] = way.rotation[e]
+
+
+@kernel
+def _go(e, k, x, dt, plan, way, rig, hanging, inertia, seconds):
+    """Write the way of environment e at the share x of the time from pose k to the next."""
+    s, ds, dds, ddds = ease(x)
+    ds, dds, ddds = ds / seconds, dds / (seconds * seconds), ddds / (seconds * seconds * seconds)
+    a, b = plan.pose[e, k], plan.pose[e, k + 1]
+    before = row(way.position, e)
+    step = (b[0] - a[0], b[1] - a[1], b[2] - a[2])
+    turned, rolled, pitched = wrap(b[3] - a[3]), b[4] - a[4], b[5] - a[5]
+    yaw, roll, pitch = a[3] + s * turned, a[4] + s * rolled, a[5] + s * pitched
+    heading, attitude = rot_z(yaw), attitude_of(yaw, roll, pitch)
+    # angular velocity, and its change, of s = 1 per second
+    leaning = (rolled, cos(roll) * pitched, sin(roll) * pitched)
+    bending = (0.0, -sin(roll) * rolled * pitched, cos(roll) * rolled * pitched)
+    spin = mul(heading, leaning)
+    swing = add(cross((0.0, 0.0, turned), spin), mul(heading, bending))
+    spin = add(spin, (0.0, 0.0, turned))
+    acceleration, turning = scale(dds, step), add(scale(dds, spin), scale(ds * ds, swing))
+    rates = scale(ds, spin)
+    body = matmul(matmul(attitude, inertia), transpose(attitude))
+    moment = add(mul(body, turning), cross(rates, mul(body, rates)))
+    force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
+    put(way.position[e], add((a[0], a[1], a[2]), scale(s, step)))
+    put(way.velocity[e], scale(ds, step))
+    put(way.acceleration[e], acceleration)
+    put(way.jerk[e], scale(ddds, step))
+    put(way.angular_velocity[e], rates)
+    putmat(way.rotation[e], attitude)
+    way.yaw[e], way.drone_yaw[e], way.drone_yaw_rate[e] = yaw, yaw, ds * turned
+    c, si = cos(yaw), sin(yaw)
+    count = rig.slots.shape[0]
+    for n in range(count):
+        old, new = mat_row(plan.pull, e, k, n), mat_row(plan.pull, e, k + 1, n)
+        put(way.pull[e, n], turn(c, si, add(scale(1.0 - s, old), scale(s, new))))
+        way.slot_jerk[e, n] = way.slots[e, n]  # kept for the differences below
+    solve_pulls(force, moment, attitude, rig.anchors, NO_BOUND, way.pull[e])
+    place_slots(e, way, rig, hanging)
+    moved = sub(row(way.position, e), before)
+    for n in range(count):
+        velocity, past = vec(way.slot_velocity, e, n), vec(way.slot_acceleration, e, n)
+        gained = scale(1.0 / dt, sub(sub(vec(way.slots, e, n), vec(way.slot_jerk, e, n)), moved))
+        change = scale(1.0 / dt, sub(gained, velocity))
+        put(way.slot_velocity[e, n], gained)
+        put(way.slot_acceleration[e, n], change)
+        put(way.slot_jerk[e, n], scale(1.0 / dt, sub(change, past)))
+        # the drones' controllers add the inertia of their share of the load, which these pulls hold already
+        share = rig.force[n, 2] / GRAVITY
+        put(way.pull[e, n], sub(vec(way.pull, e, n), scale(share, add(acceleration, change))))

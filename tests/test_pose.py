@@ -1,0 +1,247 @@
+"""Pose: its targets, the planned way to them, its reward, its success and what it observes."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+import pytest
+from conftest import floats, make, refusal, same, zeros
+
+import multilift_marl as ml
+from multilift_marl.control.scripted import make_scripted
+from multilift_marl.math3d import rotation_vector
+from multilift_marl.tasks.way import attitude_of, ease
+
+CALM = {"randomization.payload_mass": 0.0}
+
+
+def flown(vec, steps, script="formation"):
+    """Fly and yield after every step."""
+    policy = make_scripted(script, vec)
+    observation, _ = vec.reset(seed=0)
+    policy.reset()
+    for step in range(steps):
+        observation, _, terminated, truncated, info = vec.step(policy.act(observation))
+        yield step, info
+        if (over := terminated | truncated).any():
+            observation, _ = vec.reset(mask=over)
+
+
+def test_targets_are_drawn_from_the_documented_ranges():
+    vec = make("pose", num_envs=1000)
+    vec.reset(seed=0)
+    pose = vec.task.plan.pose
+    assert pose.shape == (1000, 4, 6)
+    assert np.abs(pose[..., :2]).max() <= 1 and pose[..., 2].min() >= 1 and pose[..., 2].max() <= 2
+    tilt = np.degrees(pose[:, 1:, 4:])
+    assert 44 < np.abs(tilt).max() <= 45 and (pose[:, 0, 4:] == 0).all()
+    assert 179 < np.degrees(np.abs(pose[..., 3])).max() <= 180
+    np.testing.assert_allclose(tilt.std(), 45 / np.sqrt(3), rtol=0.03)
+    easy = make("pose_easy", num_envs=200)
+    easy.reset(seed=0)
+    assert 19 < np.degrees(np.abs(easy.task.plan.pose[..., 4:])).max() <= 20
+
+
+def test_the_attitude_has_the_heading_and_tilt_that_were_drawn():
+    turned = np.reshape(attitude_of(0.7, 0.3, -0.4), (3, 3))
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
+    assert np.arctan2(-turned[0, 1], turned[1, 1]) == pytest.approx(0.7)
+    assert turned[2, 1] == pytest.approx(np.sin(0.3)) and -turned[2, 0] == pytest.approx(np.cos(0.3) * np.sin(-0.4))
+
+
+def test_a_new_target_comes_every_four_seconds_and_is_not_seen_before():
+    vec = make("pose", num_envs=2)
+    told = vec.observation_names.index("payload_error_0")
+    other = make("pose", num_envs=2)
+    seen = []
+    for step, _ in flown(vec, 450):
+        target = vec.task.goal.position.copy()
+        stage = step // 200  # the steps up to and at 4.00 s belong to the first
+        np.testing.assert_allclose(target, vec.task.plan.pose[:, 1 + stage, :3], atol=1e-12)
+        seen.append(vec._observation.copy())
+    other.reset(seed=0)
+    other.task.plan.pose[:, 2:, :5] += 0.1
+    for step in range(200):
+        other.step(zeros(other))
+        assert same(other._observation, seen[step])
+    other.step(zeros(other))
+    assert not same(other._observation[..., told], seen[200][..., told])
+
+
+def test_ease_is_smooth_from_rest_to_rest():
+    x = np.linspace(0, 1, 2001)
+    values = np.array([ease(t) for t in x])
+    assert values[0].tolist() == [0, 0, 0, 0]
+    np.testing.assert_allclose(values[-1], [1, 0, 0, 0], atol=1e-12)
+    for k in range(3):
+        np.testing.assert_allclose(np.gradient(values[:, k], x)[1:-1], values[1:-1, k + 1], atol=2e-3)
+
+
+def test_the_way_moves_as_its_velocities_say_and_ends_at_the_target():
+    vec = make("pose", num_envs=4)
+    vec.reset(seed=0)
+    task, dt = vec.task, vec.task.control_dt
+    lead, way, kept = task.planner(0, 4), task.way, []
+    for _ in range(1000):
+        lead()
+        kept.append([array.copy() for array in (
+            way.position, way.velocity, way.acceleration, way.jerk, way.slots, way.slot_velocity, way.slot_acceleration,
+            way.slot_jerk, way.rotation, way.angular_velocity,
+        )])  # fmt: skip
+    position, velocity, acceleration, jerk, slots, slot_v, slot_a, slot_j, rotation, spin = (
+        np.array(part) for part in zip(*kept, strict=True)
+    )
+    for lower, higher in ((position, velocity), (velocity, acceleration), (acceleration, jerk)):
+        np.testing.assert_allclose((lower[2:] - lower[:-2]) / (2 * dt), higher[1:-1], atol=0.02)
+    beside = slots - position[:, :, None]
+    for lower, higher in ((beside, slot_v), (slot_v, slot_a), (slot_a, slot_j)):
+        np.testing.assert_allclose(np.diff(lower, axis=0) / dt, higher[1:], atol=1e-6)
+    turned = np.einsum("teij,tekj->teik", rotation[2:], rotation[:-2])
+    for t in range(0, len(turned), 50):
+        for e in range(4):
+            rate = np.array(rotation_vector(floats(turned[t, e]))) / (2 * dt)
+            np.testing.assert_allclose(rate, spin[t + 1, e], atol=0.01)
+    np.testing.assert_allclose(way.position, task.goal.position, atol=1e-12)
+    np.testing.assert_allclose(way.rotation, task.goal.rotation, atol=1e-12)
+    np.testing.assert_allclose(way.slots, task.goal.slots, atol=1e-9)
+    for still in (way.velocity, way.angular_velocity, way.slot_velocity, way.slot_acceleration, way.slot_jerk):
+        assert (np.abs(still) < 1e-12).all()
+
+
+@pytest.mark.parametrize("num_drones", [3, 4])
+def test_pulls_of_the_way_give_the_payload_the_motion_of_the_way(num_drones):
+    vec = make("pose", num_envs=4, num_drones=num_drones)
+    vec.reset(seed=0)
+    task, system = vec.task, vec.world.system
+    lead, way = task.planner(0, 4), task.way
+    for _ in range(350):
+        before = way.angular_velocity.copy(), way.rotation.copy()
+        lead()
+    inertial = way.acceleration[:, None] + way.slot_acceleration
+    pull = way.pull + (system.drone_pull[:, 2] / 9.81)[None, :, None] * inertial
+    wanted = system.payload_mass * (way.acceleration + [0, 0, 9.81])
+    np.testing.assert_allclose(pull.sum(axis=1), wanted, atol=1e-8)
+    arms = np.einsum("eij,nj->eni", way.rotation, system.anchors)
+    moment = np.cross(arms, pull).sum(axis=1)
+    body = np.reshape(system.inertia_matrix, (3, 3))
+
+    def momentum(rotation, spin):
+        return np.einsum("eij,jk,elk,el->ei", rotation, body, rotation, spin)
+
+    change = (momentum(way.rotation, way.angular_velocity) - momentum(before[1], before[0])) / task.control_dt
+    np.testing.assert_allclose(moment, change, atol=0.01 * np.abs(change).max() + 1e-3)
+
+
+def test_slots_turn_about_the_payload_and_never_meet():
+    vec = make("pose", num_envs=64)
+    vec.reset(seed=0)
+    lead, least = vec.task.planner(0, 64), 9.0
+    for _ in range(3000):
+        lead()
+        slots = vec.task.way.slots
+        apart = np.linalg.norm(slots[:, :, None] - slots[:, None], axis=-1) + 9 * np.eye(4)
+        least = min(least, apart.min())
+    assert least > vec.world.system.min_separation
+
+
+def test_success_needs_the_last_second_of_every_target():
+    vec, good = make("pose_easy", num_envs=48, **{"task_options.success_distance": 0.03}), []
+    for step, info in flown(vec, 600, "formation"):
+        good.append((vec.task.errors.distance <= 0.03) & (vec.task.errors.angle <= np.radians(5)))
+        assert step == 599 or not info["success"].any()
+    good = np.array(good).reshape(3, 200, 48)
+    expected = good[:, 150:].all(axis=(0, 1))
+    assert 0 < expected.sum() < 48
+    assert same(info["success"], expected)
+
+
+def test_the_best_script_solves_nine_of_ten_easy_episodes():
+    for script in ("formation_integral", "payload_geometric"):
+        vec = make("pose_easy", num_envs=64)
+        for _, info in flown(vec, vec.max_steps, script):
+            assert not info["failure"].any()
+        assert info["success"].mean() >= 0.9
+
+
+def test_pose_pays_every_positive_weight_in_full_at_rest_at_the_goal():
+    vec, still = make("pose", num_envs=1), np.zeros((1, 4, 4))
+    vec.reset(seed=0)
+    state, goal = vec.world.state, vec.task.goal
+    state.payload_position[:], state.payload_rotation[:] = goal.position, goal.rotation
+    state.payload_velocity[:], state.payload_body_rates[:] = 0, 0
+    vec.task.check(0, 1, 0.0)
+    vec.task.scorer(0, 1, still, still)()
+    paid = dict(zip(vec.reward_terms, vec.task.terms[0], strict=True))
+    assert paid == pytest.approx({name: max(weight, 0.0) for name, weight in vec.task.REWARD.items()})
+
+
+def test_returns_rank_motors_off_holding_the_start_and_the_scripts():
+    def score(script="formation", off=False, **options):
+        vec = make("pose", num_envs=48, **{f"task_options.{key}": value for key, value in options.items()})
+        if off:
+            vec.pilot._gains = vec.pilot._gains._replace(thrust_min=0.0, thrust_max=0.0)
+            vec._bind()
+        policy, total, over = make_scripted(script, vec), np.zeros(48), np.zeros(48, bool)
+        observation, _ = vec.reset(seed=0)
+        for _ in range(vec.max_steps):
+            observation, reward, terminated, truncated, _ = vec.step(policy.act(observation))
+            total += np.where(over, 0, reward.mean(axis=1))
+            over |= terminated | truncated
+            if over.all():
+                break
+            if (terminated | truncated).any():
+                vec.reset(mask=terminated | truncated)
+        return total
+
+    still = {"target_seconds": 1e6, "way_seconds": 9e5}  # a way that hardly begins
+    off, hold, moved = score(off=True), score(**still), score(target_seconds=12.0)
+    formation, integral, geometric = (score(name) for name in ("formation", "formation_integral", "payload_geometric"))
+    assert off.mean() < 0.1 * hold.mean()
+    assert hold.mean() < 0.6 * moved.mean()
+    assert formation.mean() < integral.mean() < geometric.mean()
+
+
+def test_integrals_count_the_distance_from_the_way():
+    vec, total = make("pose", num_envs=4, **CALM), 0.0
+    for _ in flown(vec, 60):
+        total = np.clip(total + vec.task.dt * (vec.world.state.payload_position - vec.task.way.position), -0.5, 0.5)
+    np.testing.assert_allclose(vec.task.errors.position_integral, total, atol=1e-12)
+    assert vec.task.errors.distance.max() > 0.5 and np.abs(total).max() < 0.1
+
+
+def test_observations_tell_where_the_way_is_and_how_much_time_is_left():
+    vec = make("pose", num_envs=2)
+    for _ in flown(vec, 230):
+        pass
+    goal, way, names = vec.task.goal, vec.task.way, vec.observation_names
+    at = names.index("way_position_0")
+    c, s = goal.slot_frame[..., 0], goal.slot_frame[..., 1]
+    ahead = (way.position - goal.position)[:, None]
+    expected = np.stack([c * ahead[..., 0] + s * ahead[..., 1], c * ahead[..., 1] - s * ahead[..., 0]], axis=-1)
+    np.testing.assert_allclose(vec._observation[..., at : at + 2], expected, atol=1e-5)
+    assert names[-1] == "time_left_0"
+    np.testing.assert_allclose(vec._observation[..., -1], 1 - (230 - 200) / 200, atol=1e-6)
+    np.testing.assert_allclose(vec.state()[:, -1], vec._observation[:, 0, -1])
+
+
+@pytest.mark.parametrize("num_drones", [1, 2])
+def test_teams_that_cannot_hold_a_tilt_get_level_targets(num_drones):
+    vec = make("pose", num_envs=16, num_drones=num_drones)
+    vec.reset(seed=0)
+    assert (vec.task.plan.pose[..., 4:] == 0).all()
+    assert np.abs(vec.task.plan.pose[..., 3]).max() > pi / 2
+
+
+def test_a_point_payload_counts_as_turned_as_its_way_is():
+    vec = make("pose", num_envs=4, **{"payload.shape": "point"})
+    for _ in flown(vec, 200):
+        pass
+    assert vec.task.errors.angle.max() < 1e-9
+
+
+def test_impossible_options_are_refused():
+    assert "way_seconds=5 must not exceed" in refusal(ml.make_vec, "pose", **{"task_options.way_seconds": 5.0})
+    assert "lower one first" in refusal(ml.make_vec, "pose", **{"task_options.target_height": [2.0, 1.0]})
+    low = {"task_options.target_height": [0.1, 0.1]}
+    assert "can hold hardly any" in refusal(lambda: make("pose", num_envs=1, **low).reset())

@@ -1,0 +1,141 @@
+"""Pulls that exert a wrench: balance, least change, lower bounds, by closed forms; targets that teams can hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import floats, make_system
+
+from multilift_marl.control.formation import Goal, Rig, place_formation
+from multilift_marl.control.pulls import BALANCED, place_balanced, solve_pulls
+from multilift_marl.math3d import axis_angle, matmul, rot_z
+from multilift_marl.tasks.starts import make_hanging
+
+LEVEL = floats(np.eye(3))
+SQUARE = np.array([[0.3, 0.2, 0.1], [-0.3, 0.2, 0.1], [-0.3, -0.2, 0.1], [0.3, -0.2, 0.1]])
+OUTWARD = np.array([[1.0, 1.0, 3.0], [-1.0, 1.0, 3.0], [-1.0, -1.0, 3.0], [1.0, -1.0, 3.0]])
+
+
+def solve(force, moment, given, anchors=SQUARE, attitude=LEVEL, least=-np.inf) -> tuple[np.ndarray, float]:
+    """Return the pulls (N, 3) and the imbalance."""
+    pull = np.array(given, float)
+    left = solve_pulls(floats(force), floats(moment), attitude, anchors, least, pull)
+    return pull, left
+
+
+def balance_matrix(anchors: np.ndarray) -> np.ndarray:
+    """Return G (6, 3 N) with (F, M) = G f."""
+    blocks = [np.vstack([np.eye(3), [[0, -z, y], [z, 0, -x], [-y, x, 0]]]) for x, y, z in anchors]
+    return np.concatenate(blocks, axis=1)
+
+
+def test_pulls_that_already_balance_stay_as_they_are():
+    pull, left = solve([0, 0, 12], [0, 0, 0], OUTWARD)
+    np.testing.assert_allclose(pull, OUTWARD, atol=1e-12)
+    assert left < 1e-9
+
+
+def test_without_bounds_the_change_is_the_pseudo_inverses():
+    rng = np.random.default_rng(0)
+    turn = np.reshape(axis_angle((0.6, 0.0, 0.8), 0.7), (3, 3))
+    wrench, matrix = rng.normal(size=6) + [0, 0, 12, 0, 0, 0], balance_matrix(SQUARE @ turn.T)
+    pull, left = solve(wrench[:3], wrench[3:], OUTWARD, attitude=floats(turn))
+    expected = OUTWARD.ravel() + np.linalg.pinv(matrix) @ (wrench - matrix @ OUTWARD.ravel())
+    np.testing.assert_allclose(pull.ravel(), expected, atol=1e-9)
+    assert left < 1e-9
+
+
+def test_a_moment_shifts_pull_from_one_side_to_the_other():
+    pull, _ = solve([0, 0, 12], [0.8, 0, 0], [[0, 0, 3.0]] * 4, anchors=SQUARE * [1, 1, 0])
+    np.testing.assert_allclose(pull[:, 2], 3 + 0.8 / (4 * 0.2) * np.sign(SQUARE[:, 1]), atol=1e-9)
+    np.testing.assert_allclose(pull[:, :2], 0, atol=1e-9)
+
+
+def test_bounded_pulls_meet_the_conditions_of_a_minimum():
+    rng, met = np.random.default_rng(1), 0
+    direction = OUTWARD / np.linalg.norm(OUTWARD, axis=1, keepdims=True)
+    bound = 0.5 * np.linalg.norm(OUTWARD, axis=1)
+    for _ in range(200):
+        wrench = rng.normal(size=6) * [2, 2, 2, 0.5, 0.5, 0.5] + [0, 0, 12, 0, 0, 0]
+        pull, left = solve(wrench[:3], wrench[3:], OUTWARD, least=0.5)
+        if left > 1e-9:
+            continue  # these cables cannot exert it
+        spare = (direction * pull).sum(axis=1) - bound
+        assert spare.min() > -1e-9
+        tight = spare < 1e-7
+        met += tight.any()
+        # f - n = Gᵀ(λ, μ) + a u, with a ≥ 0 where the bound is met and 0 elsewhere
+        columns = [balance_matrix(SQUARE).T]
+        for i in np.flatnonzero(tight):
+            column = np.zeros((4, 3))
+            column[i] = direction[i]
+            columns.append(column.reshape(-1, 1))
+        multipliers, *_ = np.linalg.lstsq(np.hstack(columns), (pull - OUTWARD).ravel(), rcond=None)
+        np.testing.assert_allclose(np.hstack(columns) @ multipliers, (pull - OUTWARD).ravel(), atol=1e-7)
+        assert (multipliers[6:] > -1e-7).all()
+    assert met > 20
+
+
+def test_what_cables_cannot_exert_is_left_over_and_does_no_harm():
+    line = np.array([[0.3, 0, 0], [-0.3, 0, 0]])
+    pull, left = solve([0, 0, 6], [0.5, 0.6, 0], [[0, 0, 3.0]] * 2, anchors=line)
+    np.testing.assert_allclose(pull, [[0, 0, 2.0], [0, 0, 4.0]], atol=1e-5)
+    assert left == pytest.approx(0.5, abs=1e-5)
+
+
+def test_one_cable_pulls_a_point_as_told():
+    pull, left = solve([1, -2, 9], [0, 0, 0], [[0, 0, 9.0]], anchors=np.zeros((1, 3)))
+    np.testing.assert_allclose(pull, [[1, -2, 9]], atol=1e-6)
+    assert left < 1e-6
+
+
+def placed(system, yaw: float, roll: float, place) -> Goal:
+    goal, rig = (
+        Goal.zeros(1, system.num_drones),
+        Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull),
+    )
+    goal.position[0] = [0.3, -0.2, 1.5]
+    goal.rotation[0] = np.reshape(matmul(rot_z(yaw), axis_angle((1.0, 0.0, 0.0), roll)), (3, 3))
+    place(goal, rig)
+    return goal
+
+
+@pytest.mark.parametrize("model", ["massless", "chain"])
+@pytest.mark.parametrize("num_drones", [1, 2, 3, 4, 6])
+def test_level_targets_are_those_of_the_formation_bit_for_bit(num_drones, model):
+    system = make_system(num_drones, **{"cable.model": model})
+    hanging = make_hanging(system)
+    ours = placed(system, 0.7, 0.0, lambda goal, rig: place_balanced(0, goal, rig, hanging))
+    plain = placed(system, 0.7, 0.0, lambda goal, rig: place_formation(0, goal, rig))
+    for mine, theirs in zip(ours, plain, strict=True):
+        assert mine.tobytes() == theirs.tobytes()
+
+
+@pytest.mark.parametrize("model", ["massless", "chain"])
+@pytest.mark.parametrize("num_drones", [3, 4, 6])
+@pytest.mark.parametrize("roll", [0.3, -0.7])
+def test_a_tilted_payload_is_balanced_and_slots_lie_along_the_pulls(num_drones, model, roll):
+    system, held = make_system(num_drones, **{"cable.model": model}), []
+    hanging = make_hanging(system)
+    goal = placed(system, 2.0, roll, lambda goal, rig: held.append(place_balanced(0, goal, rig, hanging)))
+    pull = goal.pull[0] - [[0, 0, w] for w in hanging.weight]
+    weight = 9.81 * system.payload_mass
+    arms = system.anchors @ goal.rotation[0].T
+    assert held == [True]
+    np.testing.assert_allclose(pull.sum(axis=0), [0, 0, weight], atol=BALANCED * weight)
+    np.testing.assert_allclose(np.cross(arms, pull).sum(axis=0), 0, atol=BALANCED * weight)
+    assert np.linalg.norm(pull, axis=1).min() > 0.2 * np.linalg.norm(system.formation_force, axis=1).min()
+    cables = goal.slots[0] - goal.position[0] - arms
+    if model == "massless":
+        size = np.linalg.norm(pull, axis=1, keepdims=True)
+        np.testing.assert_allclose(cables, (system.cable_length[:, None] + size / 1e5) * pull / size, atol=1e-9)
+    else:
+        np.testing.assert_allclose(np.linalg.norm(cables, axis=1), system.cable_length, rtol=1e-3)
+
+
+@pytest.mark.parametrize("num_drones", [1, 2])
+def test_one_or_two_cables_cannot_hold_a_tilted_box(num_drones):
+    system, held = make_system(num_drones), []
+    hanging = make_hanging(system)
+    placed(system, 0.0, 0.3, lambda goal, rig: held.append(place_balanced(0, goal, rig, hanging)))
+    assert held == [False]
