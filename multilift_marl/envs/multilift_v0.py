@@ -26,7 +26,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
 
     Args:
         config: what to build; it is stepped alone, whatever `env.num_envs` says.
-        render_mode: None, or "rgb_array" for `render`.
+        render_mode: None, "rgb_array" for `render`, or "human" for a window that shows every step.
 
     Attributes:
         vec: the batched core underneath, of one environment.
@@ -75,6 +75,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         options = {name: value for name, value in (options or {}).items() if name != "options"}  # of PettingZoo's test
         observation, info = self.vec.reset(seed, options=options)
         self.agents = self.possible_agents.copy()
+        self._pictures.show()
         return dict(zip(self.agents, observation[0], strict=True)), self._infos(info)
 
     def step(
@@ -113,6 +114,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         over, out_of_time = bool(terminated[0]), bool(truncated[0])
         if over or out_of_time:
             self.agents = []
+        self._pictures.show()
         return (
             dict(zip(agents, observation[0], strict=True)),
             dict(zip(agents, reward[0].tolist(), strict=True)),
@@ -133,8 +135,8 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         """Return the space of an agent's actions, the same object on every call."""
         return self.action_spaces[agent]
 
-    def render(self) -> np.ndarray:
-        """Return a picture (H, W, 3) uint8 of the team and its target.
+    def render(self) -> np.ndarray | None:
+        """Return a picture (H, W, 3) uint8 of the team and its target; None with "human", which shows every step.
 
         Raises:
             RuntimeError: there is no `render_mode`, or no episode was ever started.
@@ -143,7 +145,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         return self._pictures.frame()
 
     def close(self) -> None:
-        """Free the renderer; the environment itself holds nothing that must be closed."""
+        """Free renderer and window; the environment itself holds nothing that must be closed."""
         self._pictures.close()
 
     def __reduce__(self) -> tuple[type[MultiliftParallelEnv], tuple[Config, str | None]]:
@@ -173,7 +175,7 @@ def parallel_env(
         task: a configuration's name, the path of one, or a Config.
         num_drones: N; None for the configured value, likewise the next.
         seed: of the first reset.
-        render_mode: None or "rgb_array".
+        render_mode: None, "rgb_array" or "human".
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
 
     Raises:

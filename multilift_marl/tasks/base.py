@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,17 @@ from multilift_marl.tasks.terms import Errors, measure
 Look = tuple[Any, tuple]  # a kernel and its arguments
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
 INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
+
+
+class Box(NamedTuple):
+    """A box to look at."""
+
+    size: tuple[float, float, float]
+    """Half its edges [m]."""
+    position: tuple[float, float, float]
+    """Of its middle [m]."""
+    rgba: tuple[float, float, float, float]
+    """Colour and opacity, 0 to 1."""
 
 
 @kernel
@@ -139,6 +150,14 @@ class Task:
         self.start(env, rng, float(parameters.payload_mass[env]))
         self.hanging = self.nominal_hanging
         return self.begin(env)
+
+    def route(self, env: int) -> np.ndarray:
+        """Return points (P, 3) of the way that the target takes in this episode, to draw it; none if it stays."""
+        return np.zeros((0, 3))
+
+    def scenery(self, env: int) -> list[Box]:
+        """Return what stands around in environment `env`, to draw it; what may be touched is `failures`' business."""
+        return []
 
     def begin(self, env: int) -> bool:
         """Reset the measurements of one environment to its drawn start; return whether that start is sound."""

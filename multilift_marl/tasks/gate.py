@@ -15,7 +15,7 @@ from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import add, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, turn, vec
 from multilift_marl.sim.scene import drone_half_size
 from multilift_marl.sim.world import World
-from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.base import Box, Task
 from multilift_marl.tasks.failures import WALL
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.paths import STEP, differences, set_goal
@@ -23,6 +23,7 @@ from multilift_marl.tasks.starts import hang_team, in_ball
 from multilift_marl.tasks.terms import mean_change, tolerance
 
 THICKNESS = 0.1  # [m] of the walls
+_WALL = (0.62, 0.52, 0.45, 1.0)  # colour
 
 
 class GateOptions(Section):
@@ -133,15 +134,15 @@ class Gate(Task):
         """Close to the goal throughout the last moments."""
         return self.good_time >= self.options.success_seconds - 1e-9
 
-    def scenery(self, env: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the walls as boxes: half edges (3,) and centre (3,) [m]."""
+    def scenery(self, env: int) -> list[Box]:
+        """Return the walls; see `Task.scenery`."""
         half, gap, top = 2.5, self.gates.half_width, self.gates.gap_height
         boxes = []
         for x, y in zip(self.gates.x, self.gap_y[env], strict=True):
             for side in (-1, 1):
-                boxes.append(([THICKNESS / 2, half / 2, top / 2], [x, y + side * (gap + half / 2), top / 2]))
-            boxes.append(([THICKNESS / 2, half + gap, 0.25], [x, y, top + 0.25]))
-        return [(np.array(size), np.array(place)) for size, place in boxes]
+                boxes.append(Box((THICKNESS / 2, half / 2, top / 2), (x, y + side * (gap + half / 2), top / 2), _WALL))
+            boxes.append(Box((THICKNESS / 2, half + gap, 0.25), (x, y, top + 0.25), _WALL))
+        return boxes
 
 
 @kernel
