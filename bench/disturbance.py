@@ -46,7 +46,7 @@ class Flight:
         self.system, self.dt, self.kind = config.system, 1 / config.sim.control_hz, config.control.disturbance
         e, n = len(mass), self.system.num_drones
         self.world, self.reference = World(self.system, e, 1), Reference.zeros(e, n)
-        self.world.set_payload_mass(np.ones(e, bool), mass * self.system.payload_mass)
+        self.world.set_parameters(np.ones(e, bool), payload_mass=mass * self.system.payload_mass)
         self.gains = make_gains(config.control, self.system)
         self.pull = np.broadcast_to(self.system.drone_pull, (e, n, 3)).copy()
         self.slots = self.system.slots + [0, 0, REST_HEIGHT]

@@ -15,7 +15,7 @@ kernel = njit(cache=True, nogil=True, error_model="numpy")
 many environments are computed together."""
 
 
-_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering.py", "__init__.py")
+_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "__init__.py")
 
 
 def bind(function: Any, *arguments: Any) -> Callable[[], None]:

@@ -21,7 +21,7 @@ NUM_DRONES = (1, 2, 3, 6)
 GRAVITY = 9.81
 TIMESTEPS = (5e-4, 1e-3, 2e-3, 4e-3)
 OFF_CENTRE = [[0.25, 0.2, 0.08], [-0.3, 0.2, 0.08], [-0.3, -0.2, 0.08], [0.25, -0.2, 0.08]]
-INFO = {"success", "failure", "diverged", "failure_cause", "reward_terms"}
+INFO = {"success", "failure", "diverged", "failure_cause", "reward_terms", "randomization"}
 JARGON = ("Input ", "Value error", "Field required", "Tuple ", "instance of", "\n", ". ", "  ", "Errno")
 SMALL = {
     "env.num_envs": 8, "env.num_threads": 1, "env.episode_seconds": 0.5, "train.horizon": 16, "train.frames": 1280,

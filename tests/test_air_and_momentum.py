@@ -68,7 +68,7 @@ def test_a_falling_payload_approaches_its_terminal_speed():
 @pytest.mark.parametrize("force", [[1.5, 0, 0], [0, -1, 2.0], [1e-3, 0, 0]])
 def test_force_on_a_free_payload_accelerates_it(force):
     world = free_world(num_envs=2)
-    world.set_payload_mass(mask(2, 1), np.array([0, 0.7]))
+    world.set_parameters(mask(2, 1), payload_mass=np.array([0, 0.7]))
     world.plant.payload_force[:] = force
     world.step(weightless(world), 25)
     expected = 0.1 * (np.array(force) / np.array([[0.35], [0.7]]) - [0, 0, GRAVITY])
@@ -86,7 +86,7 @@ def test_force_on_a_carried_payload_accelerates_the_whole_team(num_drones, force
 @pytest.mark.parametrize("shape", ["box", "point"])
 def test_momentum_changes_by_the_impulse_of_thrust_and_weight(num_drones, shape):
     world = World(without_drag(make_system(num_drones, **{"payload.shape": shape})), 2, 1)
-    world.set_payload_mass(mask(2, 1), np.full(2, 1.2 * world.system.payload_mass))
+    world.set_parameters(mask(2, 1), payload_mass=np.full(2, 1.2 * world.system.payload_mass))
     system, vehicle, rng = world.system, world.system.vehicle, np.random.default_rng(0)
     weight = (world.plant.payload_mass + num_drones * vehicle.mass)[:, None] * [0, 0, -GRAVITY]
     linear, angular = (momentum.copy() for momentum in momenta(world))

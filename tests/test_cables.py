@@ -57,7 +57,7 @@ def test_the_formation_stays_at_rest_under_equilibrium_thrust(num_drones, overri
 def test_static_stretch_is_the_load_over_the_stiffness_for_any_mass(timestep):
     world = World(without_drag(make_system(1, **{"sim.timestep": timestep})), 5, 1)
     mass = np.array([0.1, 0.2, 0.35, 0.7, 1.0])
-    world.set_payload_mass(np.ones(5, bool), mass)
+    world.set_parameters(np.ones(5, bool), payload_mass=mass)
     thrust = np.broadcast_to((mass[:, None, None] + world.system.vehicle.mass) * GRAVITY / 4, (5, 1, 4))
     world.step(thrust, round(1.0 / timestep))
     np.testing.assert_allclose(stretch(world)[:, 0], mass * GRAVITY / 1e5, rtol=1e-4)
@@ -75,7 +75,7 @@ def test_changing_the_mass_and_back_leaves_no_trace():
     system, everyone = make_system(4), np.ones(2, bool)
     changed, untouched = World(system, 2, 1), World(system, 2, 1)
     for factor in (1.2, 0.8, 1.0):
-        changed.set_payload_mass(everyone, np.full(2, factor * system.payload_mass))
+        changed.set_parameters(everyone, payload_mass=np.full(2, factor * system.payload_mass))
     for world in (changed, untouched):
         world.step(1.02 * hover_thrust(world), 100)
     assert same(changed.state_dict(), untouched.state_dict())

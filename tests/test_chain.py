@@ -72,7 +72,7 @@ def test_the_formation_hangs_as_statics_says(num_drones, shape, timestep):
 def test_a_changed_payload_stretches_the_cable_by_its_weight_and_the_ropes(timestep):
     world = make_world(1, 5, drag=False, sim__timestep=timestep, cable__density=0.05, cable__segments=5)
     mass = np.array([0.1, 0.2, 0.35, 0.7, 1.0])
-    world.set_payload_mass(np.ones(5, bool), mass)
+    world.set_parameters(np.ones(5, bool), payload_mass=mass)
     thrust = (mass[:, None, None] + world.system.vehicle.mass + 0.05) * GRAVITY / 4
     world.step(np.broadcast_to(thrust, (5, 1, 4)), round(1.0 / timestep))
     expected = (mass * GRAVITY + 2 * 0.01 * GRAVITY) / 1e5  # on average a segment carries two of the five nodes

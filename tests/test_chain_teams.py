@@ -77,7 +77,7 @@ def test_a_mass_changed_in_flight_counts_from_the_next_step():
     world, other = make_world(3, 2), make_world(3, 2)
     thrust = hover_thrust(world)
     world.step(thrust, 10)
-    world.set_payload_mass(mask(2, 1), np.full(2, 1.3))
+    world.set_parameters(mask(2, 1), payload_mass=np.full(2, 1.3))
     other.load_state_dict(world.state_dict())
     for each in (world, other):
         each.step(thrust, 10)

@@ -14,7 +14,8 @@ def play(vec: MultiliftVec, steps: int, row: int, first_step: int = 0) -> tuple[
     for step in range(first_step, first_step + steps):
         observation, reward, terminated, truncated, info = vec.step(bold_actions(vec, step, vec.first_env))
         terms = {name: values[row] for name, values in info["reward_terms"].items()}
-        told = [info[name][row] for name in sorted(INFO - {"reward_terms"})]
+        told = [info[name][row] for name in sorted(INFO - {"reward_terms", "randomization"})]
+        told += [values[row] for values in info["randomization"].values()]
         shown.append([observation[row], reward[row], terminated[row], truncated[row], vec.state()[row], terms, told])
         ended = terminated | truncated
         if ended.any():

@@ -190,6 +190,18 @@ def test_command_films_the_first_episode(run, tmp_path):
     assert len(frames) == 10 and frames.std() > 10
 
 
+def test_command_films_from_the_camera_asked_for(run, tmp_path, monkeypatch):
+    from multilift_marl import rendering
+
+    asked = []
+    plain = rendering.Renderer
+    monkeypatch.setattr(rendering, "Renderer", lambda vec, **how: asked.append(how) or plain(vec, 64, 36, **how))
+    settings = ["episodes=1", "video=true", "baseline=none", "env.episode_seconds=0.1", f"out={tmp_path}"]
+    assert evaluate([f"run={run}", *settings]) == 0
+    assert evaluate([f"run={run}", *settings, "camera=chase", "trail=0.5"]) == 0
+    assert asked == [{"camera": "side", "trail": 2.0}, {"camera": "chase", "trail": 0.5}]
+
+
 def test_without_graphics_evaluation_goes_on(run, tmp_path, monkeypatch, capsys):
     from multilift_marl import rendering
     from multilift_marl.errors import RenderingError
@@ -210,6 +222,9 @@ def test_without_graphics_evaluation_goes_on(run, tmp_path, monkeypatch, capsys)
         ("episodes=0", "episodes must be a whole number, at least 1, but is 0"),
         ("episodes=many", "episodes must be a whole number, at least 1, but is 'many'"),
         ("video=perhaps", "video must be true or false, but is 'perhaps'"),
+        ("camera=sid", "unknown camera 'sid'; did you mean 'side'?"),
+        ("trail=long", "trail must be a number of seconds from 0 to 1000, but is 'long'"),
+        ("trail=-1", "trail must be a number of seconds from 0 to 1000, but is -1"),
         ("checkpoint=none.pt", "no checkpoint none.pt"),
         ("control.action=ctbr", "was trained with control.action=reference and cannot fly control.action=ctbr"),
         ("payload.mas=1", "unknown key 'payload.mas'; did you mean 'mass'?"),

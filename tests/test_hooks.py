@@ -94,7 +94,7 @@ def test_a_drone_on_a_taut_cable_swings_about_its_hook_as_theory_says(model, axi
         overrides |= {"cable.model": "chain", "cable.segments": 2, "cable.density": 1e-5}
     system = make_system(1, **overrides, **{"payload.drag_area": 0.0, "vehicle.drag": [0.0, 0.0, 0.0]})
     world, vehicle, thrust = World(system, 1, 1), system.vehicle, 8.0
-    world.set_payload_mass(mask(1, 0), np.array([1e4]))
+    world.set_parameters(mask(1, 0), payload_mass=np.array([1e4]))
     state, tilt = world.state, 0.02
     state.payload_position[0], state.payload_rotation[0] = [0, 0, 100.0], np.eye(3)
     state.drone_rotation[0, 0] = np.reshape(axis_angle(floats(np.eye(3)[axis]), tilt), (3, 3))

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 import multilift_marl as ml
+from multilift_marl.config.schema import RandomizationConfig
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.failures import CAUSES
 from multilift_marl.tasks.observations import OBSERVATION
@@ -105,6 +106,11 @@ def test_documents_name_everything_about_a_task(task):
         assert f"`{cause}`" in common, cause
 
 
+def test_the_table_of_hidden_parameters_is_complete():
+    text = (ROOT / "docs" / "randomization.md").read_text()
+    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(RandomizationConfig.model_fields)
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_and_files_of_documents_exist(document):
     for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
@@ -148,7 +154,7 @@ def test_commands_of_documents_run_in_order(tmp_path):
             command = re.sub(r"episodes=\d+", "episodes=2", command) + " env.episode_seconds=0.4"
         if script.startswith("examples/"):
             command += " 1"  # iteration
-        if script == "bench/bench.py":
+        if script in ("bench/bench.py", "bench/randomization.py"):
             command += " repeats=1 seconds=0.05 env.num_envs=4"
         if script == "bench/disturbance.py":
             command = command.split(" rigs=")[0].replace("seconds=30", "") + " rigs=report4 seconds=0.05"

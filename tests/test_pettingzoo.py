@@ -233,8 +233,8 @@ def test_pettingzoo_without_a_registry_is_left_alone(monkeypatch):
 
 
 def test_rendering_must_be_asked_for():
-    with pytest.raises(ValueError, match="unknown render_mode 'human'; known: rgb_array"):
-        parallel_env(render_mode="human")
+    with pytest.raises(ValueError, match="unknown render_mode 'ascii'; known: human, rgb_array"):
+        parallel_env(render_mode="ascii")
     env = parallel_env()
     env.reset()
     with pytest.raises(RuntimeError, match='render_mode="rgb_array"'):

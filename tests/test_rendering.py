@@ -11,15 +11,13 @@ import pytest
 from conftest import make, make_system, same
 
 import multilift_marl as ml
-from multilift_marl import rendering
 from multilift_marl.errors import RenderingError
-from multilift_marl.rendering import Renderer, write_video
+from multilift_marl.rendering import CAMERAS, Renderer, opengl, write_video
 from multilift_marl.sim.scene import build_model
 
 needs_gl = pytest.mark.skipif(
     not (ctypes.util.find_library("EGL") or ctypes.util.find_library("OSMesa")), reason="no OpenGL on this machine"
 )
-CAMERAS = ("side", "top")
 
 
 def picture(vec, env=0, **keywords):
@@ -189,7 +187,7 @@ def test_opengl_that_does_not_work_is_named_with_its_cure(monkeypatch, chosen, m
     if chosen is not None:
         monkeypatch.setenv("MUJOCO_GL", chosen)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
-    monkeypatch.setattr(rendering.importlib, "import_module", broken)
+    monkeypatch.setattr(opengl.importlib, "import_module", broken)
     with pytest.raises(RenderingError, match=message):
         Renderer(make(num_envs=1))
 

@@ -106,7 +106,7 @@ def test_the_team_of_a_known_payload_lifts_it_with_no_jerk_at_its_cables():
 def test_the_pull_suits_lighter_and_heavier_payloads(factor):
     vec = make("takeoff", num_envs=4, **CALM, **{"task_options.success_distance": 0.1})
     vec.reset(seed=0)
-    vec.world.set_payload_mass(np.ones(4, bool), np.full(4, factor * vec.world.system.payload_mass))
+    vec.world.set_parameters(np.ones(4, bool), payload_mass=np.full(4, factor * vec.world.system.payload_mass))
     for _ in range(vec.max_steps):
         *_, info = vec.step(zeros(vec))
     assert info["success"].all()

@@ -27,7 +27,7 @@ def fly(world: World, steps: int = 60, seed: int = 0, first: int = 0) -> dict[st
 
 def disturb(world: World) -> None:
     everyone = np.arange(world.num_envs)
-    world.set_payload_mass(everyone > 0, world.system.payload_mass * (1 + 0.05 * everyone))
+    world.set_parameters(everyone > 0, payload_mass=world.system.payload_mass * (1 + 0.05 * everyone))
     world.plant.payload_force[:, 0] = 0.3 * everyone
 
 
@@ -47,7 +47,7 @@ def test_the_number_of_threads_changes_no_bit(num_drones, num_threads):
 def test_an_environment_does_not_feel_its_neighbours():
     system = make_system(4)
     alone, crowd = World(system, 1, 1), World(system, 5, 2)
-    crowd.set_payload_mass(mask(5, 2, 3), np.full(5, 1.6))
+    crowd.set_parameters(mask(5, 2, 3), payload_mass=np.full(5, 1.6))
     crowd.plant.payload_force[4] = [0, 1, 0]
     assert same(rows(fly(crowd), [0]), fly(alone))
 
@@ -125,7 +125,7 @@ def test_thrust_of_wrong_shape_is_refused(shape):
 def test_impossible_payload_mass_is_refused(mass):
     world = World(make_system(2), 2, 1)
     with pytest.raises(ValueError, match="mass"):
-        world.set_payload_mass(mask(2, 1), np.array([1.0, mass]))
+        world.set_parameters(mask(2, 1), payload_mass=np.array([1.0, mass]))
 
 
 @pytest.mark.parametrize("force", [1e5, 1e30, np.nan])

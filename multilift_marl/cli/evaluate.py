@@ -17,6 +17,7 @@ from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError, nearest
 from multilift_marl.evaluation.report import format_table, make_report, write_report
 from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
+from multilift_marl.rendering import CAMERAS
 
 _USAGE = """Judge a team on fixed seeds, beside the scripted ones on the same episodes.
 
@@ -31,13 +32,15 @@ _USAGE = """Judge a team on fixed seeds, beside the scripted ones on the same ep
   seed        evaluation seed: episode i is the same for every policy                         (1000)
   baseline    script in the plots beside the policy; none: fly the policy alone               (formation_integral)
   video       true: also an mp4 of the first episode                                          (false)
+  camera      of the video: side, top or chase                                                (side)
+  trail       seconds of flight that drones and payload draw behind them in the video         (2)
   out         folder for metrics.json, plots and video      (<run>/eval/<time>, of a script runs/<policy>-<config>/…)
 
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
 
 _DEFAULTS = {
     "run": "latest", "policy": None, "config": None, "checkpoint": "best", "episodes": 200, "seed": 1000,
-    "baseline": "formation_integral", "video": False, "out": None,
+    "baseline": "formation_integral", "video": False, "camera": "side", "trail": 2.0, "out": None,
 }  # fmt: skip
 
 
@@ -124,6 +127,10 @@ def _check(own: dict[str, Any]) -> None:
         raise ConfigError(f"unknown baseline '{own['baseline']}'{nearest(str(own['baseline']), [*SCRIPTED, 'none'])}")
     if not isinstance(own["video"], bool):
         raise ConfigError(f"video must be true or false, but is {own['video']!r}")
+    if own["camera"] not in CAMERAS:
+        raise ConfigError(f"unknown camera '{own['camera']}'{nearest(str(own['camera']), CAMERAS)}")
+    if isinstance(own["trail"], bool) or not isinstance(own["trail"], int | float) or not 0 <= own["trail"] < 1e3:
+        raise ConfigError(f"trail must be a number of seconds from 0 to 1000, but is {own['trail']!r}")
 
 
 def _check_interfaces(flown: _Flown, config: Config, baseline: str) -> None:
@@ -176,12 +183,12 @@ def _draw(config: Config, makers: dict[str, Any], flown: _Flown, own: dict[str, 
     print(f"wrote plots in {out}")
     if own["video"]:
         try:
-            _film(config, flown.make, own["seed"], out / "episode_0.mp4")
+            _film(config, flown.make, own, out / "episode_0.mp4")
         except RenderingError as error:
             print(f"no video: {error}", file=sys.stderr)
 
 
-def _film(config: Config, maker: Any, seed: int, path: Path) -> None:
+def _film(config: Config, maker: Any, own: dict[str, Any], path: Path) -> None:
     """Film the first episode, every other policy step."""
     from multilift_marl import rendering
 
@@ -190,13 +197,13 @@ def _film(config: Config, maker: Any, seed: int, path: Path) -> None:
 
         def shoot(vec: Any) -> None:
             if not tools:
-                tools.append(stack.enter_context(rendering.Renderer(vec)))
+                tools.append(stack.enter_context(rendering.Renderer(vec, camera=own["camera"], trail=own["trail"])))
                 tools.append(stack.enter_context(rendering.VideoWriter(path, config.env.policy_hz / 2)))
             renderer, video = tools
             if vec.steps[0] % 2 == 0:
                 video.append(renderer.frame())
 
-        trace_episode(config, maker, 0, seed, shoot)
+        trace_episode(config, maker, 0, own["seed"], shoot)
     print(f"wrote {path}")
 
 

@@ -9,16 +9,18 @@ import numpy as np
 from multilift_marl.config.teams import check_rotors, describe_team
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import thrust_frame
 
 if TYPE_CHECKING:
+    from multilift_marl.config.schema import RandomizationConfig
     from multilift_marl.config.system import System
 
 MIN_THRUST_TO_WEIGHT = 1.18
 
 
-def check_possible(system: System, heaviest: float) -> None:
-    """Refuse what cannot fly, hovering under a payload `heaviest` times its nominal mass included."""
-    n, vehicles = system.num_drones, system.vehicles
+def check_possible(system: System, ranges: RandomizationConfig) -> None:
+    """Refuse what cannot fly, the heaviest payload and the heaviest and weakest drones included."""
+    n, vehicles, heaviest = system.num_drones, system.vehicles, 1 + ranges.payload_mass
     if system.air.wash or system.air.ground_effect:
         for vehicle in vehicles:
             check_rotors(vehicle)
@@ -30,16 +32,19 @@ def check_possible(system: System, heaviest: float) -> None:
             f"{lifted}, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
         )
     rope = system.drone_pull - system.formation_force
-    own = GRAVITY * system.drone_mass[:, None] * [0, 0, 1]
+    own = (1 + ranges.vehicle_mass) * GRAVITY * system.drone_mass[:, None] * [0, 0, 1]
     hover = np.linalg.norm(heaviest * system.formation_force + rope + own, axis=1)
+    thrust *= 1 - ranges.vehicle_thrust_coefficient
     if np.any(hover > thrust):
         i = int(np.argmax(hover - thrust))
+        varied = ranges.vehicle_mass or ranges.vehicle_thrust_coefficient
+        cure = "randomization.vehicle_mass, randomization.vehicle_thrust_coefficient, " if varied else ""
         raise ConfigError(
             f"drone {i} would need {hover[i]:.1f} N of its {thrust[i]:.1f} N to hover under the heaviest payload; "
-            "lower payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
+            f"lower {cure}payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
         )
     if system.hooks.any():
-        _check_hooks(system, heaviest)
+        _check_hooks(system, ranges)
     tight = heaviest * system.resting_tension
     if np.any(tight >= system.breaking_load):
         i = int(np.argmax(tight - system.breaking_load))
@@ -58,16 +63,20 @@ def check_possible(system: System, heaviest: float) -> None:
             )
 
 
-def _check_hooks(system: System, heaviest: float) -> None:
+def _check_hooks(system: System, ranges: RandomizationConfig) -> None:
     """Refuse hooks so far from a drone's centre that its rotors could not hold their moment."""
+    heaviest, weakest = 1 + ranges.payload_mass, 1 - ranges.vehicle_thrust_coefficient
     pulls = heaviest * system.formation_force + system.drone_pull - system.formation_force
-    for i, (vehicle, rotation) in enumerate(zip(system.vehicles, system.resting_rotation, strict=True)):
-        own = rotation.T @ (pulls[i] + [0, 0, vehicle.mass * GRAVITY])
-        rotors = np.linalg.solve(vehicle.allocation, [own[2], *np.cross(system.hooks[i], rotation.T @ pulls[i])])
+    for i, vehicle in enumerate(system.vehicles):
+        force = pulls[i] + [0, 0, (1 + ranges.vehicle_mass) * vehicle.mass * GRAVITY]
+        pull = np.reshape(thrust_frame(tuple(force), 0.0), (3, 3)).T @ pulls[i]
+        wrench = [np.linalg.norm(force), *np.cross(system.hooks[i], pull)]
+        rotors = np.linalg.solve(vehicle.allocation, wrench)
         least = vehicle.thrust_coefficient * vehicle.rotor_speed_min**2
-        if rotors.min() < least or rotors.max() > vehicle.rotor_thrust_max:
+        most = weakest * vehicle.rotor_thrust_max
+        if rotors.min() < least or rotors.max() > most:
             raise ConfigError(
                 f"drone {i} would need {rotors.min():.2f} to {rotors.max():.2f} N of its rotors to hold the pull at "
                 f"cable.hook {system.hooks[i].tolist()}, but they give {least:.2f} to "
-                f"{vehicle.rotor_thrust_max:.2f} N; move the hook nearer to the centre of mass"
+                f"{most:.2f} N; move the hook nearer to the centre of mass"
             )

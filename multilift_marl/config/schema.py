@@ -47,6 +47,27 @@ PerDrone = Positive | tuple[Positive, ...]
 NotNegativePerDrone = NotNegative | tuple[NotNegative, ...]
 VectorPerDrone = Vector | tuple[Vector, ...]
 Links = Annotated[Int, Field(ge=2, le=100)]
+Share = Annotated[Float, Field(ge=0, lt=1)]
+
+
+def _level(value: Any) -> Any:
+    """Accept the named levels of the observations' imperfections."""
+    if isinstance(value, str) and value in (levels := {"none": 0.0, "standard": 1.0}):
+        return levels[value]
+    try:
+        return _real(value)
+    except ValueError:
+        raise ValueError("must be none, standard, or a factor on standard") from None
+
+
+def _range(value: Any) -> Any:
+    """Accept one whole number for a range of one."""
+    return value if isinstance(value, list | tuple) else (value, value)
+
+
+Level = Annotated[Float, Field(ge=0), BeforeValidator(_level)]
+Delay = Annotated[Int, Field(ge=0, le=50)]
+Delays = Annotated[tuple[Delay, Delay], BeforeValidator(_range)]
 
 
 class Section(BaseModel):
@@ -180,10 +201,26 @@ class ControlConfig(Section):
 
 
 class RandomizationConfig(Section):
-    """What each episode draws anew, always from the nominal values; hidden from the drones."""
+    """What each episode draws anew, always from the nominal values; hidden from the drones (docs/randomization.md)."""
 
-    payload_mass: Float = Field(0.0, ge=0, lt=1, description="[-] mass and inertia scaled by 1 ± this, uniform")
+    payload_mass: Share = Field(0.0, description="[-] mass and inertia scaled by 1 ± this, uniform")
+    payload_inertia: Share = Field(0.0, description="[-] inertia, beside that, scaled by 1 ± this, uniform")
+    payload_center_of_mass: tuple[NotNegative, NotNegative, NotNegative] = Field(
+        (0.0, 0.0, 0.0), description="[m] moved by ± this along each axis, uniform"
+    )
+    payload_drag: Share = Field(0.0, description="[-] drag of the payload scaled by 1 ± this, uniform")
     payload_force: Float = Field(0.0, ge=0, description="[N] constant horizontal force, magnitude uniform up to this")
+    cable_length: Share = Field(0.0, description="[-] length of each cable scaled by 1 ± this, uniform")
+    cable_stiffness: Share = Field(0.0, description="[-] stiffness of each cable, likewise")
+    vehicle_mass: Share = Field(0.0, description="[-] mass and inertia of each drone, likewise")
+    vehicle_thrust_coefficient: Share = Field(0.0, description="[-] of each drone's rotors, likewise")
+    vehicle_rotor_time_constant: Share = Field(0.0, description="[-] of each drone's rotors, up and down, likewise")
+    vehicle_drag: Share = Field(0.0, description="[-] drag of each drone, likewise")
+    wind: Float = Field(0.0, ge=0, description="[m/s] horizontal mean wind, beside wind.velocity, uniform up to this")
+    observation_noise: Level = Field(0.0, description="none, standard or a factor on it: white noise, each policy step")
+    observation_bias: Level = Field(0.0, description="none, standard or a factor on it: constant in an episode")
+    observation_delay: Delays = Field((0, 0), description="[policy steps] a number, or the range of a uniform draw")
+    action_delay: Delays = Field((0, 0), description="[policy steps] a number, or the range of a uniform draw")
 
 
 class WindConfig(Section):

@@ -26,7 +26,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import quat_to_mat, thrust_frame
 
 if TYPE_CHECKING:
-    from multilift_marl.config.schema import Config, WindConfig
+    from multilift_marl.config.schema import Config, RandomizationConfig, WindConfig
 
 MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the mean span
 _FALCON = PRESETS["falcon"]
@@ -63,6 +63,7 @@ class System:
         air: what else the air does.
         timestep: physics step [s].
         control_interval: physics steps for each control step.
+        varied: keys of `randomization` by which environments differ.
     """
 
     vehicles: tuple[Vehicle, ...]
@@ -94,6 +95,7 @@ class System:
     air: WindConfig
     timestep: float
     control_interval: int
+    varied: frozenset[str] = frozenset()
 
     @property
     def num_drones(self) -> int:
@@ -225,8 +227,10 @@ def resolve_system(config: Config) -> System:
         control_interval=whole_ratio(
             1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"
         ),
+        varied=frozenset(key for key, value in config.randomization if np.any(value)),
     )
-    check_possible(system, heaviest=1 + config.randomization.payload_mass)
+    _check_ranges(config.randomization, system)
+    check_possible(system, config.randomization)
     return system
 
 
@@ -254,6 +258,18 @@ def _steady_bending(tension: float, mass: float, length: float, n: int, h: float
     node, link = mass / n, length / n
     least = 2 * tension * link * h / (4 * modes) - node * link**2 / (h * modes**2)
     return max(tension * link * h, float(least.max()))
+
+
+def _check_ranges(ranges: RandomizationConfig, system: System) -> None:
+    """Refuse to vary what the system has not, and delays in the wrong order."""
+    if system.payload_shape == "point":
+        for key in ("payload_inertia", "payload_center_of_mass"):
+            if np.any(getattr(ranges, key)):
+                raise ConfigError(f"randomization.{key} needs a payload with extent, not a point; set it to 0")
+    for key in ("action_delay", "observation_delay"):
+        low, high = getattr(ranges, key)
+        if low > high:
+            raise ConfigError(f"randomization.{key}={[low, high]} must list the shorter delay first")
 
 
 def whole_ratio(fast: float, slow: float, slow_key: str, fast_key: str) -> int:

@@ -6,19 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from multilift_marl._jit import bind
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.config.system import whole_ratio
 from multilift_marl.control.pilot import Pilot
+from multilift_marl.envs.episodes import Episodes
+from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.errors import ConfigError
-from multilift_marl.sim.randomization import randomize
 from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.failures import CAUSES, DIVERGED
 from multilift_marl.tasks.observations import observation_names, state_size
 
 TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
-_MAX_REDRAWS = 1000
 
 
 class MultiliftVec:
@@ -67,7 +68,9 @@ class MultiliftVec:
         self._previous = np.zeros_like(self._action)
         self._observation = np.zeros((e, n, self.observation_size), np.float32)
         self._state = np.zeros((e, self.state_size), np.float32)
-        self._mass = np.full(e, system.payload_mass)
+        self._starts = Episodes(
+            config, self.world, self.task, (self.action_size, self.observation_size, self.state_size)
+        )
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
         self._bind()
@@ -80,32 +83,29 @@ class MultiliftVec:
         Args:
             seed: start at episode 0 of this seed; None goes to each environment's next episode.
             mask: bool (E,).
-            options: reserved; must be empty.
+            options: what to fix, see docs/randomization.md: `randomization`, values by the names of
+                `info["randomization"]`, and `state`, fields of SystemState by name; each one for all environments in
+                the mask or with a row for each.
 
         Returns:
             Observations of all environments (E, N, D) float32, rows outside the mask unchanged, and info.
 
         Raises:
-            ValueError: a mask of wrong shape or type, a negative seed, or an unknown option.
+            ValueError: a mask of wrong shape or type, a negative seed, an unknown option or one that cannot be; after
+                the last, environments in the mask must be reset again.
         """
-        if options:
-            raise ValueError(f"unknown reset option '{next(iter(options))}'; this task has none")
-        mask = np.ones(self.num_envs, bool) if mask is None else self._checked_mask(mask)
+        mask = np.ones(self.num_envs, bool) if mask is None else check_mask(mask, self.num_envs)
+        check_seed(seed)
+        fixed = self._starts.read(options, mask)
+        before = self.seeds.copy(), self.episodes.copy()
         if seed is not None:
-            if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or not 0 <= seed < 2**63:
-                raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, but is {seed!r}")
             self.seeds[mask], self.episodes[mask] = seed, -1
         self.episodes[mask] += 1
-        drawn = np.flatnonzero(mask).tolist()
-        for e in drawn:
-            self._draw(e)
-        self.world.set_payload_mass(mask, self._mass)
-        self.world.load(mask)
-        self._action[mask] = self._previous[mask] = 0.0
-        self.steps[mask], self._ended[mask] = 0, False
-        for e in drawn:
-            self.pilot.start(e)
-            self.task.observe(e, e + 1, self._action, self._observation, self._state)
+        try:
+            self._start(mask, fixed)
+        except ValueError:
+            (self.seeds[:], self.episodes[:]), self._ended[mask] = before, True
+            raise
         return self.current()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -161,6 +161,7 @@ class MultiliftVec:
         saved = {f"world.{key}": array for key, array in self.world.state_dict().items()}
         saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
         saved |= self.pilot.state_dict()
+        saved |= {f"imperfections.{key}": array.copy() for key, array in self._starts.imperfections.arrays().items()}
         for name in ("_action", "_observation", "_state", "seeds", "episodes", "steps", "_ended"):
             saved[name] = getattr(self, name).copy()
         return saved
@@ -173,7 +174,7 @@ class MultiliftVec:
                     f"the saved state does not fit these environments: '{key}' has shape "
                     f"{np.shape(saved.get(key))}, expected {array.shape}; use the configuration it was saved with"
                 )
-        groups: dict[str, dict[str, np.ndarray]] = {"world": {}, "task": {}}
+        groups: dict[str, Rows] = {"world": {}, "task": {}, "imperfections": {}}
         for key, array in saved.items():
             group, _, name = key.partition(".")
             if group in groups:
@@ -183,43 +184,47 @@ class MultiliftVec:
         self.world.load_state_dict(groups["world"])
         self.task.load_state_dict(groups["task"])
         self.pilot.load_state_dict(saved)
+        self._starts.load_state_dict(groups["imperfections"])
+
+    def _start(self, mask: np.ndarray, fixed: dict[str, Rows]) -> None:
+        """Start the episodes in `mask`, with a row of what is fixed of draw and state for each."""
+        chosen = np.flatnonzero(mask).tolist()
+        for i, e in enumerate(chosen):
+            key = (self.purpose, self.first_env + e, int(self.episodes[e]))
+            self._starts.draw(e, int(self.seeds[e]), key, fixed, i)
+        self._starts.load(mask)
+        self._action[mask] = self._previous[mask] = 0.0
+        self.steps[mask], self._ended[mask] = 0, False
+        for e in chosen:
+            self.pilot.start(e)
+            self.task.observe(e, e + 1, self._action, self._observation, self._state)
 
     def _bind(self) -> None:
         """Bind what is called in every step to its arrays, for each shard."""
         self._calls: dict[int, tuple] = {}
+        through = self._starts.imperfections
+        flown = through.applied if through.slow else self._action
         for shard in self.world.shards:
             span = (shard.lo, shard.hi)
-            act, follow = self.pilot.bind(*span, self._action, self.task.way, self.task.planner(*span))
+            act, follow = self.pilot.bind(*span, flown, self.task.way, self.task.planner(*span))
             after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
-            self._calls[shard.lo] = (act, follow, after)
+            before = (act,)
+            if through.slow:
+                send, arguments = through.send(*span, self._action)
+                before = (bind(send, *arguments), act)
+            self._calls[shard.lo] = (before, follow, after)
 
     def _advance(self, shard: Shard) -> None:
         """One policy step of one shard, on its own thread."""
-        act, follow, after = self._calls[shard.lo]
-        act()
+        before, follow, after = self._calls[shard.lo]
+        for call in before:
+            call()
         for _ in range(self.control_ticks):
             for call in follow:
                 call()
             self.world.advance(shard, self.world.system.control_interval)
         for call in after:
             call()
-
-    def _draw(self, e: int) -> None:
-        """Draw hidden parameters and a sound start for one environment."""
-        key = (self.purpose, self.first_env + e, int(self.episodes[e]))
-        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(int(self.seeds[e]), spawn_key=key)))
-        if self.world.system.air.turbulence:  # a stream of its own: all other draws stay what they are without it
-            self.world.seed_turbulence(e, np.random.SeedSequence(int(self.seeds[e]), spawn_key=(*key, 1)))
-        randomize(self.world, e, rng, self.config.randomization, self._mass)
-        self.world.state.cable_broken[e] = False
-        for _ in range(_MAX_REDRAWS):
-            self.task.start(e, rng, float(self._mass[e]))
-            if self.task.begin(e):
-                return
-        raise ConfigError(
-            f"no start of task {self.task.name} is free of failure ({CAUSES[self.task.cause[e]]}) in {_MAX_REDRAWS} "
-            "draws; narrow the start ranges in task_options or change the rig"
-        )
 
     def _accept(self, action: np.ndarray) -> None:
         action = np.asarray(action)
@@ -249,13 +254,8 @@ class MultiliftVec:
             "diverged": self.world.diverged.copy(),
             "failure_cause": np.where(terminated, self.task.cause, 0),
             "reward_terms": {name: self.task.terms[:, i].copy() for i, name in enumerate(self.reward_terms)},
+            "randomization": self._starts.drawn.copy(),
         }
-
-    def _checked_mask(self, mask: np.ndarray) -> np.ndarray:
-        mask = np.asarray(mask)
-        if mask.shape != (self.num_envs,) or mask.dtype != bool:
-            raise ValueError(f"mask has shape {mask.shape} and dtype {mask.dtype}, expected bool {(self.num_envs,)}")
-        return mask
 
 
 def resolve_config(

@@ -2,36 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import nearest
-from multilift_marl.rendering import Renderer
+from multilift_marl.rendering import Renderer, Window
 
-RENDER_MODES = ("rgb_array",)
+BATCH_RENDER_MODES = ("rgb_array",)  # of many environments
+RENDER_MODES = (*BATCH_RENDER_MODES, "human")
 
 
 class Pictures:
-    """Draws environments of `vec`, if `render_mode` asks for it; the renderer is made for the first picture.
+    """Draws environments of `vec`, if `render_mode` asks for it; nothing is opened before the first picture.
 
     Args:
         vec: the environments.
-        render_mode: None or one of RENDER_MODES.
+        render_mode: None, "rgb_array" for pictures, or "human" for a window that shows every step as it is flown.
+        modes: those of the face.
 
     Raises:
         ValueError: an unknown render mode.
     """
 
-    def __init__(self, vec: MultiliftVec, render_mode: str | None):
-        if render_mode not in (None, *RENDER_MODES):
-            raise ValueError(f"unknown render_mode '{render_mode}'{nearest(str(render_mode), RENDER_MODES)}")
+    def __init__(self, vec: MultiliftVec, render_mode: str | None, modes: Sequence[str] = RENDER_MODES):
+        if render_mode not in (None, *modes):
+            raise ValueError(f"unknown render_mode '{render_mode}'{nearest(str(render_mode), modes)}")
         self._vec, self._mode = vec, render_mode
         self._renderer: Renderer | None = None
+        self._window: Window | None = None
 
-    def frame(self, env: int = 0) -> np.ndarray:
-        """Return a picture (H, W, 3) uint8 of the team and its target.
+    def frame(self, env: int = 0) -> np.ndarray | None:
+        """Return a picture (H, W, 3) uint8 of the team and its target; with "human", which shows it anyway, None.
 
         Raises:
             RuntimeError: there is no render mode, or no episode was ever started.
@@ -41,25 +45,40 @@ class Pictures:
             raise RuntimeError('render() needs an environment made with render_mode="rgb_array"')
         if self._vec.episodes[env] < 0:
             raise RuntimeError("there is nothing to draw yet: call reset() before render()")
+        if self._mode == "human":
+            return None
         if self._renderer is None:
             self._renderer = Renderer(self._vec)
         return self._renderer.frame(env)
 
+    def show(self) -> None:
+        """Show what has just been flown, if the render mode is "human".
+
+        Raises:
+            RenderingError: there is no display.
+        """
+        if self._mode == "human":
+            if self._window is None:
+                self._window = Window(self._vec)
+            self._window.show()
+
     def close(self) -> None:
-        """Free the renderer; the next picture makes a new one."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        """Free renderer and window; the next picture makes new ones."""
+        for tool in (self._renderer, self._window):
+            if tool is not None:
+                tool.close()
+        self._renderer = self._window = None
 
 
 def solo_info(vec: MultiliftVec, info: dict[str, Any]) -> dict[str, Any]:
     """Return the info of the only environment of `vec` in plain values.
 
     Returns:
-        `success`, `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one) and `reward_terms`
-        {name: float}.
+        `success`, `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms`
+        {name: float} and `randomization` {name: array}.
     """
     told: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
     told["failure_cause"] = vec.failure_causes[info["failure_cause"][0]]
     told["reward_terms"] = dict(zip(vec.reward_terms, vec.task.terms[0].tolist(), strict=True))
+    told["randomization"] = {name: array[0] for name, array in info["randomization"].items()}
     return told

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec, make_vec
-from multilift_marl.envs.faces import RENDER_MODES, Pictures, solo_info
+from multilift_marl.envs.faces import BATCH_RENDER_MODES, RENDER_MODES, Pictures, solo_info
 from multilift_marl.tasks import list_tasks
 
 
@@ -28,7 +28,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Args:
         task: a configuration's name, the path of one, or a Config.
-        render_mode: None, or "rgb_array" for `render`.
+        render_mode: None, "rgb_array" for `render`, or "human" for a window that shows every step.
         num_drones: N; None for the configured value, likewise the next.
         seed: of the first reset.
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
@@ -68,6 +68,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             ValueError: a negative seed or an unknown option.
         """
         observation, info = self.vec.reset(seed, options=options)
+        self._pictures.show()
         super().reset(seed=seed)  # for wrappers that draw from np_random; nothing here does
         return observation.reshape(-1), solo_info(self.vec, info)
 
@@ -88,11 +89,12 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise RuntimeError("the episode has ended or none was started: call reset() before step()")
         joint = _split(self.vec, action, self.action_space)
         observation, reward, terminated, truncated, info = self.vec.step(joint)
+        self._pictures.show()
         mean = float(_mean(reward)[0])
         return observation.reshape(-1), mean, bool(terminated[0]), bool(truncated[0]), solo_info(self.vec, info)
 
-    def render(self) -> np.ndarray:
-        """Return a picture (H, W, 3) uint8 of the team and its target.
+    def render(self) -> np.ndarray | None:
+        """Return a picture (H, W, 3) uint8 of the team and its target; None with "human", which shows every step.
 
         Raises:
             RuntimeError: there is no `render_mode`, or no episode was ever started.
@@ -101,7 +103,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._pictures.frame()
 
     def close(self) -> None:
-        """Free the renderer; the environment itself holds nothing that must be closed."""
+        """Free renderer and window; the environment itself holds nothing that must be closed."""
         self._pictures.close()
 
     def __reduce__(self) -> tuple[type[MultiliftGymnasiumEnv], tuple[Config, str | None]]:
@@ -134,7 +136,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": list(RENDER_MODES),
+        "render_modes": list(BATCH_RENDER_MODES),
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
     closed = True  # until there is something to close: Gymnasium 1.1 closes what was refused, too
@@ -154,7 +156,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space, self.single_action_space = _joint_spaces(self.vec)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._pictures = Pictures(self.vec, render_mode)
+        self._pictures = Pictures(self.vec, render_mode, BATCH_RENDER_MODES)
         self._causes = np.array(self.vec.failure_causes, dtype=object)
         self.closed = False
 

@@ -20,12 +20,13 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     """A team of N drones as a PettingZoo environment; agents `drone_0` ... act at once and end together.
 
     Observations are (D,) float32, actions (A,) in [-1, 1], rewards are the team's. Each agent's info holds `success`,
-    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one) and `reward_terms` {name: float}. A
-    copy, also by pickle, is a new environment of the same configuration, not yet reset.
+    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms` {name: float} and
+    `randomization` {name: array}, the hidden draw. A copy, also by pickle, is a new environment of the same
+    configuration, not yet reset.
 
     Args:
         config: what to build; it is stepped alone, whatever `env.num_envs` says.
-        render_mode: None, or "rgb_array" for `render`.
+        render_mode: None, "rgb_array" for `render`, or "human" for a window that shows every step.
 
     Attributes:
         vec: the batched core underneath, of one environment.
@@ -63,16 +64,18 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
 
         Args:
             seed: start at episode 0 of this seed; None goes to the next episode.
-            options: ignored; PettingZoo's API test passes some of its own.
+            options: `randomization` and `state`, values by name to start from; see docs/randomization.md.
 
         Returns:
             Observation {agent: (D,) float32} and info of each agent.
 
         Raises:
-            ValueError: a negative seed.
+            ValueError: a negative seed, an unknown option or one that cannot be.
         """
-        observation, info = self.vec.reset(seed)
+        options = {name: value for name, value in (options or {}).items() if name != "options"}  # of PettingZoo's test
+        observation, info = self.vec.reset(seed, options=options)
         self.agents = self.possible_agents.copy()
+        self._pictures.show()
         return dict(zip(self.agents, observation[0], strict=True)), self._infos(info)
 
     def step(
@@ -111,6 +114,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         over, out_of_time = bool(terminated[0]), bool(truncated[0])
         if over or out_of_time:
             self.agents = []
+        self._pictures.show()
         return (
             dict(zip(agents, observation[0], strict=True)),
             dict(zip(agents, reward[0].tolist(), strict=True)),
@@ -131,8 +135,8 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         """Return the space of an agent's actions, the same object on every call."""
         return self.action_spaces[agent]
 
-    def render(self) -> np.ndarray:
-        """Return a picture (H, W, 3) uint8 of the team and its target.
+    def render(self) -> np.ndarray | None:
+        """Return a picture (H, W, 3) uint8 of the team and its target; None with "human", which shows every step.
 
         Raises:
             RuntimeError: there is no `render_mode`, or no episode was ever started.
@@ -141,7 +145,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         return self._pictures.frame()
 
     def close(self) -> None:
-        """Free the renderer; the environment itself holds nothing that must be closed."""
+        """Free renderer and window; the environment itself holds nothing that must be closed."""
         self._pictures.close()
 
     def __reduce__(self) -> tuple[type[MultiliftParallelEnv], tuple[Config, str | None]]:
@@ -150,7 +154,8 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     def _infos(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
         """Return a dict for each agent; none is shared, so that wrappers may write into theirs."""
         told = solo_info(self.vec, info)
-        return {name: {**told, "reward_terms": told["reward_terms"].copy()} for name in self.possible_agents}
+        own = ("reward_terms", "randomization")
+        return {name: {**told, **{key: told[key].copy() for key in own}} for name in self.possible_agents}
 
     def _mismatch(self, actions: dict[str, Any]) -> ValueError:
         for name in self.possible_agents:
@@ -170,7 +175,7 @@ def parallel_env(
         task: a configuration's name, the path of one, or a Config.
         num_drones: N; None for the configured value, likewise the next.
         seed: of the first reset.
-        render_mode: None or "rgb_array".
+        render_mode: None, "rgb_array" or "human".
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
 
     Raises:

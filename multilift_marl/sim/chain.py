@@ -38,6 +38,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.sim.hanging import hang
+from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.rows import (
     MAX_RATE,
     MAX_SPEED,
@@ -65,25 +66,36 @@ class Chain(NamedTuple):
     frames: np.ndarray
     """(N, 3, 3) frame of the first link in the payload's, in the resting formation."""
     length: np.ndarray
-    """(N,) of a segment [m]; likewise the next ones."""
+    """(E, N) of a segment [m]; likewise the next ones."""
     stiffness: np.ndarray
-    damping: np.ndarray
     weight: np.ndarray
+    damping: np.ndarray
+    """(N,) of a segment [N s/m]."""
 
 
-def make_chain(system: System) -> Chain:
-    """Return the chains of `system`."""
-    n = system.cable_segments
-    return Chain(
+def make_chain(system: System, parameters: Parameters) -> Chain:
+    """Return the chains of `system`, those of each environment by `parameters`."""
+    n, shape = system.cable_segments, parameters.cable_length.shape
+    chain = Chain(
         segments=n,
         coordinates=np.cumsum(np.append(0, 5 * n + 4)),
         velocities=np.cumsum(np.append(0, 4 * n + 3)),
         frames=np.stack([link_frame(force) for force in system.formation_force]),
-        length=system.cable_length / n,
-        stiffness=n * system.cable_stiffness,
+        length=np.zeros(shape),
+        stiffness=np.zeros(shape),
+        weight=np.zeros(shape),
         damping=n * system.cable_damping,
-        weight=GRAVITY * system.cable_mass / n,
     )
+    divide_chains(chain, system, parameters)
+    return chain
+
+
+def divide_chains(chain: Chain, system: System, parameters: Parameters) -> None:
+    """Write segments that make up the cables of every environment."""
+    n, length = chain.segments, parameters.cable_length
+    chain.length[:] = length / n
+    chain.stiffness[:] = n * parameters.cable_stiffness
+    chain.weight[:] = GRAVITY * (system.cable_mass * (length / system.cable_length)) / n
 
 
 @kernel
@@ -100,45 +112,48 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
     """
     for e in range(lo, hi):
         line, told = rows[e - lo], sensors[e - lo]
-        if diverged[e] or not _sound(line, told, state.cable_broken[e], c, chain):
+        if diverged[e] or not _sound(e, line, told, state.cable_broken[e], c, chain):
             diverged[e] = True
             continue
         read_payload(e, line, state, c)
         slack = False
-        for n in range(chain.length.shape[0]):
+        for n in range(chain.segments.shape[0]):
             at = _SENSORS * n
             for j in range(3):
                 state.drone_position[e, n, j] = told[at + j]
                 state.drone_velocity[e, n, j] = told[at + 7 + j]
                 state.drone_body_rates[e, n, j] = told[at + 10 + j]
             putmat(state.drone_rotation[e, n], quat_to_mat(told[at + 3], told[at + 4], told[at + 5], told[at + 6]))
-            pull = 0.0 if state.cable_broken[e, n] else _tension(n, line, c, chain)
+            pull = 0.0 if state.cable_broken[e, n] else _tension(e, n, line, c, chain)
             keep_tension(e, n, pull, state, record, c)
-            slack = slack or pull <= chain.segments[n] * chain.weight[n]  # the drone holds the cable, and nothing more
+            slack = slack or pull <= chain.segments[n] * chain.weight[e, n]  # the drone holds the cable alone
         if slack:
             record.slack_time[e] += c.timestep
 
 
 @kernel
-def _tension(n, line, c, chain):
+def _tension(e, n, line, c, chain):
     """Return the tension of cable n in its segment next to the drone [N]; 0 where that is pushed together."""
     at = c.qpos + c.payload_nq + chain.coordinates[n] + 5 * chain.segments[n] - 1
     v = c.qvel + c.payload_nv + chain.velocities[n] + 4 * chain.segments[n] - 1
-    return max(0.0, chain.stiffness[n] * line[at] + chain.damping[n] * line[v])
+    return max(0.0, chain.stiffness[e, n] * line[at] + chain.damping[n] * line[v])
 
 
 @kernel
-def _sound(line, told, broken, c, chain):
+def _sound(e, line, told, broken, c, chain):
     """Return whether a simulation's numbers are finite and within physical bounds."""
     for j in range(c.payload_nv):
         if not abs(line[c.qvel + j]) < (MAX_SPEED if j < 3 else MAX_RATE):
             return False
-    count = chain.length.shape[0]
+    count = chain.segments.shape[0]
     for n in range(count):
         for j in range(7, _SENSORS):
             if not abs(told[_SENSORS * n + j]) < (MAX_SPEED if j < 10 else MAX_RATE):
                 return False
-        if not broken[n] and not _tension(n, line, c, chain) < MAX_STRETCH * c.cable_stiffness[n] * c.cable_length[n]:
+        if (
+            not broken[n]
+            and not _tension(e, n, line, c, chain) < MAX_STRETCH * c.cable_stiffness[e, n] * c.cable_length[e, n]
+        ):
             return False
         for j in range(7):
             if not isfinite(told[_SENSORS * n + j]):
@@ -167,14 +182,14 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
         if c.payload_nv == 3:
             attitude, spin = _UPRIGHT, (0.0, 0.0, 0.0)
         spin = mul(attitude, spin)
-        for i in range(chain.length.shape[0]):
+        for i in range(chain.segments.shape[0]):
             n = chain.segments[i]
             at, v = c.qpos + c.payload_nq + chain.coordinates[i], c.qvel + c.payload_nv + chain.velocities[i]
             anchor = mul(attitude, (c.anchors[i, 0], c.anchors[i, 1], c.anchors[i, 2]))
             drone = mat(state.drone_rotation, e, i)
             arm = mul(drone, row(c.hooks, i))
             chord = sub(add(vec(state.drone_position, e, i), arm), add(row(state.payload_position, e), anchor))
-            hang(chord, chain.length[i], chain.stiffness[i], chain.weight[i], links[:n])
+            hang(chord, chain.length[e, i], chain.stiffness[e, i], chain.weight[e, i], links[:n])
             turning = mul(drone, vec(state.drone_body_rates, e, i))
             end = add(vec(state.drone_velocity, e, i), cross(turning, arm))
             opening = sub(end, add(row(state.payload_velocity, e), cross(spin, anchor)))
@@ -182,14 +197,14 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
             for j in range(n):
                 direction, stretch = row(links, j), links[j, 3]
                 frame, rate = _put_link(
-                    line, at + 5 * j, v + 4 * j, frame, rate, direction, chain.length[i], stretch,
+                    line, at + 5 * j, v + 4 * j, frame, rate, direction, chain.length[e, i], stretch,
                     scale(1.0 / n, opening),
                 )  # fmt: skip
             at, v = at + 5 * n, v + 4 * n
             q = mat_to_quat(matmul(transpose(frame), drone))
             line[at], line[at + 1], line[at + 2], line[at + 3] = q
             put(line[v : v + 3], sub(vec(state.drone_body_rates, e, i), tmul(drone, rate)))
-            keep_tension(e, i, _tension(i, line, c, chain), state, record, c)
+            keep_tension(e, i, _tension(e, i, line, c, chain), state, record, c)
 
 
 @kernel

@@ -6,16 +6,18 @@ which needs no Jacobian. Drones on chains have no free joint: theirs are Cartesi
 
 from __future__ import annotations
 
-from math import exp, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
+from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
 from multilift_marl.math3d import add, clip, mat, mul, norm, put, row, scale, sub, tmul, vec
 from multilift_marl.sim.air import AIR_DENSITY, air_moment, ground_gain, spread_wash
 from multilift_marl.sim.gusts import blow
+from multilift_marl.sim.parameters import Parameters, lag_shares
 from multilift_marl.sim.scene import Layout
 
 
@@ -45,7 +47,9 @@ class Constants(NamedTuple):
     hooks: np.ndarray
     """(N, 3) [m]."""
     cable_length: np.ndarray
+    """(E, N) [m]."""
     cable_stiffness: np.ndarray
+    """(E, N) [N/m]."""
     breaking_load: np.ndarray
     """(N,) [N]."""
     qpos: int
@@ -60,8 +64,9 @@ class Constants(NamedTuple):
     payload_nv: int
 
 
-def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: int, cartesian: int) -> Constants:
-    """Return the constants of `system`; the offsets are of qpos, qvel, qfrc_applied and xfrc_applied."""
+def make_constants(system: System, layout: Layout, parameters: Parameters, batch: Batch) -> Constants:
+    """Return the constants of `system`, live `parameters` and the places of fields in the rows of a batch."""
+    qpos, qvel, force, cartesian = (_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied", "xfrc_applied"))
     chain = system.cable_model == "chain"
     loads = [
         cartesian + 6 * body if chain else force + layout.payload_nv + 6 * n
@@ -77,13 +82,13 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
         torque_ratio=np.array([vehicle.torque_ratio for vehicle in vehicles]),
         speed_min=np.array([vehicle.rotor_speed_min for vehicle in vehicles], float),
         speed_max=np.array([vehicle.rotor_speed_max for vehicle in vehicles]),
-        rising=np.array([_lag(h / vehicle.rotor_time_constant_up) for vehicle in vehicles]),
-        falling=np.array([_lag(h / vehicle.rotor_time_constant_down) for vehicle in vehicles]),
+        rising=np.array([lag_shares(h / vehicle.rotor_time_constant_up) for vehicle in vehicles]),
+        falling=np.array([lag_shares(h / vehicle.rotor_time_constant_down) for vehicle in vehicles]),
         drag=np.array([vehicle.drag for vehicle in vehicles], float),
         anchors=np.ascontiguousarray(system.anchors),
         hooks=np.ascontiguousarray(system.hooks),
-        cable_length=system.cable_length,
-        cable_stiffness=system.cable_stiffness,
+        cable_length=parameters.cable_length,
+        cable_stiffness=parameters.cable_stiffness,
         breaking_load=system.breaking_load,
         qpos=qpos,
         qvel=qvel,
@@ -95,12 +100,15 @@ def make_constants(system: System, layout: Layout, qpos: int, qvel: int, force: 
     )
 
 
-def _lag(h: float) -> tuple[float, float, float]:
-    return exp(-h), (1 - exp(-h)) / h, (1 - exp(-2 * h)) / (2 * h)
+def _offset(batch: Batch, name: str) -> int:
+    """Return where a state field starts in a row of `batch.state`."""
+    view = batch.bind(name)
+    start = view.__array_interface__["data"][0] - batch.state.__array_interface__["data"][0]
+    return start // batch.state.itemsize
 
 
 @kernel
-def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
+def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied):
     """Advance the rotors by one physics step and write the loads of that step into `batch.state`.
 
     The rotor speed follows its command with a first-order lag, one for rising and one for falling. The thrust applied
@@ -116,6 +124,7 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
         c: Constants.
         air, flow: Air of all environments and AirConstants; both None where all of it is off, for which Numba compiles
             a version without it.
+        varied: Varied of all environments; None where rotors and drag are nominal.
     """
     for e in range(lo, hi):
         line = rows[e - lo]
@@ -135,10 +144,15 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
                 target = sqrt(max(thrust[e, n, k], 0.0) / b)
                 target = 0.0 if plant.motors_off[e, n] else clip(target, slowest, fastest)
                 gap = before - target
-                decay, mean_first, mean_second = falling if gap > 0.0 else rising
+                if varied is None:
+                    decay, mean_first, mean_second = falling if gap > 0.0 else rising
+                else:
+                    decay, mean_first, mean_second = vec(varied.falling if gap > 0.0 else varied.rising, e, n)
                 after = target + gap * decay
                 square = target * target + 2.0 * target * gap * mean_first + gap * gap * mean_second
                 f = b * square
+                if varied is not None:
+                    f *= varied.thrust[e, n]
                 state.rotor_speed[e, n, k] = after
                 total += f
                 mx += c.rotor_positions[n, k, 1] * f
@@ -157,6 +171,8 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
                 if flow.moments:
                     more = air_moment(e, n, through, state, flow)
                     mx, my = mx + more[0], my + more[1]
+            if varied is not None:
+                through = scale(varied.drag[e, n], through)
             body = (-drag[0] * through[0], -drag[1] * through[1], total - drag[2] * through[2])
             torque = (mx, my, mz)
             if c.world_torque:
@@ -170,4 +186,6 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow):
             here = add(wind, vec(air.wash, e, thrust.shape[1]))
         through = sub(row(state.payload_velocity, e), here)
         drag = scale(-c.payload_drag * norm(through), through)
+        if varied is not None:
+            drag = scale(varied.payload_drag[e], drag)
         put(line[c.force : c.force + 3], add(drag, row(plant.payload_force, e)))

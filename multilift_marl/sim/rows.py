@@ -42,7 +42,7 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
     """
     for e in range(lo, hi):
         line = rows[e - lo]
-        if diverged[e] or not _sound(line, tension[e - lo], c):
+        if diverged[e] or not _sound(e, line, tension[e - lo], c):
             diverged[e] = True
             continue
         read_payload(e, line, state, c)
@@ -84,11 +84,11 @@ def keep_tension(e, n, pull, state, record, c):
         state.cable_broken[e, n] = True
     record.tension_min[e] = min(record.tension_min[e], pull)
     record.tension_max[e] = max(record.tension_max[e], pull)
-    record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[n] * c.cable_length[n]))
+    record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[e, n] * c.cable_length[e, n]))
 
 
 @kernel
-def _sound(line, tension, c):
+def _sound(e, line, tension, c):
     """Return whether a simulation's numbers are finite and within physical bounds."""
     v = c.qvel
     for j in range(c.payload_nv):
@@ -100,7 +100,7 @@ def _sound(line, tension, c):
         for j in range(6):
             if not abs(line[v + 6 * n + j]) < (MAX_SPEED if j < 3 else MAX_RATE):
                 return False
-        if not tension[n] < MAX_STRETCH * c.cable_stiffness[n] * c.cable_length[n]:
+        if not tension[n] < MAX_STRETCH * c.cable_stiffness[e, n] * c.cable_length[e, n]:
             return False
     for j in range(c.payload_nq + 7 * tension.shape[0]):
         if not isfinite(line[c.qpos + j]):
@@ -129,7 +129,7 @@ def write_rows(rows, lo, hi, mask, state, record, c):
             v += 6
             anchor = (c.anchors[n, 0], c.anchors[n, 1], c.anchors[n, 2])
             cable = sub(hook_place(e, n, state, c.hooks), add(row(state.payload_position, e), mul(attitude, anchor)))
-            pull = c.cable_stiffness[n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[n])
+            pull = c.cable_stiffness[e, n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[e, n])
             keep_tension(e, n, pull, state, record, c)
 
 

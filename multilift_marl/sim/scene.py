@@ -20,6 +20,7 @@ DRONE_COLOURS = (  # told apart by the colour-blind too (Okabe & Ito 2008), none
     (0.00, 0.45, 0.70, 1), (0.84, 0.37, 0.00, 1), (0.80, 0.47, 0.65, 1),
     (0.34, 0.71, 0.91, 1), (0.90, 0.62, 0.00, 1), (0.35, 0.35, 0.38, 1),
 )  # fmt: skip
+PAYLOAD_COLOUR = (0.86, 0.66, 0.35, 1)
 
 
 class Layout(NamedTuple):
@@ -142,7 +143,9 @@ def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
     body = spec.worldbody.add_body(name="payload", pos=[0, 0, 0 if point else 1.5])
     body.mass, body.explicitinertial = system.payload_mass, True
     body.inertia, body.ipos, body.iquat = system.payload_inertia, [0, 0, 0], system.payload_axes
-    colour = [0.86, 0.66, 0.35, 1]
+    if "payload_center_of_mass" in system.varied:
+        body.simple = False  # or MuJoCo takes the centre of mass to be the origin for good
+    colour = list(PAYLOAD_COLOUR)
     if point:
         for name, axis in zip("xyz", np.eye(3), strict=True):
             body.add_joint(name=f"payload/{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)

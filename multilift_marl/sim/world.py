@@ -16,11 +16,18 @@ from mujoco.batch import Batch, SimulationError
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
 from multilift_marl.sim.air import make_air
-from multilift_marl.sim.breaking import cut_cables
-from multilift_marl.sim.cables import limit_solref
-from multilift_marl.sim.chain import make_chain, read_chains, write_chains
+from multilift_marl.sim.chain import divide_chains, make_chain, read_chains, write_chains
 from multilift_marl.sim.dynamics import apply_loads, make_constants
 from multilift_marl.sim.gusts import start_turbulence
+from multilift_marl.sim.parameters import (
+    Parameters,
+    adopt,
+    fit_cables,
+    make_varied,
+    nominal_parameters,
+    write_lags,
+    write_model,
+)
 from multilift_marl.sim.rows import read_rows, write_rows
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.standing import hover_drone, make_drones
@@ -54,14 +61,14 @@ class World:
         system: what to simulate, such as `load_config("hover").system`.
         num_envs: E.
         num_threads: threads; 0 for one on each available CPU. Results do not depend on it, bit for bit.
-
         seed: of the turbulence that each `reset` starts with; `seed_turbulence` gives another.
 
     Attributes:
         state: SystemState of all environments; live arrays, E first.
         thrust: commanded thrust of each rotor (E, N, 4) [N].
-        plant: true parameters and loads; write `wind` and `payload_force` freely, the mass by `set_payload_mass`.
-        drones: numbers of each drone.
+        parameters: true parameters; changed by `set_parameters` alone.
+        plant: true loads; write `wind` and `payload_force` freely.
+        drones: nominal numbers of each drone.
         air: what blows beside the mean wind.
         record: what accumulated since the reset.
         diverged: (E,) bool, until reset.
@@ -76,11 +83,12 @@ class World:
         _quiet_mujoco()
         self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
         self.model, self.layout = build_model(system)
-        self.drones = make_drones(system)
-        self.thrust = np.zeros((num_envs, self.num_drones, 4))
+        self.thrust, self.drones = np.zeros((num_envs, self.num_drones, 4)), make_drones(system)
         self.state = SystemState.zeros(num_envs, self.num_drones)
+        self.parameters = nominal_parameters(system, num_envs)
+        self._varied = make_varied(system, self.parameters)
         self.plant = Plant(
-            payload_mass=np.full(num_envs, system.payload_mass),
+            payload_mass=self.parameters.payload_mass,
             payload_force=np.zeros((num_envs, 3)),
             wind=np.tile(system.wind, (num_envs, 1)),
             motors_off=np.zeros((num_envs, system.num_drones), bool),
@@ -105,9 +113,8 @@ class World:
         for e in np.flatnonzero(mask):
             for n, pull in enumerate(system.drone_pull):
                 hover_drone(e, n, state, tuple(pull), 0.0, self.drones)
-        self.set_payload_mass(mask, np.full(self.num_envs, system.payload_mass))
-        self.plant.payload_force[mask] = 0
-        self.plant.wind[mask] = system.wind
+        self.set_parameters(mask, **nominal_parameters(system, self.num_envs)._asdict())
+        self.plant.payload_force[mask], self.plant.wind[mask] = 0, system.wind
         if system.air.turbulence:
             for e in np.flatnonzero(mask):
                 self.seed_turbulence(e, np.random.SeedSequence(self.seed, spawn_key=(int(e),)))
@@ -163,37 +170,28 @@ class World:
             for other in others:
                 other.result()
 
-    def set_payload_mass(self, mask: np.ndarray, mass: np.ndarray) -> None:
-        """Give the payload of the environments in `mask` (E,) a true `mass` (E,) [kg]; inertia scales with it.
+    def set_parameters(self, mask: np.ndarray, **values: np.ndarray) -> None:
+        """Give the environments in `mask` (E,) their own true parameters.
 
-        The constants that MuJoCo derives from masses follow, and so do the cables' constraint parameters.
+        Args:
+            mask: bool (E,).
+            **values: fields of `Parameters` by name, each (E, ...), rows outside the mask not used; others stay.
 
         Raises:
-            ValueError: a mass that is not positive and finite.
+            ValueError: a value that cannot be, or of what the configuration does not vary at a cost.
         """
-        if not (np.isfinite(mass[mask]) & (mass[mask] > 0)).all():
-            raise ValueError(f"payload masses must be positive and finite, but are {mass[mask]} kg")
-        changed = mask & (mass != self.plant.payload_mass)
-        if not changed.any():
+        changed, names = adopt(self.system, self.parameters, mask, values)
+        if not names:
             return
-        self.plant.payload_mass[changed] = mass[changed]
-        body, system = self.layout.payload_body, self.system
+        if self._varied is not None and "vehicle_rotor_time_constant" in names:
+            write_lags(self._varied, self.system, self.parameters, changed)
+        if self._chain is not None:
+            divide_chains(self._chain, self.system, self.parameters)
         for shard in self.shards:
             local = changed[shard.lo : shard.hi]
-            if not local.any():
-                continue
-            new = mass[shard.lo : shard.hi][local]
-            shard.batch.expand("body_mass")[local, body] = new
-            shard.batch.expand("body_inertia")[local, body] = (
-                system.payload_inertia * (new / system.payload_mass)[:, None]
-            )
-            if system.cable_model == "chain":
-                shard.batch.set_const(local)
-                continue
-            solref = shard.batch.expand("tendon_solref_lim")
-            shard.batch.set_const(local)
-            inverse_weight = shard.batch.expanded("tendon_invweight0")[local]
-            solref[local] = limit_solref(system.cable_stiffness, system.cable_damping, inverse_weight)
+            if local.any():
+                shared = self.model, self.layout, self.system
+                write_model(shard.batch, *shared, self._own(shard), local, names, shard.broken)
 
     def seed_turbulence(self, env: int, seed: np.random.SeedSequence) -> None:
         """Start the turbulence of one environment anew, from its stationary distribution."""
@@ -236,10 +234,11 @@ class World:
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of all that the future of the simulations depends on."""
-        saved = {f"state.{name}": array.copy() for name, array in self.state._asdict().items()}
-        saved |= {f"plant.{name}": array.copy() for name, array in self.plant._asdict().items()}
-        saved |= {f"air.{name}": array.copy() for name, array in self.air._asdict().items()}
-        saved |= {f"record.{name}": array.copy() for name, array in self.record._asdict().items()}
+        saved = {
+            f"{prefix}.{name}": array.copy()
+            for prefix, group in self._groups().items()
+            for name, array in group._asdict().items()
+        }
         saved["rows"] = np.concatenate([shard.batch.state for shard in self.shards])
         saved["warning"] = np.concatenate([shard.batch.warning for shard in self.shards])
         saved["diverged"] = self.diverged.copy()
@@ -247,8 +246,9 @@ class World:
 
     def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
         """Continue bit for bit from what `state_dict` returned, at any number of threads."""
-        self.set_payload_mass(np.ones(self.num_envs, bool), saved["plant.payload_mass"])
-        for prefix, group in (("state", self.state), ("plant", self.plant), ("air", self.air), ("record", self.record)):
+        parameters = {name: saved[f"parameters.{name}"] for name in Parameters._fields}
+        self.set_parameters(np.ones(self.num_envs, bool), **parameters)
+        for prefix, group in self._groups().items():
             for name, array in group._asdict().items():
                 array[:] = saved[f"{prefix}.{name}"]
         for shard in self.shards:
@@ -257,40 +257,41 @@ class World:
             self._cut(shard)
         self.diverged[:] = saved["diverged"]
 
+    def _groups(self) -> dict[str, SystemState | Plant | Parameters | Air | Record]:
+        names = ("state", "plant", "parameters", "air", "record")
+        return {name: getattr(self, name) for name in names}
+
     def _cut(self, shard: Shard) -> None:
         """Bring the shard's models into line with `state.cable_broken`."""
         broken = self.state.cable_broken[shard.lo : shard.hi]
         if (broken != shard.broken).any():
-            cut_cables(shard.batch, self.model, self.system, broken)
+            fit_cables(shard.batch, self.model, self.system, self._own(shard), broken)
             shard.broken[:] = broken
+
+    def _own(self, shard: Shard) -> Parameters:
+        """Return the parameters of a shard's environments."""
+        return Parameters(*(array[shard.lo : shard.hi] for array in self.parameters))
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int)
         chain = self.system.cable_model == "chain"
         read, self._write = (read_chains, write_chains) if chain else (read_rows, write_rows)
+        self._chain = make_chain(self.system, self.parameters) if chain else None
         shards = []
         for lo, hi in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             batch = Batch(self.model, hi - lo, nthread=1, persistent=chain)
             # drones on chains are read from sensors; persistent batches compute those of the new state anyway
             step = functools.partial(batch.step, stage=mujoco.mjtStage.mjSTAGE_VEL) if chain else batch.step
-            offsets = [_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied", "xfrc_applied")]
-            constants = make_constants(self.system, self.layout, *offsets)  # the same for every shard
-            self.constants = (constants, make_chain(self.system)) if chain else (constants,)
+            constants = make_constants(self.system, self.layout, self.parameters, batch)  # the same for every shard
+            self.constants = (constants, self._chain) if chain else (constants,)
             flow = make_air(self.system)
             air, flow = (None, None) if flow.still else (self.air, flow)
             span, told = (batch.state, lo, hi), batch.bind("sensordata")
-            blown = (self.thrust, self.state, self.plant, self.record, constants, air, flow)
+            blown = (self.thrust, self.state, self.plant, self.record, constants, air, flow, self._varied)
             apply = bind(apply_loads, *span, *blown)
             follow = bind(read, *span, told, self.state, self.record, self.diverged, *self.constants)
             shards.append(Shard(lo, hi, batch, step, apply, follow, np.zeros((hi - lo, self.num_drones), bool)))
         return shards
-
-
-def _offset(batch: Batch, name: str) -> int:
-    """Return where a state field starts in a row of `batch.state`."""
-    view = batch.bind(name)
-    start = view.__array_interface__["data"][0] - batch.state.__array_interface__["data"][0]
-    return start // batch.state.itemsize
 
 
 def _quiet_mujoco() -> None:

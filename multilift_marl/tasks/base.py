@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -13,14 +13,28 @@ from multilift_marl.config.schema import Config, Section
 from multilift_marl.config.validate import validate
 from multilift_marl.control.formation import Goal, Reference, make_rig
 from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.failures import Watch, find_failures, make_limits
-from multilift_marl.tasks.observations import Component, observe_team
-from multilift_marl.tasks.starts import make_hanging
+from multilift_marl.tasks.imperfections import Imperfections
+from multilift_marl.tasks.observations import Component, observation_names, observe_team
+from multilift_marl.tasks.starts import make_hanging, true_hanging
 from multilift_marl.tasks.terms import Errors, measure
 
+Look = tuple[Any, tuple]  # a kernel and its arguments
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
 INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
+
+
+class Box(NamedTuple):
+    """A box to look at."""
+
+    size: tuple[float, float, float]
+    """Half its edges [m]."""
+    position: tuple[float, float, float]
+    """Of its middle [m]."""
+    rgba: tuple[float, float, float, float]
+    """Colour and opacity, 0 to 1."""
 
 
 @kernel
@@ -56,6 +70,9 @@ class Task:
         min_separation: smallest distance between drones in the episode (E,) [m].
         watch: failures that do not count for now.
         time: since the start, for tasks with a plan (E,) [s].
+        seen: the state as the drones are told it, for observers; live arrays.
+        hanging: numbers of a hanging team; in `start`, the true ones of the environment, else nominal.
+        nominal_hanging: always nominal, for goals.
     """
 
     name: ClassVar[str]
@@ -69,7 +86,8 @@ class Task:
 
     def __init__(self, config: Config, world: World, reference: Reference):
         e, n, system = world.num_envs, world.num_drones, world.system
-        self.world, self.reference = world, reference
+        self.world, self.reference, self.seen = world, reference, world.state
+        self._imperfections: Imperfections | None = None
         if n < self.LEAST_DRONES:
             raise ConfigError(
                 f"task {self.name} needs more drones; raise env.num_drones to {self.LEAST_DRONES} or more"
@@ -80,7 +98,8 @@ class Task:
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
         self.way = self.goal
         self.rig = make_rig(system)
-        self.limits, self.hanging = make_limits(system), make_hanging(system)
+        self.limits, self.nominal_hanging = make_limits(system), make_hanging(system)
+        self.hanging = self.nominal_hanging
         tension = system.resting_tension
         self._nominal = np.append(np.stack([system.cable_length, tension], axis=1), [[system.payload_mass, 0]], axis=0)
         self.cause, self.good_time = np.zeros(e, np.int64), np.zeros(e)
@@ -120,6 +139,26 @@ class Task:
         """Return what writes `EXTRA` and `EXTRA_STATE`, the last numbers of each row, of environments lo to hi."""
         return None
 
+    def blur(self, imperfections: Imperfections) -> None:
+        """Let the drones observe through these from now on."""
+        self._imperfections = imperfections
+        self.seen = imperfections.state if imperfections.noisy else self.world.state
+
+    def draw_start(self, env: int, rng: np.random.Generator, parameters: Parameters) -> bool:
+        """Draw a start of one environment, whose team has true `parameters`; return whether it is sound."""
+        self.hanging = true_hanging(self.nominal_hanging, parameters, env)
+        self.start(env, rng, float(parameters.payload_mass[env]))
+        self.hanging = self.nominal_hanging
+        return self.begin(env)
+
+    def route(self, env: int) -> np.ndarray:
+        """Return points (P, 3) of the way that the target takes in this episode, to draw it; none if it stays."""
+        return np.zeros((0, 3))
+
+    def scenery(self, env: int) -> list[Box]:
+        """Return what stands around in environment `env`, to draw it; what may be touched is `failures`' business."""
+        return []
+
     def begin(self, env: int) -> bool:
         """Reset the measurements of one environment to its drawn start; return whether that start is sound."""
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
@@ -133,30 +172,53 @@ class Task:
 
     def observe(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> None:
         """Write observations (E, N, D) and global states (E, S) of environments lo to hi."""
-        observe_team(*self._observed(lo, hi, action, observation, critic))
+        looks, late = self._looks(lo, hi, 0.0, action, observation, critic)
+        for function, arguments in looks:
+            function(*arguments)
         if extra := self.observer(lo, hi, observation, critic):
             extra()
+        for function, arguments in late:
+            function(*arguments)
 
     def after_step(
         self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray, observation: np.ndarray, critic: np.ndarray
     ) -> list[Callable[[], None]]:
         """Return what is called in turn for environments lo to hi after each policy step: check, score, observe."""
         extra = self.observer(lo, hi, observation, critic)
+        looks, late = self._looks(lo, hi, self.dt, action, observation, critic)
         return [
             bind(check_team, *self._checked(lo, hi, self.dt)),
             self.scorer(lo, hi, action, previous),
-            bind(observe_team, *self._observed(lo, hi, action, observation, critic)),
+            *(bind(function, *arguments) for function, arguments in looks),
             *([extra] if extra else []),
+            *(bind(function, *arguments) for function, arguments in late),
         ]
+
+    def _looks(
+        self, lo: int, hi: int, dt: float, action: np.ndarray, observation: np.ndarray, critic: np.ndarray
+    ) -> tuple[list[Look], list[Look]]:
+        """Return the kernels that observe, before and after the task's own, with their arguments."""
+        plant, goal, reference, rig, nominal = self.world.plant, self.goal, self.reference, self.rig, self._nominal
+        common, span, through = (action, rig, nominal, observation), (lo, hi), self._imperfections
+        state, errors = self.world.state, self.errors
+        looks = [(observe_team, (*span, state, plant, goal, reference, errors, *common, critic))]
+        if through is None:
+            return looks, []
+        if through.noisy:
+            state, errors = through.state, through.errors
+            looks += [
+                through.sense(*span, self.world.state),
+                (measure, (*span, state, goal, self.way, self.way is not goal, errors, dt, INTEGRAL_LIMIT)),
+                (observe_team, (*span, state, plant, goal, reference, errors, *common, through.unused)),
+            ]
+        own = len(observation_names(0))
+        late = [through.delay(*span, observation, (own, own + action.shape[2]))] if through.late else []
+        return looks, late
 
     def _checked(self, lo: int, hi: int, dt: float) -> tuple:
         state, goal, way, errors = self.world.state, self.goal, self.way, self.errors
         found = (self.limits, self.watch, self.cause, self.min_separation)
         return lo, hi, state, goal, way, way is not goal, errors, dt, *found
-
-    def _observed(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> tuple:
-        state, plant, goal, reference = self.world.state, self.world.plant, self.goal, self.reference
-        return lo, hi, state, plant, goal, reference, self.errors, action, self.rig, self._nominal, observation, critic
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""

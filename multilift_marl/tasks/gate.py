@@ -16,7 +16,7 @@ from multilift_marl.math3d import add, mat, matrow, mul, norm, put, putmat, rot_
 from multilift_marl.sim.scene import drone_half_size
 from multilift_marl.sim.standing import hook_place
 from multilift_marl.sim.world import World
-from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.base import Box, Task
 from multilift_marl.tasks.failures import WALL
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.paths import STEP, differences, set_goal
@@ -24,6 +24,7 @@ from multilift_marl.tasks.starts import hang_team, in_ball
 from multilift_marl.tasks.terms import mean_change, tolerance
 
 THICKNESS = 0.1  # [m] of the walls
+_WALL = (0.62, 0.52, 0.45, 1.0)  # colour
 
 
 class GateOptions(Section):
@@ -122,7 +123,8 @@ class Gate(Task):
 
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell where the next gap is; see `Task.observer`."""
-        return bind(_tell, lo, hi, self.world.state, self.goal, self.gates, self.bodies, observation, critic)
+        state = self.world.state
+        return bind(_tell, lo, hi, state, self.seen, self.goal, self.gates, self.bodies, observation, critic)
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness to the moving target and for room; a touched wall is a failure. See `Task.scorer`."""
@@ -137,15 +139,15 @@ class Gate(Task):
         """Close to the goal throughout the last moments."""
         return self.good_time >= self.options.success_seconds - 1e-9
 
-    def scenery(self, env: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the walls as boxes: half edges (3,) and centre (3,) [m]."""
+    def scenery(self, env: int) -> list[Box]:
+        """Return the walls; see `Task.scenery`."""
         half, gap, top = 2.5, self.gates.half_width, self.gates.gap_height
         boxes = []
         for x, y in zip(self.gates.x, self.gap_y[env], strict=True):
             for side in (-1, 1):
-                boxes.append(([THICKNESS / 2, half / 2, top / 2], [x, y + side * (gap + half / 2), top / 2]))
-            boxes.append(([THICKNESS / 2, half + gap, 0.25], [x, y, top + 0.25]))
-        return [(np.array(size), np.array(place)) for size, place in boxes]
+                boxes.append(Box((THICKNESS / 2, half / 2, top / 2), (x, y + side * (gap + half / 2), top / 2), _WALL))
+            boxes.append(Box((THICKNESS / 2, half + gap, 0.25), (x, y, top + 0.25), _WALL))
+        return boxes
 
 
 @kernel
@@ -254,19 +256,19 @@ def _spread(e, g, state, gates, bodies):
 
 
 @kernel
-def _tell(lo, hi, state, goal, gates, bodies, observation, critic):
+def _tell(lo, hi, state, seen, goal, gates, bodies, observation, critic):
     for e in range(lo, hi):
         g = _next(e, state.payload_position[e, 0], gates)
         middle = (gates.x[g], gates.y[e, g], gates.level)
         told = critic[e, critic.shape[1] - 6 :]
         put(told[0:3], row(goal.velocity, e))
         put(told[3:6], sub(row(state.payload_position, e), middle))
-        room = min(max(_spread(e, g, state, gates, bodies), -0.5), 0.5)
+        room = min(max(_spread(e, g, seen, gates, bodies), -0.5), 0.5)
         for n in range(observation.shape[1]):
             c, s = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
             own = observation[e, n, observation.shape[2] - 5 :]
             own[0], own[1] = turn(c, s, row(goal.velocity, e))[:2]
-            own[2], own[3] = turn(c, s, sub(vec(state.drone_position, e, n), middle))[:2]
+            own[2], own[3] = turn(c, s, sub(vec(seen.drone_position, e, n), middle))[:2]
             own[4] = room
 
 

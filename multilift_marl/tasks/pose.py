@@ -81,13 +81,14 @@ class Pose(Task):
         """Draw a level pose to start from and the targets; the team hangs there at rest; see `Task.start`."""
         option, tilt = self.options, radians(self.options.target_tilt)
         ranges = (option.target_xy, *option.target_height, radians(option.target_yaw), tilt)
-        drawn = draw_plan(env, rng, ranges, self.plan, self.goal, self.rig, self.hanging, self._bounds)
+        drawn = draw_plan(env, rng, ranges, self.plan, self.goal, self.rig, self.nominal_hanging, self._bounds)
         if drawn < 0:
             raise ConfigError(
                 "this team can hold hardly any of the poses of task pose; lower task_options.target_tilt, raise "
                 "target_height or change the rig"
             )
-        _start(env, self.world.state, self.plan, self.goal, self.way, self.rig, self.hanging, mass)
+        rest, own = self.nominal_hanging, self.hanging
+        _start(env, self.world.state, self.plan, self.goal, self.way, self.rig, rest, own, mass)
         self.reached[env] = False
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
@@ -125,8 +126,8 @@ class Pose(Task):
 
 
 @kernel
-def _start(e, state, plan, goal, way, rig, hanging, mass):
-    aim(e, 0, plan, way, rig, hanging)
+def _start(e, state, plan, goal, way, rig, rest, hanging, mass):
+    aim(e, 0, plan, way, rig, rest)
     for moving in (way.velocity, way.acceleration, way.jerk, way.angular_velocity):
         moving[e] = 0.0
     for moving in (way.slot_velocity, way.slot_acceleration, way.slot_jerk):
@@ -135,7 +136,7 @@ def _start(e, state, plan, goal, way, rig, hanging, mass):
     still = (0.0, 0.0, 0.0)
     hang_team(e, state, way, rig, hanging, mass, row(way.position, e), matrow(way.rotation, e), still, still)
     plan.stage[e] = 0
-    aim(e, 1, plan, goal, rig, hanging)  # last, since it shares the slot frames with the way
+    aim(e, 1, plan, goal, rig, rest)  # last, since it shares the slot frames with the way
 
 
 @kernel

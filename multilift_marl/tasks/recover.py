@@ -94,7 +94,7 @@ class Recover(Task):
             _throw_as_crazymarl(env, rng, state, goal, self.rig.drones, self.hanging)
         if not self.rig.anchors.any():
             _turn_formation(env, state, goal, self.rig)
-        drones = self.rig.drones
+        drones = self.hanging.drones
         carried = drones.mass + mass / self.world.num_drones
         state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / drones.thrust_coefficient)[:, None]
         state.payload_body_rates[env] = 0.0
@@ -106,7 +106,7 @@ class Recover(Task):
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell grace and slack; see `Task.observer`."""
         return bind(
-            _tell, lo, hi, self.time, self.options.grace, self.world.state, self.rig, self.hanging, observation, critic
+            _tell, lo, hi, self.time, self.options.grace, self.seen, self.rig, self.hanging, observation, critic
         )
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:

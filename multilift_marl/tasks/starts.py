@@ -12,11 +12,12 @@ from multilift_marl.config.system import GRAVITY, System
 from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
 from multilift_marl.sim.cables import cable_end
-from multilift_marl.sim.standing import hold_hook, hover_drone
+from multilift_marl.sim.parameters import Parameters
+from multilift_marl.sim.standing import Drones, hold_hook, hover_drone, make_drones
 
 
 class Hanging(NamedTuple):
-    """Numbers of a team that hangs in equilibrium, nominal."""
+    """Numbers of a team that hangs in equilibrium."""
 
     length: np.ndarray
     """(N,) of the cables [m]; likewise the next ones."""
@@ -24,16 +25,33 @@ class Hanging(NamedTuple):
     weight: np.ndarray
     segments: np.ndarray
     payload_mass: float
+    """Nominal [kg]."""
+    drones: Drones
 
 
 def make_hanging(system: System) -> Hanging:
-    """Return the numbers of `system`."""
+    """Return the nominal numbers of `system`."""
     return Hanging(
         length=system.cable_length,
         stiffness=system.cable_stiffness,
         weight=system.cable_mass * GRAVITY,
         segments=system.cable_segments,
         payload_mass=system.payload_mass,
+        drones=make_drones(system),
+    )
+
+
+def true_hanging(nominal: Hanging, parameters: Parameters, e: int) -> Hanging:
+    """Return the numbers of the team in environment e."""
+    p, drones = parameters, nominal.drones
+    return nominal._replace(
+        length=p.cable_length[e],
+        stiffness=p.cable_stiffness[e],
+        weight=nominal.weight * (p.cable_length[e] / nominal.length),
+        drones=drones._replace(
+            mass=p.vehicle_mass[e],
+            thrust_coefficient=drones.thrust_coefficient * p.vehicle_thrust_coefficient[e],
+        ),
     )
 
 
@@ -77,8 +95,8 @@ def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, m
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
         pull = add(scale(tension, direction), half)
-        hover_drone(e, n, state, pull, goal.drone_yaw[e], rig.drones)
-        hold_hook(e, n, state, add(anchor, end), rig.drones.hooks)
+        hover_drone(e, n, state, pull, goal.drone_yaw[e], hanging.drones)
+        hold_hook(e, n, state, add(anchor, end), hanging.drones.hooks)
 
 
 class StartRanges(NamedTuple):

@@ -22,6 +22,8 @@ from multilift_marl.tasks.paths import (
     HELIX,
     LEMNISCATE,
     PATHS,
+    RAMP,
+    RANDOM,
     Path,
     draw_curve,
     largest_rates,
@@ -34,6 +36,7 @@ from multilift_marl.tasks.starts import hang_team, in_ball
 from multilift_marl.tasks.terms import mean_change, tolerance
 
 AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
+_DRAWN = 400  # points of a path that is drawn
 
 
 class TrackOptions(Section):
@@ -79,6 +82,7 @@ class Track(Task):
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
+        self.seconds = config.env.episode_seconds
         self.path, self.worst = Path.zeros(world.num_envs), np.zeros(world.num_envs)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
@@ -108,6 +112,14 @@ class Track(Task):
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell how the target will move; see `Task.observer`."""
         return bind(_look_ahead, lo, hi, self.time, self.path, self.goal, observation, critic)
+
+    def route(self, env: int) -> np.ndarray:
+        """Return the path, one round of it if it repeats; see `Task.route`."""
+        points, kind = np.zeros((_DRAWN, 3)), self.path.kind[env]
+        turns = 4 if kind == HELIX else 1
+        lap = np.inf if kind == RANDOM else turns * 2 * pi / self.path.rate[env] + RAMP / 2  # half the ramp is lost
+        _trace(env, min(self.seconds, lap), self.path, points)
+        return points
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness to the moving target; see `Task.scorer`."""
@@ -148,6 +160,12 @@ def _plan(lo, hi, time, dt, path, goal, rig):
     for e in range(lo, hi):
         time[e] += dt
         _aim(e, time[e], path, goal, rig)
+
+
+@kernel
+def _trace(e, seconds, path, points):
+    for i in range(points.shape[0]):
+        put(points[i], place(e, seconds * i / (points.shape[0] - 1), path))
 
 
 @kernel

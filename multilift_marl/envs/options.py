@@ -1,0 +1,134 @@
+"""What `reset` is asked for, checked: which environments, which seed, and what is fixed of the episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from multilift_marl.errors import nearest
+from multilift_marl.math3d import add, matrow, mul, row, sub
+from multilift_marl.sim.parameters import CONFIGURED
+from multilift_marl.sim.standing import hook_place
+from multilift_marl.sim.state import SystemState
+from multilift_marl.sim.world import World
+
+Rows = dict[str, np.ndarray]
+OPTIONS = ("randomization", "state")
+MOST_STRETCH = 0.01  # [-] of its length that a cable may be stretched at the start, or ...
+MOST_TENSION = 5.0  # [-] ... as much as this times its tension at rest stretches it
+
+
+def check_mask(mask: Any, num_envs: int) -> np.ndarray:
+    """Return a mask as an array, refused if it is none of `num_envs` environments."""
+    mask = np.asarray(mask)
+    if mask.shape != (num_envs,) or mask.dtype != bool:
+        raise ValueError(f"mask has shape {mask.shape} and dtype {mask.dtype}, expected bool {(num_envs,)}")
+    return mask
+
+
+def check_seed(seed: Any) -> None:
+    """Refuse what is no seed."""
+    whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+    if seed is not None and not (whole and 0 <= seed < 2**63):
+        raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, but is {seed!r}")
+
+
+def read_options(options: Mapping[str, Any], mask: np.ndarray, drawn: Rows, state: SystemState) -> dict[str, Rows]:
+    """Return the fixed draw and state of `options`, by option and name, with a row for each environment in `mask`.
+
+    Args:
+        options: as given to `reset`.
+        mask: (E,) bool.
+        drawn: all that may be fixed, by name, environment first.
+        state: for the shapes of its fields.
+
+    Raises:
+        ValueError: an unknown name, a wrong shape, or values that cannot be.
+    """
+    for name in options:
+        if name not in OPTIONS:
+            raise ValueError(f"unknown reset option '{name}'{nearest(str(name), OPTIONS)}")
+    for name in OPTIONS:
+        if not isinstance(options.get(name, {}), Mapping):
+            raise ValueError(f"reset option '{name}' must be a dict of values by name, such as {{'payload_mass': 1.6}}")
+    fixed = {}
+    for name, value in options.get("randomization", {}).items():
+        if name not in drawn:
+            raise ValueError(_unknown_draw(str(name), drawn))
+        fixed[name] = _rows(f"randomization '{name}'", value, drawn[name], mask)
+    given = {}
+    for name, value in options.get("state", {}).items():
+        if name not in SystemState._fields:
+            raise ValueError(f"unknown field '{name}' of the state{nearest(str(name), SystemState._fields)}")
+        if name == "cable_tension":
+            raise ValueError("cable_tension cannot be given: it follows from where drones and payload are")
+        given[name] = _rows(f"state '{name}'", value, getattr(state, name), mask, scalars=False)
+        _check_field(name, given[name])
+    return {"randomization": fixed, "state": given}
+
+
+def _unknown_draw(name: str, drawn: Rows) -> str:
+    if name in (*CONFIGURED, "action_delay", "observation_delay", "observation_bias"):
+        return f"{name} is not drawn here, and costs speed where it is; set randomization.{name} above 0"
+    return f"unknown draw '{name}'{nearest(name, drawn)}"
+
+
+def _rows(what: str, value: Any, like: np.ndarray, mask: np.ndarray, scalars: bool = True) -> np.ndarray:
+    """Return a row of `value` for each environment in `mask`; it has E rows, as many as these, or one for all."""
+    count, shape = int(mask.sum()), like.shape[1:]
+    try:
+        array = np.array(value, like.dtype if like.dtype != np.float32 else float)
+        exact = np.array(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} must hold numbers, but is {value!r}") from None
+    if like.dtype.kind in "ib" and (exact.dtype.kind not in "iufb" or (exact != array).any()):
+        kind = "true or false" if like.dtype.kind == "b" else "whole numbers"
+        raise ValueError(f"{what} must hold {kind}, but is {value!r}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} holds NaN or infinite values; give finite numbers")
+    if array.shape == shape or (scalars and not array.shape):
+        return np.broadcast_to(array, (count, *shape))
+    if array.shape == like.shape:
+        return array[mask]
+    if array.shape == (count, *shape):
+        return array
+    raise ValueError(f"{what} has shape {array.shape}, expected {(count, *shape)}, {like.shape} or {shape}")
+
+
+def _check_field(name: str, rows: np.ndarray) -> None:
+    """Refuse rotations and rotor speeds that are none."""
+    if name.endswith("rotation"):
+        off = np.abs(rows @ np.swapaxes(rows, -1, -2) - np.eye(3)).max()
+        if off > 1e-6 or (np.linalg.det(rows) < 0).any():
+            raise ValueError(f"state '{name}' must hold rotation matrices (3, 3), with orthonormal columns, det 1")
+    if name == "rotor_speed" and (rows < 0).any():
+        raise ValueError("state 'rotor_speed' must not be negative; the sense of rotation is the vehicle's")
+
+
+def check_delays(fixed: Rows, longest: dict[str, int]) -> None:
+    """Refuse delays longer than those that are remembered."""
+    for name, most in longest.items():
+        if name in fixed and not ((fixed[name] >= 0) & (fixed[name] <= most)).all():
+            raise ValueError(f"{name} must be from 0 to {most}, the longest of randomization.{name}; raise that")
+
+
+def check_stretch(world: World, e: int, length: np.ndarray, stiffness: np.ndarray) -> None:
+    """Refuse a start of environment e with over-stretched cables of `length` [m] and `stiffness` [N/m], each (N,).
+
+    Raises:
+        ValueError: naming the cable.
+    """
+    state, system = world.state, world.system
+    for n, anchor in enumerate(system.anchors):
+        if state.cable_broken[e, n]:
+            continue
+        foot = add(row(state.payload_position, e), mul(matrow(state.payload_rotation, e), tuple(anchor)))
+        span = float(np.linalg.norm(sub(hook_place(e, n, state, world.drones.hooks), foot)))
+        most = max(MOST_STRETCH * length[n], MOST_TENSION * system.resting_tension[n] / stiffness[n])
+        if span > length[n] + most:
+            raise ValueError(
+                f"the given state stretches cable {n} of environment {e} to {span:.3f} m, but it is {length[n]:.3f} m "
+                "long; move drone or payload"
+            )

@@ -1,0 +1,81 @@
+"""What is drawn beside the bodies: trails, the path of the target, scenery."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import mujoco
+import numpy as np
+
+_GEOM = mujoco.mjtGeom
+_TRAIL_POINTS = 40  # of one trail
+_MAX_DASHES = 300
+
+
+def add_box(scene: mujoco.MjvScene, size: np.ndarray, position: np.ndarray, rgba: np.ndarray) -> None:
+    """Add an upright box of half edges `size` (3,) at `position` (3,) [m]; where the scene is full, nothing."""
+    _add(scene, _GEOM.mjGEOM_BOX, np.asarray(size, float), np.asarray(position, float), np.float32(rgba))
+
+
+def add_lines(scene: mujoco.MjvScene, starts: np.ndarray, ends: np.ndarray, radius: float, rgba: np.ndarray) -> None:
+    """Add straight lines from `starts` (K, 3) to `ends` (K, 3) [m] with colours `rgba` (K, 4)."""
+    for start, end, colour in zip(starts, ends, rgba, strict=True):
+        geom = _add(scene, _GEOM.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), colour)
+        if geom is not None:
+            mujoco.mjv_connector(geom, _GEOM.mjGEOM_CAPSULE, radius, start, end)
+
+
+def _add(
+    scene: mujoco.MjvScene, kind: int, size: np.ndarray, position: np.ndarray, rgba: np.ndarray
+) -> mujoco.MjvGeom | None:
+    """Add a geom that casts no shadow, and return it; None where the scene is full."""
+    if scene.ngeom == scene.maxgeom:
+        return None
+    geom = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), rgba)
+    geom.objtype, geom.objid, geom.segid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1, -1  # left as they were by mjv_initGeom
+    geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, False
+    scene.ngeom += 1
+    return geom
+
+
+def dashes(points: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts and ends (K, 3) of dashes, each `length` [m] or more long, along a line through `points` (P, 3)."""
+    run = np.append(0.0, np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum())
+    count = int(min(run[-1] / (2 * length), _MAX_DASHES))
+    at = np.linspace(0.0, run[-1], 2 * count + 1)
+    line = np.stack([np.interp(at, run, points[:, axis]) for axis in range(3)], axis=1)
+    return line[0:-1:2], line[1::2]
+
+
+class Trail:
+    """Where bodies were in the last seconds.
+
+    Args:
+        seconds: how long [s]; 0 for no trail.
+    """
+
+    def __init__(self, seconds: float):
+        self.seconds = seconds
+        self._past: deque[tuple[float, np.ndarray]] = deque()
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._past.clear()
+
+    def add(self, time: float, bodies: np.ndarray) -> None:
+        """Note where the bodies (B, 3) are at a time [s], later than all noted."""
+        while self._past and self._past[0][0] < time - self.seconds:
+            self._past.popleft()
+        if not self._past or time - self._past[-1][0] >= self.seconds / _TRAIL_POINTS:
+            self._past.append((time, bodies.copy()))
+
+    def draw(self, scene: mujoco.MjvScene, time: float, bodies: np.ndarray, radius: float, rgba: np.ndarray) -> None:
+        """Add the trails to `scene`, from now (`time` [s], `bodies` (B, 3)) fading into the past; `rgba` (B, 4)."""
+        times = np.array([past[0] for past in self._past] + [time])
+        places = np.stack([past[1] for past in self._past] + [bodies], axis=1)
+        fresh = np.clip(1.0 - (time - times[:-1]) / max(self.seconds, 1e-9), 0.0, 1.0)
+        for line, colour in zip(places, rgba, strict=True):
+            faded = np.tile(colour, (len(fresh), 1))
+            faded[:, 3] *= fresh
+            add_lines(scene, line[:-1], line[1:], radius, faded)

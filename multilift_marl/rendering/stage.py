@@ -1,0 +1,127 @@
+"""What a picture shows, before anything draws it: bodies, target, cables coloured by tension, trails, path, scenery."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from multilift_marl.math3d import mat_to_quat
+from multilift_marl.rendering.cameras import Camera
+from multilift_marl.rendering.colours import tension_colours
+from multilift_marl.rendering.decor import Trail, add_box, add_lines, dashes
+from multilift_marl.sim.scene import DRONE_COLOURS, PAYLOAD_COLOUR, build_model
+
+if TYPE_CHECKING:
+    from multilift_marl.envs.core import MultiliftVec
+
+_MAX_GEOMS = 20_000
+_CABLE, _LINE, _DASH = 0.0013, 0.0011, 0.016  # radii and length, over the camera's distance: visible from anywhere
+_GLOW = 0.5  # of cables, so that light and shade change their colour less
+_PATH_COLOUR, _TRAIL_STRENGTH = (0.0, 0.60, 0.25, 0.9), 0.75
+
+
+class Stage:
+    """One environment as MuJoCo's abstract scene, which needs no OpenGL.
+
+    Args:
+        vec: the environments; they are only read.
+        camera: one of `cameras.CAMERAS`.
+        aspect: width over height of the picture.
+        trail: seconds of flight that payload and drones draw behind them; 0 for none.
+
+    Attributes:
+        model, data: the same system with looks, in the state last shown.
+        scene: what there is to draw.
+        camera: from where.
+
+    Raises:
+        RenderingError: an unknown camera.
+    """
+
+    def __init__(self, vec: MultiliftVec, camera: str = "side", aspect: float = 16 / 9, trail: float = 0.0):
+        self._vec, system = vec, vec.world.system
+        self.model, _ = build_model(system, visuals=True)
+        self.data = mujoco.MjData(self.model)
+        self.camera = Camera(vec, self.model, camera, aspect)
+        self.scene = mujoco.MjvScene(self.model, maxgeom=_MAX_GEOMS)
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = camera != "top"
+        self._option = mujoco.MjvOption()
+        self._target = self.model.body("target").id
+        self._trail, self._episode, self._time = Trail(trail), (-1, -1, -1), 0.0
+        colours = [DRONE_COLOURS[n % len(DRONE_COLOURS)] for n in range(vec.num_drones)]
+        self._trail_colours = np.array([PAYLOAD_COLOUR, *colours]) * [1, 1, 1, _TRAIL_STRENGTH]
+        self._links = [self._find_links(n) for n in range(vec.num_drones)]
+        self._chains = {geom for links in self._links for geom in links}
+        fog = self.model.vis.map  # as far away as the camera may be
+        far = max(1.0, self.camera.view.distance / 6.0)
+        fog.fogstart, fog.fogend = far * fog.fogstart, far * fog.fogend
+
+    def update(self, env: int, look: Callable[[mujoco.MjvCamera], None] | None = None) -> None:
+        """Show environment `env` as it is now; one that has diverged stays as last shown.
+
+        Args:
+            env: which.
+            look: called with a copy of the camera, to take the picture from elsewhere.
+        """
+        vec = self._vec
+        time = float(vec.steps[env]) * vec.task.dt
+        episode = (env, int(vec.seeds[env]), int(vec.episodes[env]))
+        if episode != self._episode or time < self._time:
+            self._trail.clear()
+            self.camera.start(env)
+        self._episode, self._time = episode, time
+        path = vec.task.route(env)
+        self._pose(env)
+        self.camera.aim(env, path)
+        view = self.camera.view
+        if look is not None:
+            view = copy.copy(view)
+            look(view)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, self.data, self._option, None, view, everything, self.scene)
+        for geom in self.scene.geoms[: self.scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_TENDON:
+                geom.emission = _GLOW
+            elif geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                if self.model.geom_bodyid[geom.objid] in (0, self._target):
+                    geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # casts no shadow
+                elif geom.objid in self._chains:
+                    geom.emission = _GLOW
+        self._decorate(env, time, path)
+
+    def _pose(self, env: int) -> None:
+        world, goal = self._vec.world, self._vec.task.goal
+        if not world.diverged[env]:
+            self.data.qpos[:] = world.qpos(env)
+        colours = tension_colours(world.state.cable_tension[env], world.system.resting_tension)
+        radius = _CABLE * self.camera.view.distance
+        if self.model.ntendon:
+            self.model.tendon_width[:] = radius
+            self.model.tendon_rgba[:, :3], self.model.tendon_rgba[:, 3] = colours, ~world.state.cable_broken[env]
+        for links, colour in zip(self._links, colours, strict=True):
+            self.model.geom_rgba[links, :3], self.model.geom_size[links, 0] = colour, radius
+        self.data.mocap_pos[0] = goal.position[env]
+        self.data.mocap_quat[0] = mat_to_quat(tuple(goal.rotation[env].ravel()))
+        mujoco.mj_fwdPosition(self.model, self.data)
+
+    def _decorate(self, env: int, time: float, path: np.ndarray) -> None:
+        task, state, scene = self._vec.task, self._vec.world.state, self.scene
+        line, dash = _LINE * self.camera.view.distance, _DASH * self.camera.view.distance
+        for box in task.scenery(env):
+            add_box(scene, *box)
+        if len(path):
+            starts, ends = dashes(path, dash)
+            add_lines(scene, starts, ends, line, np.tile(np.float32(_PATH_COLOUR), (len(starts), 1)))
+        if self._trail.seconds > 0 and not self._vec.world.diverged[env]:
+            bodies = np.vstack([state.payload_position[env], state.drone_position[env]])
+            self._trail.add(time, bodies)
+            self._trail.draw(scene, time, bodies, line, self._trail_colours.astype(np.float32))
+
+    def _find_links(self, cable: int) -> list[int]:
+        """Return the geoms of a chain; none of a massless cable."""
+        names = [self.model.body(body).name for body in self.model.geom_bodyid]
+        return [geom for geom, name in enumerate(names) if name.startswith(f"cable_{cable}/")]

@@ -1,0 +1,203 @@
+"""What stands between the true state and a drone's observation, and between its command and its flight.
+
+Noise and bias are those of measured states: each drone measures its own, and all are told one measurement of the
+payload's. Delays are whole policy steps. Success, reward and the critic's global state know nothing of it, and the
+drones' own controllers fly by the true state. docs/randomization.md says the same in a table.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.schema import RandomizationConfig
+from multilift_marl.math3d import add, axis_angle, mat, matmul, matrow, norm, put, putmat, row, scale, vec
+from multilift_marl.sim.generator import normal_pair
+from multilift_marl.sim.state import SystemState
+from multilift_marl.tasks.terms import Errors
+
+STANDARD = np.array([0.005, 0.05, 0.01, 0.1])  # position [m], velocity [m/s], rotation [rad], angular velocity [rad/s]
+
+
+class Memory(NamedTuple):
+    """What sensors and links remember; environment first."""
+
+    generator: np.ndarray
+    """(E,) uint64, state of the random numbers."""
+    bias: np.ndarray
+    """(E, N + 1, 4, 3) of each drone's measurements, then of the payload's, as `STANDARD` lists them."""
+    sent: np.ndarray
+    """(E,) actions since the reset."""
+    seen: np.ndarray
+    """(E,) observations since the reset."""
+    action_delay: np.ndarray
+    """(E,) [policy steps]."""
+    observation_delay: np.ndarray
+    """(E,) [policy steps]."""
+    actions: np.ndarray
+    """(E, K, N, A) the last ones, at their number modulo K."""
+    observations: np.ndarray
+    """(E, K, N, D) likewise."""
+
+
+class Imperfections:
+    """Noise, bias and delays of E teams.
+
+    Args:
+        ranges: how large they are.
+        shape: E, N, A, D.
+        critic: numbers of the global state.
+        attitude: whether the payload has one.
+
+    Attributes:
+        memory: Memory.
+        state: what is measured (SystemState; tensions, rotors and cables are not).
+        errors: the payload's errors as measured, with their own integrals.
+        noisy, late, slow: whether there is noise or bias, a delay of observations, one of actions.
+        on: whether there is any of these.
+        applied: actions that the drones fly (E, N, A).
+    """
+
+    def __init__(self, ranges: RandomizationConfig, shape: tuple[int, int, int, int], critic: int, attitude: bool):
+        e, n, a, d = shape
+        self.noise = STANDARD * ranges.observation_noise
+        self.bias = STANDARD * ranges.observation_bias
+        (_, slowest), (_, latest) = ranges.action_delay, ranges.observation_delay
+        self.noisy, self.late, self.slow = bool(self.noise.any() or self.bias.any()), latest > 0, slowest > 0
+        counts = (np.zeros(e, np.int64) for _ in range(4))
+        self.memory = Memory(
+            np.zeros(e, np.uint64), np.zeros((e, n + 1, 4, 3)), *counts,
+            np.zeros((e, (slowest + 1) * self.slow, n, a)), np.zeros((e, (latest + 1) * self.late, n, d), np.float32),
+        )  # fmt: skip
+        self.state, self.errors = SystemState.zeros(e, n), Errors.zeros(e)
+        self.applied = np.zeros((e, n, a))
+        self.unused = np.zeros((e, critic), np.float32)
+        self.on = self.noisy or self.late or self.slow
+        self._attitude = attitude
+
+    def start(self, env: int, seed: np.random.SeedSequence) -> None:
+        """Begin an episode of one environment: draw its biases, forget what was sent and seen."""
+        memory = self.memory
+        memory.generator[env] = seed.generate_state(1, np.uint64)[0]
+        draw_bias(env, memory, self.bias)
+        memory.sent[env] = memory.seen[env] = 0
+        memory.actions[env] = 0.0
+        self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
+
+    def sense(self, lo: int, hi: int, state: SystemState) -> tuple[Any, tuple]:
+        """Return the kernel that measures, with its arguments."""
+        return sense, (lo, hi, state, self.state, self.memory, self.noise, self._attitude)
+
+    def delay(self, lo: int, hi: int, observation: np.ndarray, own: tuple[int, int]) -> tuple[Any, tuple]:
+        """Return the kernel that holds observations back, with its arguments; see `delay_observations`."""
+        return delay_observations, (lo, hi, observation, self.memory, *own)
+
+    def send(self, lo: int, hi: int, action: np.ndarray) -> tuple[Any, tuple]:
+        """Return the kernel that holds actions back, with its arguments."""
+        return delay_actions, (lo, hi, action, self.memory, self.applied)
+
+    def drawn(self) -> dict[str, np.ndarray]:
+        """Return the live arrays of what an episode draws of it, by the names of `randomization`."""
+        memory = self.memory
+        drawn = {"action_delay": memory.action_delay} if self.slow else {}
+        drawn |= {"observation_delay": memory.observation_delay} if self.late else {}
+        return drawn | ({"observation_bias": memory.bias} if self.bias.any() else {})
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the live arrays that outlive a step."""
+        if not self.on:
+            return {}
+        return self.memory._asdict() | {f"errors_{name}": array for name, array in self.errors._asdict().items()}
+
+
+@kernel
+def draw_bias(e, memory, size):
+    """Draw the biases of environment e, normal with standard deviations `size` (4,)."""
+    for i in range(memory.bias.shape[1]):
+        for kind in range(4):
+            put(memory.bias[e, i, kind], scale(size[kind], _normal(e, memory)))
+
+
+@kernel
+def _normal(e, memory):
+    """Return three independent standard normal numbers."""
+    (a, b), (c, _) = normal_pair(e, memory), normal_pair(e, memory)
+    return (a, b, c)
+
+
+@kernel
+def _off(e, i, kind, memory, noise):
+    """Return how far a measurement is off: its bias and, drawn anew, its noise."""
+    return add(vec(memory.bias[e], i, kind), scale(noise[kind], _normal(e, memory)))
+
+
+@kernel
+def _turned(off, attitude):
+    """Return an attitude turned by a rotation vector in the world frame."""
+    angle = norm(off)
+    return matmul(axis_angle(scale(1.0 / angle, off), angle), attitude) if angle > 0.0 else attitude
+
+
+@kernel
+def sense(lo, hi, state, seen, memory, noise, attitude):
+    """Measure the state of environments lo to hi.
+
+    Args:
+        lo, hi: the environments.
+        state: true.
+        seen: written, what is measured.
+        memory: Memory; its generators advance.
+        noise: standard deviations (4,), as `STANDARD` lists them.
+        attitude: whether the payload has one.
+    """
+    count = state.drone_position.shape[1]
+    for e in range(lo, hi):
+        for n in range(count):
+            put(seen.drone_position[e, n], add(vec(state.drone_position, e, n), _off(e, n, 0, memory, noise)))
+            put(seen.drone_velocity[e, n], add(vec(state.drone_velocity, e, n), _off(e, n, 1, memory, noise)))
+            turned = _turned(_off(e, n, 2, memory, noise), mat(state.drone_rotation, e, n))
+            putmat(seen.drone_rotation[e, n], turned)
+            put(seen.drone_body_rates[e, n], add(vec(state.drone_body_rates, e, n), _off(e, n, 3, memory, noise)))
+        put(seen.payload_position[e], add(row(state.payload_position, e), _off(e, count, 0, memory, noise)))
+        put(seen.payload_velocity[e], add(row(state.payload_velocity, e), _off(e, count, 1, memory, noise)))
+        seen.payload_rotation[e] = state.payload_rotation[e]
+        seen.payload_body_rates[e] = state.payload_body_rates[e]
+        if attitude:
+            turned = _turned(_off(e, count, 2, memory, noise), matrow(state.payload_rotation, e))
+            putmat(seen.payload_rotation[e], turned)
+            put(seen.payload_body_rates[e], add(row(state.payload_body_rates, e), _off(e, count, 3, memory, noise)))
+
+
+@kernel
+def delay_observations(lo, hi, observation, memory, first, last):
+    """Replace observations of environments lo to hi by those of `observation_delay` steps ago, at first by the first.
+
+    Numbers first to last, the own last action, are a drone's own and stay.
+    """
+    held = memory.observations
+    for e in range(lo, hi):
+        now = memory.seen[e]
+        held[e, now % held.shape[1]] = observation[e]
+        then = now - min(memory.observation_delay[e], now)
+        for n in range(observation.shape[1]):
+            for k in range(observation.shape[2]):
+                if not first <= k < last:
+                    observation[e, n, k] = held[e, then % held.shape[1], n, k]
+        memory.seen[e] = now + 1
+
+
+@kernel
+def delay_actions(lo, hi, action, memory, applied):
+    """Write the actions of `action_delay` steps ago to `applied`, zeros before the first."""
+    held = memory.actions
+    for e in range(lo, hi):
+        now = memory.sent[e]
+        held[e, now % held.shape[1]] = action[e]
+        then = now - memory.action_delay[e]
+        if then >= 0:
+            applied[e] = held[e, then % held.shape[1]]
+        else:
+            applied[e] = 0.0
+        memory.sent[e] = now + 1

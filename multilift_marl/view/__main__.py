@@ -1,0 +1,79 @@
+"""`python -m multilift_marl.view task=hover run=hover`: watch a team in the browser."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from multilift_marl.cli.common import run_command
+from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.schema import Config
+from multilift_marl.errors import ConfigError
+from multilift_marl.view.page import HOST, Page
+from multilift_marl.view.session import Session
+
+_USAGE = f"""Watch a team in the browser, at an address of this machine alone ({HOST}).
+
+  python -m multilift_marl.view task=hover run=hover [key=value ...]
+
+  task    a configuration's name or path                      (the run's own, or hover)
+  run     a run folder, "latest", or the name of a shipped policy ("hover"); none: scripts only
+  policy  which flies first: run, or a script                 (run, or formation)
+  seed    evaluation seed: the episodes are those of evaluate.py        (1000)
+  port    of the address; 0 for any free one                  (8080)
+
+Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, cable.model=chain."""
+
+_DEFAULTS = {"task": None, "run": None, "policy": None, "seed": 1000, "port": 8080}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve until interrupted; return the exit status."""
+    return run_command(_view, _USAGE, arguments)
+
+
+def _view(values: dict[str, Any]) -> int:
+    page = Page(*make_session(values))
+    print(f"watch at http://{HOST}:{page.port} (Ctrl-C ends it)", flush=True)
+    try:
+        page.run()
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        page.close()
+
+
+def make_session(values: dict[str, Any]) -> tuple[Session, int]:
+    """Return the session that key=value arguments ask for, and the port.
+
+    Raises:
+        ConfigError, CheckpointError: a wrong value, or there is no such task, run or policy.
+    """
+    own = {key: values.pop(key, default) for key, default in _DEFAULTS.items()}
+    for key, most in (("seed", 2**63 - 1), ("port", 65535)):
+        if not isinstance(own[key], int) or isinstance(own[key], bool) or not 0 <= own[key] <= most:
+            raise ConfigError(f"{key} must be a whole number from 0 to {most}, but is {own[key]!r}")
+    learned: dict[str, Any] = {}
+    if own["run"] is not None:
+        learned["run"] = _load(str(own["run"]))
+    config = _find_config(own["task"], learned, {**values, "env.num_envs": 1, "env.num_threads": 1})
+    policy = own["policy"] if own["policy"] is not None or not learned else "run"
+    return Session(config, learned, None if policy is None else str(policy), own["seed"]), own["port"]
+
+
+def _find_config(task: Any, learned: dict[str, Any], overrides: dict[str, Any]) -> Config:
+    if task is None and learned:
+        return build_config(learned["run"].config.model_dump(), overrides)
+    return load_config("hover" if task is None else str(task), overrides)
+
+
+def _load(run: str) -> Any:
+    from multilift_marl.agents.checkpoint import find_run
+    from multilift_marl.agents.policy import load_policy, shipped_policies
+
+    return load_policy(run if run in shipped_policies() else find_run(run))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,175 @@
+"""A flight to watch: one environment, a policy, and what a spectator may do to them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from multilift_marl.config.schema import Config
+from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.envs.core import EVALUATION, MultiliftVec
+from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.evaluation.rollout import Policy
+
+_MOST_STEPS = 20  # at once: a machine that is too slow falls behind in place of choking
+PUSH_SECONDS = 0.5
+
+
+class Session:
+    """Episodes of one environment, one after the other, flown in step with the clock.
+
+    Every method may be called from any thread.
+
+    Args:
+        config: the environment.
+        learned: trained policies by name, in place of their makers for scripts.
+        policy: name of the one that flies first; None for the first that fits.
+        seed: of the episodes, those of `evaluate.py`.
+
+    Attributes:
+        vec: the environment.
+        policies: names of the policies that fit it.
+        policy: name of the one that flies.
+        paused: whether the clock stands still.
+        speed: simulated seconds in a second.
+        outcome: how the last episode ended, in words.
+
+    Raises:
+        ConfigError: there is no such policy, or it does not fit the environment.
+    """
+
+    def __init__(self, config: Config, learned: dict[str, Any], policy: str | None = None, seed: int = 1000):
+        self.vec = vec = MultiliftVec(config, EVALUATION)
+        self._lock = threading.RLock()
+        self._makers = _fitting(vec, learned)
+        self.policies = tuple(self._makers)
+        self.policy = self._checked(policy if policy is not None else next(iter(self._makers), "none"), learned)
+        self._pilot = self._makers[self.policy](vec)
+        self.paused, self.speed, self.outcome = False, 1.0, ""
+        self._behind, self._calm, self._push_left = 0.0, np.zeros(3), 0
+        self._observation, _ = vec.reset(seed=seed)
+
+    def advance(self, seconds: float) -> int:
+        """Let the clock run on by `seconds` of the spectator's time; return how many policy steps were flown."""
+        with self._lock:
+            if self.paused:
+                return 0
+            self._behind = min(self._behind + seconds * self.speed, _MOST_STEPS * self.vec.task.dt)
+            flown = int(self._behind / self.vec.task.dt)
+            for _ in range(flown):
+                self.step()
+            self._behind -= flown * self.vec.task.dt
+            return flown
+
+    def step(self) -> None:
+        """Fly one policy step; after the end of an episode, start the next."""
+        with self._lock:
+            vec = self.vec
+            if vec.ended[0]:
+                self._observation, _ = vec.reset()
+                self._start()
+                return
+            self._observation, _, terminated, _, info = vec.step(self._pilot.act(self._observation))
+            if self._push_left:
+                self._push_left -= 1
+                if not self._push_left:
+                    vec.world.plant.payload_force[0] = self._calm
+            if vec.ended[0]:
+                cause = vec.failure_causes[info["failure_cause"][0]]
+                ended = "success" if info["success"][0] else f"failure: {cause}" if terminated[0] else "no success"
+                self.outcome = f"episode {vec.episodes[0]}: {ended}, {100 * vec.task.errors.distance[0]:.1f} cm"
+
+    def reset(self) -> None:
+        """Start the episode in progress anew."""
+        with self._lock:
+            vec = self.vec
+            vec.episodes[0] -= 1
+            self._observation, _ = vec.reset()
+            self._start()
+
+    def skip(self) -> None:
+        """Start the next episode."""
+        with self._lock:
+            self._observation, _ = self.vec.reset()
+            self._start()
+
+    def choose(self, policy: str) -> None:
+        """Hand the team over to another policy, in flight.
+
+        Raises:
+            ConfigError: there is no such policy here.
+        """
+        with self._lock:
+            self.policy = self._checked(policy, {})
+            self._pilot = self._makers[policy](self.vec)
+            self._pilot.reset()
+
+    def push(self, heading: float, elevation: float, force: float) -> None:
+        """Push the payload for PUSH_SECONDS.
+
+        Args:
+            heading: of the force, from x towards y [deg].
+            elevation: above the horizontal plane [deg].
+            force: its strength [N].
+        """
+        with self._lock:
+            heading, elevation = np.deg2rad(heading), np.deg2rad(elevation)
+            direction = [np.cos(elevation) * np.cos(heading), np.cos(elevation) * np.sin(heading), np.sin(elevation)]
+            plant = self.vec.world.plant
+            if not self._push_left:
+                self._calm = plant.payload_force[0].copy()
+            plant.payload_force[0] = self._calm + force * np.array(direction)
+            self._push_left = max(1, round(PUSH_SECONDS / self.vec.task.dt))
+
+    def locked(self) -> threading.RLock:
+        """Return the lock that keeps the environment as it is while it is held."""
+        return self._lock
+
+    def status(self) -> str:
+        """Return in words (Markdown) where the flight stands."""
+        with self._lock:
+            vec, errors = self.vec, self.vec.task.errors
+            tension = vec.world.state.cable_tension[0]
+            lines = (
+                f"**{vec.task.name}**, {vec.num_drones} drones, episode {vec.episodes[0]}",
+                f"{vec.steps[0] * vec.task.dt:.1f} of {vec.max_steps * vec.task.dt:g} s",
+                f"payload {100 * errors.distance[0]:.1f} cm and {np.rad2deg(errors.angle[0]):.1f}° off",
+                f"tension {tension.min():.2f} to {tension.max():.2f} N",
+                self.outcome,
+            )
+            return "  \n".join(line for line in lines if line)
+
+    def _start(self) -> None:
+        self._push_left, self._behind = 0, 0.0
+        self._pilot.reset()
+
+    def _checked(self, policy: str, learned: dict[str, Any]) -> str:
+        if policy in learned and policy not in self._makers:
+            raise ConfigError(f"the policy {policy} {_misfit(self.vec, learned[policy])}")
+        if policy not in self._makers:
+            raise ConfigError(f"unknown policy '{policy}'{nearest(policy, self._makers)}")
+        return policy
+
+
+def _fitting(vec: MultiliftVec, learned: dict[str, Any]) -> dict[str, Callable[[MultiliftVec], Policy]]:
+    """Return the makers of all policies that fit, learned ones first."""
+    makers: dict[str, Callable[[MultiliftVec], Policy]] = {}
+    for name, policy in learned.items():
+        if not _misfit(vec, policy):
+            makers[name] = lambda _, policy=policy: policy
+    if vec.config.control.action == "reference":
+        makers |= {name: lambda vec, name=name: make_scripted(name, vec) for name in SCRIPTED}
+    return makers
+
+
+def _misfit(vec: MultiliftVec, policy: Any) -> str:
+    """Return why a learned policy does not fit, "" if it does."""
+    trained, asked = policy.config.control.action, vec.config.control.action
+    if policy.action_names != vec.action_names:
+        return f"acts by control.action={trained}, not {asked}; set control.action={trained}"
+    if policy.observation_names != vec.observation_names:
+        return f"was trained in task {policy.config.task}, whose observations differ; fly that, or another policy"
+    return ""

@@ -1,0 +1,219 @@
+"""What pictures show beside the bodies: tension as colour, trails, paths, scenery; and where they are taken from."""
+
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import make, zeros
+
+from multilift_marl.rendering import Stage
+from multilift_marl.rendering.colours import DOUBLE, RESTING, SLACK, from_oklab, tension_colours, to_oklab
+from multilift_marl.rendering.decor import dashes
+from multilift_marl.sim.scene import DRONE_COLOURS
+from multilift_marl.tasks.base import Box
+from multilift_marl.tasks.paths import own_time
+
+TENDON, GEOM = int(mujoco.mjtObj.mjOBJ_TENDON), int(mujoco.mjtObj.mjOBJ_GEOM)
+# Dichromats' view of linear sRGB: Viénot, Brettel and Mollon 1999 (protan, deutan); Brettel's tritan, one half-plane
+BLIND = {
+    "protan": [[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]],
+    "deutan": [[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]],
+    "tritan": [[1.01277, 0.13548, -0.14826], [-0.01243, 0.86812, 0.14431], [0.07589, 0.80500, 0.11911]],
+}
+
+
+def shown(vec, env=0, **keywords):
+    stage = Stage(vec, **keywords)
+    stage.update(env)
+    return stage
+
+
+def geoms(stage):
+    return list(stage.scene.geoms[: stage.scene.ngeom])
+
+
+def cable_colours(stage):
+    """Return the colours (N, 3) in which cables are drawn."""
+    found = {}
+    for geom in geoms(stage):
+        if geom.objtype == TENDON:
+            found[geom.objid] = np.array(geom.rgba[:3])
+        elif geom.objtype == GEOM:
+            name = stage.model.body(stage.model.geom_bodyid[geom.objid]).name
+            if name.startswith("cable_"):
+                found[int(name.split("/")[0].removeprefix("cable_"))] = np.array(geom.rgba[:3])
+    return np.array([found[n] for n in sorted(found)])
+
+
+def extra(stage):
+    """Return the geoms that are no part of the model."""
+    return [geom for geom in geoms(stage) if geom.objtype == mujoco.mjtObj.mjOBJ_UNKNOWN]
+
+
+def test_oklab_is_that_of_its_author():
+    assert np.allclose(to_oklab(np.ones(3)), [1, 0, 0], atol=1e-4)
+    assert np.allclose(to_oklab([1.0, 0.0, 0.0]), [0.627955, 0.224863, 0.125846], atol=1e-5)  # published for sRGB red
+    colours = np.random.default_rng(0).uniform(size=(50, 3))
+    assert np.allclose(from_oklab(to_oklab(colours)), colours, atol=1e-6)
+
+
+def test_the_scale_goes_from_grey_over_blue_to_red_in_equal_steps():
+    ratios = np.linspace(0, 2, 17)
+    colours = tension_colours(10.0 * ratios, np.full(17, 10.0))
+    for at, end in ((0, SLACK), (8, RESTING), (16, DOUBLE)):
+        assert np.allclose(colours[at], end, atol=1e-6)
+    assert (tension_colours(np.array([30.0, np.inf]), np.full(2, 10.0)) == colours[16]).all()
+    lab = to_oklab(colours)
+    for half in (lab[:9], lab[8:]):
+        steps = [np.linalg.norm(b - a) for a, b in pairwise(half)]
+        assert max(steps) < 1.05 * min(steps)
+
+
+@pytest.mark.parametrize("kind", BLIND)
+def test_the_colour_blind_tell_slack_resting_and_double_apart(kind):
+    colours = np.array([SLACK, RESTING, DOUBLE])
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ np.array(BLIND[kind]).T, 0, 1)
+    lab = to_oklab(np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055))
+    apart = [np.linalg.norm(lab[i] - lab[j]) for i, j in ((0, 1), (1, 2), (0, 2))]
+    assert min(apart) > 0.15  # 0.02 is just noticeable
+
+
+@pytest.mark.parametrize("cable", ["massless", "chain"])
+def test_cables_wear_their_tension(cable):
+    vec = make(num_envs=1, num_drones=3, **{"cable.model": cable})
+    vec.reset(seed=0)
+    resting = vec.world.system.resting_tension
+    vec.world.state.cable_tension[0] = resting * [0, 1, 2]
+    assert np.allclose(cable_colours(shown(vec)), [SLACK, RESTING, DOUBLE], atol=1e-3)
+    vec.world.state.cable_tension[0] = resting * [2, 0, 1]
+    assert np.allclose(cable_colours(shown(vec)), [DOUBLE, SLACK, RESTING], atol=1e-3)
+
+
+def test_a_broken_cable_is_not_drawn():
+    vec = make(num_envs=1, num_drones=3)
+    vec.reset(seed=0)
+    vec.world.break_cables(np.array([[False, True, False]]))
+    drawn = {geom.objid for geom in geoms(shown(vec)) if geom.objtype == TENDON and geom.rgba[3] > 0}
+    assert drawn == {0, 2}
+
+
+def test_trails_follow_payload_and_drones_and_fade():
+    vec = make(num_envs=1, num_drones=2)
+    vec.reset(seed=0)
+    stage = shown(vec, trail=1.0)
+    assert not [geom for geom in extra(stage) if geom.rgba[3] > 0.01 and geom.size[2] > 1e-4]
+    past = [vec.world.state.drone_position[0, 1].copy()]
+    for _ in range(20):
+        vec.step(zeros(vec))
+        past.append(vec.world.state.drone_position[0, 1].copy())
+        stage.update(0)
+    colour = DRONE_COLOURS[1][:3]
+    trail = [geom for geom in extra(stage) if np.allclose(geom.rgba[:3], colour, atol=1e-3)]
+    middles = np.array([geom.pos for geom in trail])
+    assert len(trail) >= 10
+    gaps = np.linalg.norm(middles[:, None] - np.array(past)[None], axis=2).min(axis=1)
+    assert gaps.max() < 0.05  # each piece lies where the drone was
+    strength = [geom.rgba[3] for geom in trail]
+    assert strength == sorted(strength) and strength[0] < 0.75 * strength[-1]
+
+
+def test_a_trail_ends_after_its_time_and_with_its_episode():
+    vec = make(num_envs=1, num_drones=2)
+    vec.reset(seed=0)
+    stage, lengths = shown(vec, trail=0.2), []
+    for _ in range(40):
+        vec.step(zeros(vec))
+        stage.update(0)
+        lengths.append(len(extra(stage)))
+    assert max(lengths[20:]) <= max(lengths[:15])
+    vec.reset()
+    stage.update(0)
+    assert len(extra(stage)) <= 3 < lengths[-1]
+    assert not extra(shown(vec))  # none unless asked for
+
+
+def test_the_path_of_a_track_is_dashed_through_its_targets():
+    vec = make("track", num_envs=1, **{"env.episode_seconds": 6.0, "task_options.path": "circle"})
+    vec.reset(seed=3)
+    lines = np.array([geom.pos for geom in extra(shown(vec))])
+    assert len(lines) > 20
+    for step in range(150):
+        if step % 30 == 0:
+            assert np.linalg.norm(lines - vec.task.goal.position[0], axis=1).min() < 0.25
+        vec.step(zeros(vec))
+    route = vec.task.route(0)
+    assert np.linalg.norm(lines[:, None] - route[None], axis=2).min(axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("path, closes", [("circle", True), ("figure8", True), ("lemniscate", True), ("random", False)])
+def test_a_path_that_repeats_is_drawn_once(path, closes):
+    options = {"task_options.path": path, "task_options.acceleration": 2.0, "task_options.rate": 0.8}
+    vec = make("track", num_envs=1, **options)
+    vec.reset(seed=0)
+    route = vec.task.route(0)
+    if closes:  # more than a round is flown
+        assert vec.task.path.rate[0] * own_time(vec.config.env.episode_seconds) > 2.2 * np.pi
+    assert (np.linalg.norm(route[-1] - route[0]) < 1e-6 * np.ptp(route, axis=0).max()) == closes
+    if path == "circle":
+        assert np.linalg.norm(np.diff(route, axis=0), axis=1).sum() == pytest.approx(10 * np.pi, rel=1e-3)
+
+
+def test_dashes_are_as_long_as_their_gaps():
+    corner = np.array([[0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]])
+    starts, ends = dashes(corner, 0.1)
+    assert len(starts) == len(ends) == 10
+    assert np.allclose(np.linalg.norm(ends - starts, axis=1), 0.1, atol=1e-9)
+    assert np.allclose(starts[0], corner[0]) and len(dashes(corner[:1], 0.1)[0]) == 0
+
+
+def test_scenery_stands_where_the_task_says(monkeypatch):
+    vec = make(num_envs=1)
+    vec.reset(seed=0)
+    before = len(extra(shown(vec)))
+    box = Box((0.1, 1.0, 2.0), (1.0, 2.0, 3.0), (0.5, 0.4, 0.3, 1.0))
+    monkeypatch.setattr(vec.task, "scenery", lambda env: [box])
+    found = extra(shown(vec))
+    assert len(found) == before + 1
+    for value, expected in ((found[-1].size, box.size), (found[-1].pos, box.position), (found[-1].rgba, box.rgba)):
+        assert np.allclose(value, expected, atol=1e-6)
+
+
+def test_the_walls_of_gates_are_scenery():
+    vec = make("gate", num_envs=2, **{"task_options.gates": 2})
+    vec.reset(seed=0)
+    for env in (0, 1):
+        boxes = vec.task.scenery(env)
+        assert len(boxes) == 6 and len(extra(shown(vec, env))) == 6
+        openings = {box.position[0] for box in boxes}
+        assert openings == set(vec.task.gates.x)
+
+
+def test_chase_looks_along_the_flight_and_stays_when_the_team_does():
+    vec = make("track", num_envs=1, **{"task_options.path": "circle", "task_options.rate": 0.4})
+    vec.reset(seed=1)
+    stage = Stage(vec, "chase")
+    for _ in range(400):
+        vec.step(zeros(vec))
+        stage.update(0)
+    forward, flight = stage.scene.camera[0].forward[:2], vec.world.state.payload_velocity[0, :2]
+    cosine = forward @ flight / np.linalg.norm(forward) / np.linalg.norm(flight)
+    assert np.linalg.norm(flight) > 1.0 and cosine > np.cos(np.deg2rad(30))
+    azimuth = stage.camera.view.azimuth
+    stage.update(0)
+    assert stage.camera.view.azimuth == azimuth
+
+
+def test_the_camera_above_a_track_sees_all_of_its_path():
+    vec = make("track", num_envs=1, **{"task_options.path": "circle"})
+    vec.reset(seed=1)
+    stage = shown(vec, camera="top")
+    camera, route = stage.scene.camera[0], vec.task.route(0)
+    away = route - camera.pos
+    depth = away @ camera.forward
+    up = (away @ camera.up) / depth / (camera.frustum_top / camera.frustum_near)
+    right = (away @ np.cross(camera.forward, camera.up)) / depth / (camera.frustum_top / camera.frustum_near) / (16 / 9)
+    assert max(np.abs(up).max(), np.abs(right).max()) < 1.0
+    assert max(np.abs(up).max(), np.abs(right).max()) > 0.6  # and not from afar
+    assert depth.min() > 0

@@ -1,0 +1,68 @@
+"""The window of render_mode="human": what is said without a display, and that it shows what is flown."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from multilift_marl.envs import multilift_v0
+from multilift_marl.envs.gymnasium_env import MultiliftGymnasiumEnv
+
+WATCH = """
+import sys, time, warnings
+import numpy as np
+from multilift_marl.envs import multilift_v0
+
+env = multilift_v0.parallel_env(render_mode="human", **{"env.num_threads": 1})
+env.reset(seed=0)
+window = env._pictures._window
+start = time.perf_counter()
+for _ in range(10):
+    env.step({agent: np.zeros(4) for agent in env.agents})
+print("in step with the clock", time.perf_counter() - start >= 8 * env.vec.task.dt)
+print("drawn", window.stage.scene.ngeom > 50, env.render() is None)
+middle = window.stage.camera.view.azimuth
+window._turned[0], window._zoom = 90.0, 0.5
+window.show()
+seen = window.stage.scene.camera[0]
+print("turned", abs(seen.forward[1]) < 0.2 and window.stage.camera.view.azimuth == middle)
+window._glfw.set_window_should_close(window._window, True)
+env.step({agent: np.zeros(4) for agent in env.agents})
+env.step({agent: np.zeros(4) for agent in env.agents})
+print("closed", not window.is_open, env.agents != [])
+env.close()
+"""
+
+
+def bare(**more):
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR")
+    return {key: value for key, value in os.environ.items() if key not in hidden} | more
+
+
+@pytest.mark.parametrize("face", ["multilift_v0.parallel_env", "MultiliftGymnasiumEnv"])
+def test_without_a_display_one_sentence_names_the_ways_out(face):
+    code = (
+        "from multilift_marl.envs import multilift_v0\n"
+        "from multilift_marl.envs.gymnasium_env import MultiliftGymnasiumEnv\n"
+        "from multilift_marl.errors import RenderingError\n"
+        f"env = {face}(render_mode='human')\n"
+        "try:\n    env.reset(seed=0)\nexcept RenderingError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=bare())
+    assert done.stdout.startswith("there is no display to open a window on; use render_mode"), done.stderr
+    assert "python -m multilift_marl.view" in done.stdout and done.stdout.count("\n") == 1 and not done.stderr
+
+
+def test_both_faces_of_one_team_offer_it():
+    for face in (multilift_v0.MultiliftParallelEnv, MultiliftGymnasiumEnv):
+        assert face.metadata["render_modes"] == ["rgb_array", "human"]
+
+
+@pytest.mark.skipif(not shutil.which("xvfb-run"), reason="no virtual display on this machine")
+def test_a_window_shows_every_step():
+    command = ["xvfb-run", "-a", "-s", "-screen 0 1280x720x24", sys.executable, "-c", WATCH]
+    done = subprocess.run(command, capture_output=True, text=True, env=bare())
+    told = ["in step with the clock True", "drawn True True", "turned True", "closed True True"]
+    assert done.stdout.splitlines() == told, done.stderr
