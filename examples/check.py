@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-NAMES = sorted(path.stem for path in HERE.glob("*.py") if path.stem != "check")
+NAMES = sorted(path.stem for path in (HERE / "requirements").glob("*.txt"))
 SIZES = {"iterations": 2, "horizon": 32}
 PACKAGES = (
     "stable_baselines3", "supersuit", "ray", "skrl", "tianshou", "torchrl", "torch", "gymnasium",

@@ -130,7 +130,7 @@ def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones):
         step = 0
         while zoo.agents:
             assert same(observation, np.concatenate([observations[name] for name in agents]))
-            assert info == infos["drone_0"]
+            assert same(info, infos["drone_0"])
             action = bold(env, step)[0]
             observation, reward, terminated, truncated, info = env.step(action)
             parts = dict(zip(agents, action.reshape(num_drones, -1), strict=True))

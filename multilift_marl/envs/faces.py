@@ -80,5 +80,5 @@ def solo_info(vec: MultiliftVec, info: dict[str, Any]) -> dict[str, Any]:
     told: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
     told["failure_cause"] = vec.failure_causes[info["failure_cause"][0]]
     told["reward_terms"] = dict(zip(vec.reward_terms, vec.task.terms[0].tolist(), strict=True))
-    told["randomization"] = {name: array[0] for name, array in info["randomization"].items()}
+    told["randomization"] = {name: array[0].copy() for name, array in info["randomization"].items()}
     return told

@@ -229,6 +229,10 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         told["failure_cause"] = np.where(mask, self._causes[info["failure_cause"]], None)
         terms = {name: np.where(mask, value, 0.0) for name, value in info["reward_terms"].items()}
         told["reward_terms"] = terms | {f"_{name}": mask.copy() for name in terms}
+        drawn = {}
+        for name, value in info["randomization"].items():
+            drawn[name] = np.where(mask.reshape(-1, *(1,) * (value.ndim - 1)), value, np.zeros_like(value))
+        told["randomization"] = drawn | {f"_{name}": mask.copy() for name in drawn}
         return told | {f"_{key}": mask.copy() for key in told}
 
 

@@ -44,7 +44,7 @@ from multilift_marl.sim.rows import (
     MAX_SPEED,
     MAX_STRETCH,
     clear_record,
-    keep_tension,
+    note_tensions,
     read_payload,
     write_payload,
 )
@@ -125,10 +125,11 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
                 state.drone_body_rates[e, n, j] = told[at + 10 + j]
             putmat(state.drone_rotation[e, n], quat_to_mat(told[at + 3], told[at + 4], told[at + 5], told[at + 6]))
             pull = 0.0 if state.cable_broken[e, n] else _tension(e, n, line, c, chain)
-            keep_tension(e, n, pull, state, record, c)
+            state.cable_tension[e, n] = pull
             slack = slack or pull <= chain.segments[n] * chain.weight[e, n]  # the drone holds the cable alone
         if slack:
             record.slack_time[e] += c.timestep
+    note_tensions(lo, hi, diverged, False, state, record, c)
 
 
 @kernel
@@ -204,7 +205,8 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
             q = mat_to_quat(matmul(transpose(frame), drone))
             line[at], line[at + 1], line[at + 2], line[at + 3] = q
             put(line[v : v + 3], sub(vec(state.drone_body_rates, e, i), tmul(drone, rate)))
-            keep_tension(e, i, _tension(e, i, line, c, chain), state, record, c)
+            state.cable_tension[e, i] = _tension(e, i, line, c, chain)
+    note_tensions(lo, hi, mask, True, state, record, c)
 
 
 @kernel

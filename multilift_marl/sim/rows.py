@@ -57,10 +57,11 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
             at += 7
             v += 6
             pull = tension[e - lo, n]
-            keep_tension(e, n, pull, state, record, c)
+            state.cable_tension[e, n] = pull
             slack = slack or pull <= 0.0
         if slack:
             record.slack_time[e] += c.timestep
+    note_tensions(lo, hi, diverged, False, state, record, c)
 
 
 @kernel
@@ -77,14 +78,21 @@ def read_payload(e, line, state, c):
 
 
 @kernel
-def keep_tension(e, n, pull, state, record, c):
-    """Note the tension [N] of cable n in state and record, and whether it breaks."""
-    state.cable_tension[e, n] = pull
-    if pull > c.breaking_load[n]:
-        state.cable_broken[e, n] = True
-    record.tension_min[e] = min(record.tension_min[e], pull)
-    record.tension_max[e] = max(record.tension_max[e], pull)
-    record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[e, n] * c.cable_length[e, n]))
+def note_tensions(lo, hi, chosen, which, state, record, c):
+    """Note in record how large the tensions in state are, and which cables break, where `chosen` (E,) is `which`.
+
+    One call for all: handing over a named tuple costs two atomic operations for each of its arrays.
+    """
+    for e in range(lo, hi):
+        if chosen[e] != which:
+            continue
+        for n in range(c.breaking_load.shape[0]):
+            pull = state.cable_tension[e, n]
+            if pull > c.breaking_load[n]:
+                state.cable_broken[e, n] = True
+            record.tension_min[e] = min(record.tension_min[e], pull)
+            record.tension_max[e] = max(record.tension_max[e], pull)
+            record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[e, n] * c.cable_length[e, n]))
 
 
 @kernel
@@ -130,7 +138,8 @@ def write_rows(rows, lo, hi, mask, state, record, c):
             anchor = (c.anchors[n, 0], c.anchors[n, 1], c.anchors[n, 2])
             cable = sub(hook_place(e, n, state, c.hooks), add(row(state.payload_position, e), mul(attitude, anchor)))
             pull = c.cable_stiffness[e, n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[e, n])
-            keep_tension(e, n, pull, state, record, c)
+            state.cable_tension[e, n] = pull
+    note_tensions(lo, hi, mask, True, state, record, c)
 
 
 @kernel
