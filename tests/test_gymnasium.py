@@ -126,8 +126,7 @@ def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones):
     agents = zoo.possible_agents
     for episode in range(2):  # seed 3's first episode, then the second
         seed = 3 if episode == 0 else None
-        (observation, info), (observations, infos) = env.reset(seed=seed), zoo.reset(seed=seed)
-        step = 0
+        step, (observation, info), (observations, infos) = 0, env.reset(seed=seed), zoo.reset(seed=seed)
         while zoo.agents:
             assert same(observation, np.concatenate([observations[name] for name in agents]))
             assert same(info, infos["drone_0"])
