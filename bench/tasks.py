@@ -1,0 +1,43 @@
+"""The core against bare MuJoCo stepping of the same model, for every task and for teams of 2 to 16 drones.
+
+    python bench/tasks.py [repeats=5] [seconds=1.0]
+
+Bare stepping starts from the state in which the task's teams are after a few steps, so that its contacts are in it.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+
+import multilift_marl as ml
+from bench import bare, core, measure
+from multilift_marl.config import load_config, parse_overrides
+
+TEAMS = (2, 4, 8, 16)
+
+
+def ratio(config: str, repeats: int, seconds: float, **overrides) -> tuple[float, float, float]:
+    """Return the core's ratio to bare stepping, and both times of an environment step [µs]."""
+    vec = ml.make_vec(load_config(config, overrides))
+    rates = measure({"bare": bare(vec, len(vec.world.shards)), "core": core(vec)}, repeats, seconds)
+    ratios = [value / reference for value, reference in zip(rates["core"], rates["bare"], strict=True)]
+    return statistics.median(ratios), *(1e6 / statistics.median(rates[name]) for name in ("bare", "core"))
+
+
+def main(arguments: list[str]) -> None:
+    """Measure and print two tables."""
+    values = parse_overrides(arguments)
+    repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+    print("| task | ratio to bare | bare [µs] | core [µs] |\n|---|---|---|---|")
+    for task in ml.list_tasks():
+        found, plain, whole = ratio(task, repeats, seconds)
+        print(f"| {task} | {found:.2f} | {plain:.1f} | {whole:.1f} |", flush=True)
+    print("\n| drones | ratio to bare | bare [µs] | core [µs] |\n|---|---|---|---|")
+    for count in TEAMS:
+        found, plain, whole = ratio("hover", repeats, seconds, **{"env.num_drones": count})
+        print(f"| {count} | {found:.2f} | {plain:.1f} | {whole:.1f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
