@@ -126,3 +126,21 @@ def test_boxes_that_cannot_be_held_level_do_not_upset_it(num_drones):
     flight = fly_episodes(config, lambda vec: make_scripted("payload_geometric", vec), 16, seed=1)
     assert not flight["failure_cause"].any()
     assert flight["payload_position_error_m"].mean() < 0.1
+
+
+@pytest.mark.parametrize("task", ["takeoff", "land"])
+def test_it_leaves_slack_cables_to_the_formation(task):
+    vec = make(task, num_envs=4)
+    script = make_scripted("payload_geometric", vec)
+    observation, _ = vec.reset(seed=0)
+    script.reset()
+    held = 0
+    for _ in range(vec.max_steps):
+        action = script.act(observation)
+        slack = np.linalg.norm(vec.task.goal.pull, axis=-1).max(axis=1) < 1e-9
+        assert np.isfinite(action).all() and not action[slack].any()
+        held += slack.sum()
+        observation, _, terminated, truncated, _ = vec.step(action)
+        if terminated.any() or truncated.all():
+            break
+    assert held > 0

@@ -23,6 +23,7 @@ from multilift_marl.math3d import (
     matmul,
     matrow,
     mul,
+    norm,
     put,
     rotation_vector,
     row,
@@ -133,6 +134,9 @@ def _steer(
     """
     mass = hanging.payload_mass
     for e in range(lo, hi):
+        if not _carried(e, way, rig):  # nothing is to be held yet: the formation alone
+            action[e], last[e], fresh[e] = 0.0, 0.0, True
+            continue
         attitude, payload = matrow(way.rotation, e), matrow(state.payload_rotation, e)
         apart = sub(row(state.payload_position, e), row(way.position, e))
         moving = sub(row(state.payload_velocity, e), row(way.velocity, e))
@@ -160,6 +164,15 @@ def _steer(
             for j in range(3):
                 action[e, n, j] = clip(offset[j] / max_offset, -1.0, 1.0)
         fresh[e] = False
+
+
+@kernel
+def _carried(e, way, rig):
+    """Return whether every cable is meant to pull at least half of what it does at rest."""
+    for n in range(rig.slots.shape[0]):
+        if norm(vec(way.pull, e, n)) < 0.5 * norm(row(rig.force, n)):
+            return False
+    return True
 
 
 @kernel
