@@ -108,7 +108,7 @@ def read_chains(rows, lo, hi, sensors, state, record, diverged, c, chain):
         sensors: 13 numbers of each drone (hi - lo, 13 N).
         state, record: written.
         diverged: (E,) bool, set, never cleared.
-        c, chain: Constants, Chain.
+        c, chain: Places, Chain.
     """
     for e in range(lo, hi):
         line, told = rows[e - lo], sensors[e - lo]

@@ -17,7 +17,8 @@ from multilift_marl.config.system import System
 from multilift_marl.math3d import add, clip, mat, mul, norm, put, row, scale, sub, tmul, vec
 from multilift_marl.sim.air import AIR_DENSITY, air_moment, ground_gain, spread_wash
 from multilift_marl.sim.gusts import blow
-from multilift_marl.sim.parameters import Parameters, lag_shares
+from multilift_marl.sim.parameters import lag_shares
+from multilift_marl.sim.rows import field_offset
 from multilift_marl.sim.scene import Layout
 
 
@@ -42,31 +43,17 @@ class Constants(NamedTuple):
     """(N, 3) the same of those whose speed falls."""
     drag: np.ndarray
     """(N, 3) linear drag of a drone along its axes [kg/s]."""
-    anchors: np.ndarray
-    """(N, 3) [m]."""
-    hooks: np.ndarray
-    """(N, 3) [m]."""
-    cable_length: np.ndarray
-    """(E, N) [m]."""
-    cable_stiffness: np.ndarray
-    """(E, N) [N/m]."""
-    breaking_load: np.ndarray
-    """(N,) [N]."""
-    qpos: int
-    """Offset of qpos in a row of `batch.state`; likewise the next ones."""
-    qvel: int
     force: int
+    """Offset of the payload's force in a row of `batch.state`."""
     drone_loads: np.ndarray
     """(N,) offsets of the drones' forces and torques."""
     world_torque: bool
     """Whether those torques are in the world frame in place of the body frame."""
-    payload_nq: int
-    payload_nv: int
 
 
-def make_constants(system: System, layout: Layout, parameters: Parameters, batch: Batch) -> Constants:
-    """Return the constants of `system`, live `parameters` and the places of fields in the rows of a batch."""
-    qpos, qvel, force, cartesian = (_offset(batch, name) for name in ("qpos", "qvel", "qfrc_applied", "xfrc_applied"))
+def make_constants(system: System, layout: Layout, batch: Batch) -> Constants:
+    """Return the constants of `system` and where its loads are in the rows of a batch."""
+    force, cartesian = field_offset(batch, "qfrc_applied"), field_offset(batch, "xfrc_applied")
     chain = system.cable_model == "chain"
     loads = [
         cartesian + 6 * body if chain else force + layout.payload_nv + 6 * n
@@ -85,26 +72,10 @@ def make_constants(system: System, layout: Layout, parameters: Parameters, batch
         rising=np.array([lag_shares(h / vehicle.rotor_time_constant_up) for vehicle in vehicles]),
         falling=np.array([lag_shares(h / vehicle.rotor_time_constant_down) for vehicle in vehicles]),
         drag=np.array([vehicle.drag for vehicle in vehicles], float),
-        anchors=np.ascontiguousarray(system.anchors),
-        hooks=np.ascontiguousarray(system.hooks),
-        cable_length=parameters.cable_length,
-        cable_stiffness=parameters.cable_stiffness,
-        breaking_load=system.breaking_load,
-        qpos=qpos,
-        qvel=qvel,
         force=force,
         drone_loads=np.array(loads),
         world_torque=chain,
-        payload_nq=layout.payload_nq,
-        payload_nv=layout.payload_nv,
     )
-
-
-def _offset(batch: Batch, name: str) -> int:
-    """Return where a state field starts in a row of `batch.state`."""
-    view = batch.bind(name)
-    start = view.__array_interface__["data"][0] - batch.state.__array_interface__["data"][0]
-    return start // batch.state.itemsize
 
 
 @kernel

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from math import isfinite, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
+from multilift_marl.config.system import System
 from multilift_marl.math3d import (
     add,
     dot,
@@ -19,11 +24,57 @@ from multilift_marl.math3d import (
     sub,
     vec,
 )
+from multilift_marl.sim.parameters import Parameters
+from multilift_marl.sim.scene import Layout
 from multilift_marl.sim.standing import hook_place
 
 MAX_SPEED = 100.0  # [m/s] beyond this a simulation has diverged
 MAX_RATE = 500.0  # [rad/s]
 MAX_STRETCH = 0.2  # [-] of a cable's length
+
+
+class Places(NamedTuple):
+    """Where things are, for reading and writing states."""
+
+    timestep: float
+    anchors: np.ndarray
+    """(N, 3) [m]."""
+    hooks: np.ndarray
+    """(N, 3) [m]."""
+    cable_length: np.ndarray
+    """(E, N) [m]."""
+    cable_stiffness: np.ndarray
+    """(E, N) [N/m]."""
+    breaking_load: np.ndarray
+    """(N,) [N]."""
+    qpos: int
+    """Offset of qpos in a row of `batch.state`; likewise the next one."""
+    qvel: int
+    payload_nq: int
+    payload_nv: int
+
+
+def make_places(system: System, layout: Layout, parameters: Parameters, batch: Batch) -> Places:
+    """Return the places of `system` with live `parameters` in the rows of a batch."""
+    return Places(
+        timestep=system.timestep,
+        anchors=np.ascontiguousarray(system.anchors),
+        hooks=np.ascontiguousarray(system.hooks),
+        cable_length=parameters.cable_length,
+        cable_stiffness=parameters.cable_stiffness,
+        breaking_load=system.breaking_load,
+        qpos=field_offset(batch, "qpos"),
+        qvel=field_offset(batch, "qvel"),
+        payload_nq=layout.payload_nq,
+        payload_nv=layout.payload_nv,
+    )
+
+
+def field_offset(batch: Batch, name: str) -> int:
+    """Return where a state field starts in a row of `batch.state`."""
+    view = batch.bind(name)
+    start = view.__array_interface__["data"][0] - batch.state.__array_interface__["data"][0]
+    return start // batch.state.itemsize
 
 
 @kernel
@@ -38,7 +89,7 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
         tension: cable tensions of the last physics step (hi - lo, N) [N].
         state, record: written.
         diverged: (E,) bool, set, never cleared.
-        c: Constants of `dynamics`.
+        c: Places.
     """
     for e in range(lo, hi):
         line = rows[e - lo]

@@ -28,7 +28,7 @@ from multilift_marl.sim.parameters import (
     write_lags,
     write_model,
 )
-from multilift_marl.sim.rows import read_rows, write_rows
+from multilift_marl.sim.rows import make_places, read_rows, write_rows
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.standing import hover_drone, make_drones
 from multilift_marl.sim.state import Air, Plant, Record, SystemState
@@ -216,7 +216,7 @@ class World:
             if local.any():
                 self._cut(shard)
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
-                self._write(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.record, *self.constants)
+                self._write(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.record, *self._places)
         self.diverged[mask] = False
 
     def check_warnings(self) -> None:
@@ -273,23 +273,23 @@ class World:
         return Parameters(*(array[shard.lo : shard.hi] for array in self.parameters))
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
-        edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int)
+        edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int).tolist()
         chain = self.system.cable_model == "chain"
         read, self._write = (read_chains, write_chains) if chain else (read_rows, write_rows)
         self._chain = make_chain(self.system, self.parameters) if chain else None
         shards = []
-        for lo, hi in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        for lo, hi in zip(edges[:-1], edges[1:], strict=True):
             batch = Batch(self.model, hi - lo, nthread=1, persistent=chain)
             # drones on chains are read from sensors; persistent batches compute those of the new state anyway
             step = functools.partial(batch.step, stage=mujoco.mjtStage.mjSTAGE_VEL) if chain else batch.step
-            constants = make_constants(self.system, self.layout, self.parameters, batch)  # the same for every shard
-            self.constants = (constants, self._chain) if chain else (constants,)
-            flow = make_air(self.system)
+            constants = make_constants(self.system, self.layout, batch)
+            places = make_places(self.system, self.layout, self.parameters, batch)  # the same for every shard
+            self._places = (places, self._chain) if chain else (places,)
+            span, told, flow = (batch.state, lo, hi), batch.bind("sensordata"), make_air(self.system)
             air, flow = (None, None) if flow.still else (self.air, flow)
-            span, told = (batch.state, lo, hi), batch.bind("sensordata")
             blown = (self.thrust, self.state, self.plant, self.record, constants, air, flow, self._varied)
             apply = bind(apply_loads, *span, *blown)
-            follow = bind(read, *span, told, self.state, self.record, self.diverged, *self.constants)
+            follow = bind(read, *span, told, self.state, self.record, self.diverged, *self._places)
             shards.append(Shard(lo, hi, batch, step, apply, follow, np.zeros((hi - lo, self.num_drones), bool)))
         return shards
 

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from multilift_marl.config.system import GRAVITY
+from multilift_marl.sim.dynamics import make_constants
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row, order_row
 from multilift_marl.validation.team import Team, make_team, poses, take_off, velocities
@@ -134,7 +135,8 @@ def loads(world: World) -> tuple[np.ndarray, np.ndarray]:
 
     The torques are in the frames of the bodies, for drones on chains in the world frame.
     """
-    constants, row = world.constants[0], world.shards[0].batch.state[0]
+    batch = world.shards[0].batch
+    constants, row = make_constants(world.system, world.layout, batch), batch.state[0]
     at = np.array([constants.force, *constants.drone_loads])[:, None] + np.arange(3)
     return row[at], row[at + 3]
 
