@@ -147,10 +147,15 @@ def _check_interfaces(flown: _Flown, config: Config, baseline: str) -> None:
 
 
 def _find_policy(run: str, checkpoint: str) -> _Flown:
+    import torch
+
     from multilift_marl.agents.checkpoint import find_run
     from multilift_marl.agents.policy import load_policy, shipped_policies
 
+    torch.set_num_threads(1)  # for networks this small, more of them only wait for each other
     if run in shipped_policies() and not Path(run).exists():
+        if checkpoint != "best":
+            raise ConfigError(f"checkpoint={checkpoint} means nothing to the shipped policy '{run}'; leave it out")
         policy, folder = load_policy(run), Path("runs") / f"shipped-{run}"
     else:
         folder = find_run(run)

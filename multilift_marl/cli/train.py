@@ -55,11 +55,12 @@ def _train(values: dict[str, Any]) -> int:
     if not finished:
         print(f"stopped after {minutes:.1f} min of training; go on with: python train.py resume={folder}")
         return 130
+    baseline = "formation_integral" if trainer.config.control.action == "reference" else "none"
     print(
         f"trained {trainer.frames:,} steps in {minutes:.1f} min: success {trainer.best[0]:.1%}, "
         f"payload error {-100 * trainer.best[1]:.2f} cm (best evaluation during training)\n"
         f"curves:   tensorboard --logdir {folder}\n"
-        f"evaluate: python evaluate.py run={folder} episodes=200 seed=1000 baseline=formation_integral video=true"
+        f"evaluate: python evaluate.py run={folder} episodes=200 seed=1000 baseline={baseline} video=true"
     )
     return 0
 
