@@ -101,4 +101,7 @@ def test_success_needs_the_angle_with_six_drones_alone():
 
 def test_one_drone_cannot_lose_itself():
     assert "raise env.num_drones" in refusal(make, "loss", num_drones=1)
+    for task in ("loss", "recover"):
+        message = refusal(make, task, **{"task_options.target_height": (2.0, 1.5)})
+        assert "task_options.target_height" in message and "must list the lower one first" in message
     assert "must list the earlier one first" in refusal(make, "loss", **{"task_options.loss_time": (4.0, 2.0)})

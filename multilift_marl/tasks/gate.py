@@ -18,6 +18,7 @@ from multilift_marl.sim.standing import hook_place
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Box, Task
 from multilift_marl.tasks.failures import WALL
+from multilift_marl.tasks.ground import ease
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.paths import STEP, differences, set_goal
 from multilift_marl.tasks.starts import hang_team, in_ball
@@ -151,21 +152,14 @@ class Gate(Task):
 
 
 @kernel
-def _smooth(s):
-    """Return the polynomial that rises from 0 to 1 between 0 and 1, smooth to the third derivative at both ends."""
-    s = min(max(s, 0.0), 1.0)
-    return s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
-
-
-@kernel
 def _place(e, t, gates):
     """Return where the target of environment e is at a time: straight through every gap, from x = -2 to 2 m."""
-    x = -2.0 + 4.0 * _smooth((t - gates.start) / gates.duration)
+    x = -2.0 + 4.0 * ease(t, gates.start, gates.duration)[0]
     y, before, last = 0.0, -2.0, 0.0
     for g in range(gates.x.shape[0]):
-        y += (gates.y[e, g] - last) * _smooth((x - before) / (gates.x[g] - 0.25 - before))
+        y += (gates.y[e, g] - last) * ease(x, before, gates.x[g] - 0.25 - before)[0]
         before, last = gates.x[g] + 0.25, gates.y[e, g]
-    y -= last * _smooth((x - before) / (2.0 - before))
+    y -= last * ease(x, before, 2.0 - before)[0]
     return (x, y, gates.level)
 
 

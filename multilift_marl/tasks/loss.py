@@ -17,23 +17,17 @@ from multilift_marl.math3d import norm, row
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.starts import StartRanges, start_near_target
+from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
 from multilift_marl.tasks.terms import mean_change, tolerance
 
 LEVEL_FROM = 6  # drones with which the rest can hold a payload level wherever one is lost
 
 
-class LossOptions(Section):
+class LossOptions(StartOptions):
     """When a drone is lost, where the team starts, and what counts as success."""
 
     loss_time: tuple[Float, Float] = Field((2.0, 4.0), description="[s] earliest and latest stop of the motors")
     snap: bool = Field(False, description="whether the lost drone's cable breaks, so that it is gone")
-    target_xy: Float = Field(1.0, ge=0, description="[m] target x and y within ± this")
-    target_height: tuple[Float, Float] = Field((1.5, 2.5), description="[m] lowest and highest target")
-    target_yaw: Float = Field(45.0, ge=0, le=180, description="[deg] target heading within ± this")
-    start_radius: Float = Field(0.5, ge=0, description="[m] start within a ball of this radius about the target")
-    start_tilt: Float = Field(10.0, ge=0, le=90, description="[deg] largest tilt of the payload at the start")
-    start_speed: Float = Field(0.3, ge=0, description="[m/s] largest speed of the team at the start")
     success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of its target ...")
     success_angle: Float = Field(10.0, gt=0, description="[deg] ... and, with six drones or more, of its attitude ...")
     success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds")
@@ -65,19 +59,15 @@ class Loss(Task):
         early, late = self.options.loss_time
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={self.options.loss_time} must list the earlier one first")
+        self._ranges = make_ranges(self.options)
         self.when, self.who = np.zeros(world.num_envs), np.zeros(world.num_envs, np.int64)
         world.breakable = world.breakable or self.options.snap
         self._angle = radians(self.options.success_angle) if world.num_drones >= LEVEL_FROM else np.inf
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, start, drone and time; see `Task.start`."""
-        option = self.options
-        ranges = StartRanges(
-            option.target_xy, *option.target_height, radians(option.target_yaw),
-            option.start_radius, radians(option.start_tilt), option.start_speed,
-        )  # fmt: skip
-        start_near_target(env, rng, self.world.state, self.goal, self.rig, ranges, self.hanging, mass)
-        self.who[env], self.when[env] = rng.integers(self.world.num_drones), rng.uniform(*option.loss_time)
+        start_near_target(env, rng, self.world.state, self.goal, self.rig, self._ranges, self.hanging, mass)
+        self.who[env], self.when[env] = rng.integers(self.world.num_drones), rng.uniform(*self.options.loss_time)
         self.watch.lost[env] = False
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:

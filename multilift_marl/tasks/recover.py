@@ -35,17 +35,14 @@ from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, forgive
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.starts import in_ball
+from multilift_marl.tasks.starts import TargetOptions, check_heights, in_ball
 from multilift_marl.tasks.terms import mean_change, tolerance
 
 
-class RecoverOptions(Section):
+class RecoverOptions(TargetOptions):
     """How harsh the start is, and what counts as success."""
 
     start: Literal["slack", "crazymarl"] = Field("slack", description="how teams are thrown; see docs/recover.md")
-    target_xy: Float = Field(1.0, ge=0, description="[m] target x and y within ± this")
-    target_height: tuple[Float, Float] = Field((1.5, 2.5), description="[m] lowest and highest target")
-    target_yaw: Float = Field(45.0, ge=0, le=180, description="[deg] target heading within ± this")
     start_radius: Float = Field(0.5, ge=0, description="[m] slack: payload within a ball of this radius of the target")
     start_tilt: Float = Field(90.0, ge=0, le=90, description="[deg] slack: largest tilt of drones; of payloads, half")
     start_speed: Float = Field(1.0, ge=0, description="[m/s] slack: largest speed of each body")
@@ -75,6 +72,7 @@ class Recover(Task):
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
+        check_heights(self.options)
         self._early = forgive(TILT, CABLE)
         if self.options.start == "crazymarl":  # a quarter of its teams start on the ground
             self._early = forgive(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from math import cos, pi, sin, sqrt
+from math import cos, pi, radians, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from multilift_marl._jit import kernel
+from multilift_marl.config.schema import Float, Section
 from multilift_marl.config.system import GRAVITY, System
 from multilift_marl.control.formation import goal_hook, place_formation
+from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
 from multilift_marl.sim.cables import cable_end
 from multilift_marl.sim.parameters import Parameters
@@ -99,8 +102,30 @@ def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, m
         hold_hook(e, n, state, add(anchor, end), hanging.drones.hooks)
 
 
+class TargetOptions(Section):
+    """Where a target may be, one for the whole episode."""
+
+    target_xy: Float = Field(1.0, ge=0, description="[m] target x and y within ± this")
+    target_height: tuple[Float, Float] = Field((1.5, 2.5), description="[m] lowest and highest target")
+    target_yaw: Float = Field(45.0, ge=0, le=180, description="[deg] target heading within ± this")
+
+
+class StartOptions(TargetOptions):
+    """Where a team may start, moved as one from hanging at its target."""
+
+    start_radius: Float = Field(0.5, ge=0, description="[m] start within a ball of this radius about the target")
+    start_tilt: Float = Field(10.0, ge=0, le=90, description="[deg] largest tilt of the payload at the start")
+    start_speed: Float = Field(0.3, ge=0, description="[m/s] largest speed of the team at the start")
+
+
+def check_heights(option: TargetOptions) -> None:
+    """Refuse heights of a target in the wrong order."""
+    if option.target_height[0] > option.target_height[1]:
+        raise ConfigError(f"task_options.target_height={option.target_height} must list the lower one first")
+
+
 class StartRanges(NamedTuple):
-    """How far a team may be from a target, and that from the origin."""
+    """StartOptions in SI units."""
 
     xy: float
     low: float
@@ -109,6 +134,15 @@ class StartRanges(NamedTuple):
     radius: float
     tilt: float
     speed: float
+
+
+def make_ranges(option: StartOptions) -> StartRanges:
+    """Return the ranges of `option`, checked."""
+    check_heights(option)
+    return StartRanges(
+        option.target_xy, *option.target_height, radians(option.target_yaw),
+        option.start_radius, radians(option.start_tilt), option.start_speed,
+    )  # fmt: skip
 
 
 @kernel
