@@ -140,6 +140,10 @@ class Gate(Task):
         """Close to the goal throughout the last moments."""
         return self.good_time >= self.options.success_seconds - 1e-9
 
+    def route(self, env: int) -> np.ndarray:
+        """Return points of the way through the gaps; see `Task.route`."""
+        return np.array([_place(env, t, self.gates) for t in np.linspace(0, self.options.arrival, 61)])
+
     def scenery(self, env: int) -> list[Box]:
         """Return the walls; see `Task.scenery`."""
         half, gap, top = 2.5, self.gates.half_width, self.gates.gap_height

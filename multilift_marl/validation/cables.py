@@ -185,10 +185,10 @@ def stiff_cables(fast: bool) -> Result:
 
 
 def hover_thrust(world: World) -> np.ndarray:
-    """Return rotor thrusts (1, N, 4) [N] that hold a team at rest."""
+    """Return rotor thrusts (E, N, 4) [N] that hold drones and nominal pulls of their cables in equilibrium."""
     system = world.system
-    force = np.linalg.norm(system.drone_pull + [0, 0, system.vehicle.mass * GRAVITY], axis=1)
-    return np.repeat(force[None, :, None] / 4, 4, axis=2)
+    force = np.linalg.norm(system.drone_pull + GRAVITY * system.drone_mass[:, None] * [0, 0, 1], axis=1)
+    return np.broadcast_to(force[:, None] / 4, (world.num_envs, world.num_drones, 4)).copy()
 
 
 def integrators(fast: bool) -> Result:
