@@ -5,7 +5,7 @@ Run: python bench/scripts.py [episodes] [--document docs/tasks.md]
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 from multilift_marl.config.load import load_config
@@ -39,9 +39,10 @@ FLIGHTS: dict[str, tuple[str, dict]] = {  # name: configuration, overrides
 
 def main() -> None:
     """Print the table, and write it after the marker of a document if asked."""
-    arguments = sys.argv[1:]
-    document = Path(arguments[arguments.index("--document") + 1]) if "--document" in arguments else None
-    episodes = int(arguments[0]) if arguments and arguments[0].isdigit() else 200
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("episodes", nargs="?", type=int, default=200)
+    parser.add_argument("--document", type=Path, help="where the table replaces the one after <!-- scores -->")
+    asked = parser.parse_args()
     lines = [
         f"| | {' | '.join(f'{name}: success [%] | error [cm]' for name in SCRIPTED)} |",
         f"|---|{'---|---|' * len(SCRIPTED)}",
@@ -52,16 +53,16 @@ def main() -> None:
         for script in SCRIPTED:
             settings = load_config(config, overrides)
             told = summarize(
-                fly_episodes(settings, lambda vec, script=script: make_scripted(script, vec), episodes, SEED)
+                fly_episodes(settings, lambda vec, script=script: make_scripted(script, vec), asked.episodes, SEED)
             )
             error = "payload_rmse_m" if settings.task == "track" else "payload_position_error_m"
             cells += [f"{100 * told['success_rate']['mean']:.1f}", f"{100 * told[error]['mean']:.2f}"]
         lines.append(f"| {' | '.join(cells)} |")
         print(lines[-1], flush=True)
-    if document is not None:
-        head, marker, rest = document.read_text(encoding="utf-8").partition(MARKER)
+    if asked.document is not None:
+        head, marker, rest = asked.document.read_text(encoding="utf-8").partition(MARKER)
         after = rest.partition("\n\n")[2]
-        document.write_text(f"{head}{marker}" + "\n".join(lines) + f"\n\n{after}", encoding="utf-8")
+        asked.document.write_text(f"{head}{marker}" + "\n".join(lines) + f"\n\n{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":
