@@ -15,24 +15,23 @@ from multilift_marl.tasks import list_tasks
 if TYPE_CHECKING:
     from multilift_marl.agents.policy import load_policy
     from multilift_marl.envs.torchrl_env import torchrl_env
+else:
+    _NEED_TORCH = {
+        "load_policy": "multilift_marl.agents.policy",
+        "torchrl_env": "multilift_marl.envs.torchrl_env",
+    }
+
+    def __getattr__(name: str) -> Any:
+        """Import what needs torch only when it is asked for."""
+        if name in _NEED_TORCH:
+            from importlib import import_module
+
+            return getattr(import_module(_NEED_TORCH[name]), name)
+        raise AttributeError(f"module 'multilift_marl' has no attribute '{name}'")
+
 
 __version__ = "0.1.0"
 __all__ = ["list_tasks", "load_config", "load_policy", "make_vec", "parallel_env", "sim", "torchrl_env"]
-
-_NEED_TORCH = {
-    "load_policy": "multilift_marl.agents.policy",
-    "torchrl_env": "multilift_marl.envs.torchrl_env",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import what needs torch only when it is asked for."""
-    if name in _NEED_TORCH:
-        from importlib import import_module
-
-        return getattr(import_module(_NEED_TORCH[name]), name)
-    raise AttributeError(f"module 'multilift_marl' has no attribute '{name}'")
-
 
 _register_with_gymnasium()
 _register_with_pettingzoo()

@@ -6,27 +6,33 @@ import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, TypeVarTuple, cast
 
 from numba import njit, typeof
 
-kernel = njit(cache=True, nogil=True, error_model="numpy")
-"""Compiles a function to machine code at its first call. Arithmetic is exact IEEE, so results do not depend on how
-many environments are computed together."""
-
-
+F = TypeVar("F", bound=Callable[..., Any])
+Arguments = TypeVarTuple("Arguments")
 _WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "__init__.py")
 
 
-def bind(function: Any, *arguments: Any) -> Callable[[], None]:
+def kernel(function: F) -> F:
+    """Compile a function to machine code at its first call.
+
+    Arithmetic is exact IEEE, so results do not depend on how many environments are computed together.
+    """
+    return cast(F, njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Callable[[], None]:
     """Return a call of a kernel with these very arguments, compiled now, without looking up their types at each call.
 
     That look-up costs more than many kernels do: a named tuple of ten arrays takes about 2 µs. The arrays must stay the
     same objects in memory; what is in them may change.
     """
     types = tuple(typeof(argument) for argument in arguments)
-    function.compile(types)
-    return functools.partial(function.overloads[types].entry_point, *arguments)
+    compiled: Any = function  # Numba's dispatcher
+    compiled.compile(types)
+    return functools.partial(compiled.overloads[types].entry_point, *arguments)
 
 
 def _drop_stale_kernels() -> None:

@@ -7,7 +7,15 @@ from __future__ import annotations
 
 from math import atan2, cos, sin, sqrt
 
+import numpy as np
+
 from multilift_marl._jit import kernel
+
+
+def triple(vector: np.ndarray) -> tuple[float, float, float]:
+    """Return a vector (3,) as kernels take it."""
+    x, y, z = vector.tolist()
+    return x, y, z
 
 
 @kernel

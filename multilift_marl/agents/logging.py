@@ -8,6 +8,7 @@ import platform
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
@@ -24,7 +25,7 @@ class RunLog:
 
     def __init__(self, folder: Path, iteration: int = 0, frames: int = 0):
         self._path = folder / "metrics.csv"
-        self._rows = [row for row in read_metrics(folder) if int(row["iteration"]) <= iteration]
+        self._rows: list[dict[str, Any]] = [row for row in read_metrics(folder) if int(row["iteration"]) <= iteration]
         self._columns = list(self._rows[0]) if self._rows else []
         if self._rows:
             self._rewrite()

@@ -25,7 +25,7 @@ class Learner:
 
     config: TrainConfig
     actor: Actor
-    critic: nn.Module
+    critic: CentralCritic | LocalCritic
     policy: ProbabilisticActor
     loss: MAPPOLoss
     advantage: MultiAgentGAE
@@ -50,6 +50,8 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
+    critic: CentralCritic | LocalCritic
+    source: str | tuple[str, str]
     if config.algorithm == "mappo":
         critic, source = CentralCritic(vec.state_size, vec.num_drones, config.hidden, value_norm), "state"
     else:

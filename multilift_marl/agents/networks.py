@@ -16,6 +16,12 @@ if TYPE_CHECKING:  # policies need torch only
 class Normalizer(nn.Module):
     """Standardises each number by running statistics that are part of the network (Chan et al. 1979)."""
 
+    mean: torch.Tensor
+    square: torch.Tensor
+    count: torch.Tensor
+    shift: torch.Tensor
+    scale: torch.Tensor
+
     def __init__(self, size: int, clip: float = 8.0):
         super().__init__()
         self.clip = clip
@@ -62,6 +68,8 @@ class Actor(nn.Module):
     Its mean is that of a linear script, `base` (A, D), plus a network whose last layer starts near zero: an untrained
     team flies the script.
     """
+
+    base: torch.Tensor
 
     def __init__(
         self, observation_size: int, action_size: int, hidden: Sequence[int], initial_std: float, base: torch.Tensor

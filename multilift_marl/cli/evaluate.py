@@ -9,6 +9,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from multilift_marl.cli.common import run_command
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
@@ -164,7 +166,7 @@ def _find_policy(run: str, checkpoint: str) -> _Flown:
     return _Flown("policy", policy.source, policy.config, lambda vec: policy, folder)
 
 
-def _fly(config: Config, maker: Any, name: str, own: dict[str, Any]) -> dict:
+def _fly(config: Config, maker: Any, name: str, own: dict[str, Any]) -> dict[str, np.ndarray]:
     from tqdm import tqdm
 
     with tqdm(total=own["episodes"], desc=name, unit="episode", leave=False) as bar:

@@ -54,7 +54,7 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
         )
     if n > 1:
         apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)
-        i, j = np.unravel_index(np.argmin(apart - system.min_separation), apart.shape)
+        i, j = (int(k) for k in np.unravel_index(np.argmin(apart - system.min_separation), apart.shape))
         if apart[i, j] < system.min_separation[i, j]:
             raise ConfigError(
                 f"neighbouring drones {i} and {j} would rest {apart[i, j]:.2f} m apart, closer than the separation "

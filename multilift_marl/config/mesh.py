@@ -35,8 +35,8 @@ class Mesh:
     axes: np.ndarray
 
 
-def add_mesh(spec: mujoco.MjSpec, name: str, path: str, scale: Sequence[float]) -> None:
-    """Add the file's mesh to a specification."""
+def add_mesh(spec: mujoco.MjSpec, name: str, path: str, scale: np.ndarray) -> None:
+    """Add the file's mesh, its coordinates times `scale` (3,), to a specification."""
     spec.add_mesh(name=name, file=str(Path(path).resolve()), scale=list(scale))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -167,7 +167,7 @@ def mean(values: list[float]) -> float:
     return values[0] + sum(value - values[0] for value in values) / len(values)
 
 
-def vector_per_drone(value: tuple, n: int, key: str) -> np.ndarray:
+def vector_per_drone(value: tuple[Any, ...], n: int, key: str) -> np.ndarray:
     """Return one vector for each of n drones (n, 3); a ConfigError that names `key` if a list has another length."""
     vectors = np.asarray(value, float)
     if vectors.shape not in ((3,), (n, 3)):

@@ -14,7 +14,7 @@ import numpy as np
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import Goal, Reference, leave_goal, smooth, smooth_moving
 from multilift_marl.control.gains import Gains, drone_gains

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.math3d import add, clip, heading, limit, matrow, mul, put, row, scale, sub, thrust_frame, turn, vec
 from multilift_marl.sim.standing import Drones, make_drones
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.math3d import row
 from multilift_marl.sim.standing import make_drones
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import cos, sin
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import smooth
 from multilift_marl.control.gains import drone_gains

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.pulls import LEAST, reach, solve_pulls
 from multilift_marl.math3d import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import goal_arm, place_formation
 from multilift_marl.math3d import add, cross, dot, matmul, matrow, mul, norm, put, row, scale, sub, transpose, unit, vec
 from multilift_marl.sim.cables import cable_end

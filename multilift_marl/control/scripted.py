@@ -46,12 +46,9 @@ class FormationIntegral(Formation):
         return matrix
 
 
-SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {
-    "formation": Formation,
-    "formation_integral": FormationIntegral,
-    "payload_geometric": PayloadGeometric,
-}
-LINEAR = tuple(name for name, script in SCRIPTED.items() if issubclass(script, Formation))  # maps of the observation
+LINEAR: dict[str, type[Formation]] = {"formation": Formation, "formation_integral": FormationIntegral}
+"""Scripts that are maps of the observation."""
+SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {**LINEAR, "payload_geometric": PayloadGeometric}
 
 
 def make_scripted(name: str, vec: MultiliftVec) -> Formation | PayloadGeometric:
@@ -84,4 +81,4 @@ def residual_matrix(name: str, vec: MultiliftVec) -> np.ndarray:
     if name == "formation":
         return np.zeros((vec.action_size, vec.observation_size), np.float32)
     check_interface(name, vec.config.control.action)
-    return SCRIPTED[name](vec).matrix()
+    return LINEAR[name](vec).matrix()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from multilift_marl._jit import bind
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.config.system import whole_ratio
+from multilift_marl.control.actions import Call
 from multilift_marl.control.pilot import Pilot
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
@@ -76,7 +78,7 @@ class MultiliftVec:
         self._bind()
 
     def reset(
-        self, seed: int | None = None, mask: np.ndarray | None = None, options: dict | None = None
+        self, seed: int | None = None, mask: np.ndarray | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes in the environments in `mask` (E,) (None: all).
 
@@ -169,10 +171,11 @@ class MultiliftVec:
     def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
         """Continue bit for bit from what `state_dict` returned."""
         for key, array in self.state_dict().items():
-            if key not in saved or np.shape(saved[key]) != array.shape:
+            found = np.shape(saved[key]) if key in saved else None
+            if found != array.shape:
                 raise ValueError(
-                    f"the saved state does not fit these environments: '{key}' has shape "
-                    f"{np.shape(saved.get(key))}, expected {array.shape}; use the configuration it was saved with"
+                    f"the saved state does not fit these environments: '{key}' has shape {found}, expected "
+                    f"{array.shape}; use the configuration it was saved with"
                 )
         groups: dict[str, Rows] = {"world": {}, "task": {}, "imperfections": {}}
         for key, array in saved.items():
@@ -201,14 +204,14 @@ class MultiliftVec:
 
     def _bind(self) -> None:
         """Bind what is called in every step to its arrays, for each shard."""
-        self._calls: dict[int, tuple] = {}
+        self._calls: dict[int, tuple[Sequence[Call], Sequence[Call], Sequence[Call]]] = {}
         through = self._starts.imperfections
         flown = through.applied if through.slow else self._action
         for shard in self.world.shards:
             span = (shard.lo, shard.hi)
             act, follow = self.pilot.bind(*span, flown, self.task.way, self.task.planner(*span))
             after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
-            before = (act,)
+            before: tuple[Call, ...] = (act,)
             if through.slow:
                 send, arguments = through.send(*span, self._action)
                 before = (bind(send, *arguments), act)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -41,7 +41,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         ValueError: an unknown render mode.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES)}
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012 (as Gymnasium has it)
 
     def __init__(
         self, task: str | Config = "hover", render_mode: str | None = None, *,
@@ -49,12 +49,14 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ):  # fmt: skip
         single = {"env.num_envs": 1, "env.num_threads": 1}
         self.vec = make_vec(task, num_drones=num_drones, seed=seed, **overrides | single)
-        self.metadata = _metadata(type(self), self.vec)
+        self.metadata = {**self.metadata, "render_fps": self.vec.config.env.policy_hz}
         self.render_mode = render_mode
         self.observation_space, self.action_space = _joint_spaces(self.vec)
         self._pictures = Pictures(self.vec, render_mode)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start a new episode.
 
         Args:
@@ -135,7 +137,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ValueError: an unknown render mode.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as Gymnasium has it)
         "render_modes": list(BATCH_RENDER_MODES),
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
@@ -151,7 +153,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             **overrides,
         )  # fmt: skip
         self.num_envs = self.vec.num_envs
-        self.metadata = _metadata(type(self), self.vec)
+        self.metadata = {**self.metadata, "render_fps": self.vec.config.env.policy_hz}
         self.render_mode = render_mode
         self.single_observation_space, self.single_action_space = _joint_spaces(self.vec)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -214,7 +216,8 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             RuntimeError: there is no `render_mode`, or no episode was ever started.
             RenderingError: there is no OpenGL that draws off-screen.
         """
-        return tuple(self._pictures.frame(e) for e in range(self.num_envs))
+        frames = (self._pictures.frame(e) for e in range(self.num_envs))
+        return tuple(frame for frame in frames if frame is not None)  # all: there is no mode "human"
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the renderer."""
@@ -236,17 +239,13 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return told | {f"_{key}": mask.copy() for key in told}
 
 
-def _metadata(face: type, vec: MultiliftVec) -> dict[str, Any]:
-    return {**face.metadata, "render_fps": vec.config.env.policy_hz}
-
-
 def _joint_spaces(vec: MultiliftVec) -> tuple[Box, Box]:
     """Return the spaces of the team's observations (N·D,) and actions (N·A,)."""
     observed, acted = vec.num_drones * vec.observation_size, vec.num_drones * vec.action_size
     return Box(-np.inf, np.inf, (observed,), np.float32), Box(-1.0, 1.0, (acted,), np.float32)
 
 
-def _split(vec: MultiliftVec, action: np.ndarray, space: Box) -> np.ndarray:
+def _split(vec: MultiliftVec, action: np.ndarray, space: gymnasium.Space[Any]) -> np.ndarray:
     """Return a joint action as the core takes it (E, N, A)."""
     action = np.asarray(action)
     if action.shape != space.shape:

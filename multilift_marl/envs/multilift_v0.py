@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pettingzoo
@@ -36,7 +36,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         ValueError: an unknown render mode.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as PettingZoo has it)
         "name": "multilift_v0",
         "render_modes": list(RENDER_MODES),
         "is_parallelizable": True,
@@ -45,7 +45,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     def __init__(self, config: Config, render_mode: str | None = None):
         config = resolve_config(config, num_envs=1, num_threads=1)
         self.vec = vec = MultiliftVec(config)
-        self.metadata = {**type(self).metadata, "render_fps": config.env.policy_hz}
+        self.metadata = {**self.metadata, "render_fps": config.env.policy_hz}
         self.render_mode = render_mode
         self.possible_agents = [f"drone_{n}" for n in range(vec.num_drones)]
         self.agents: list[str] = []
@@ -58,7 +58,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         self._pictures = Pictures(vec, render_mode)
 
     def reset(
-        self, seed: int | None = None, options: dict | None = None
+        self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """Start a new episode.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import sqrt
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ def bootstrap(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict]:
+def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     """Return {metric: {"mean", "ci95": [low, high]}} of what `fly_episodes` measured.
 
     Errors include failed episodes at the failure bound; "<metric>_successful" takes successful episodes alone and is
@@ -50,7 +51,7 @@ def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict]:
     return result
 
 
-def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> dict[str, dict]:
+def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     """Return the mean paired difference, policy minus baseline, of every metric on the same episodes."""
     return {
         name: _mean(values.astype(float) - baseline[name].astype(float))
@@ -59,9 +60,9 @@ def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> d
     }
 
 
-def _mean(values: np.ndarray) -> dict:
+def _mean(values: np.ndarray) -> dict[str, Any]:
     return {"mean": float(values.mean()), "ci95": list(bootstrap(values))}
 
 
-def _rate(successes: int, trials: int) -> dict:
+def _rate(successes: int, trials: int) -> dict[str, Any]:
     return {"mean": successes / trials, "ci95": list(wilson(successes, trials))}

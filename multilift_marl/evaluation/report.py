@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from multilift_marl.config.schema import Config
 from multilift_marl.evaluation.metrics import compare, summarize
@@ -26,8 +29,8 @@ _ROWS = (  # metric, heading, factor, digits
 
 
 def make_report(
-    config: Config, seed: int, policy: dict, baselines: Mapping[str, dict],
-) -> dict:  # fmt: skip
+    config: Config, seed: int, policy: dict[str, np.ndarray], baselines: Mapping[str, dict[str, np.ndarray]]
+) -> dict[str, Any]:  # fmt: skip
     """Return the content of metrics.json.
 
     Args:
@@ -46,12 +49,12 @@ def make_report(
     }
 
 
-def write_report(path: Path, report: dict) -> None:
+def write_report(path: Path, report: dict[str, Any]) -> None:
     """Write metrics.json."""
     path.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def format_table(report: dict, name: str = "policy") -> str:
+def format_table(report: dict[str, Any], name: str = "policy") -> str:
     """Return the report as a Markdown table: mean and 95 % interval of each metric, a column for each policy."""
     columns = {name: report["policy"], **report["baselines"]}
     causes = {
@@ -69,7 +72,7 @@ def format_table(report: dict, name: str = "policy") -> str:
     return "\n".join(lines)
 
 
-def _cell(value: dict | None, factor: float, digits: int) -> str:
+def _cell(value: dict[str, Any] | None, factor: float, digits: int) -> str:
     if value is None:
         return "-"
     low, high = value["ci95"]

@@ -64,7 +64,7 @@ class Camera:
             self.view.lookat[:] = (path.min(axis=0) + path.max(axis=0)) / 2
         else:
             away = payload - target
-            distance = np.linalg.norm(away)
+            distance = float(np.linalg.norm(away))
             self.view.lookat[:] = target + max(0.0, 1.0 - _ROOM / max(distance, _ROOM)) * away
         self.view.lookat[2] += self._lift
 

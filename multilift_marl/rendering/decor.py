@@ -6,15 +6,16 @@ from collections import deque
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 _GEOM = mujoco.mjtGeom
 _TRAIL_POINTS = 40  # of one trail
 _MAX_DASHES = 300
 
 
-def add_box(scene: mujoco.MjvScene, size: np.ndarray, position: np.ndarray, rgba: np.ndarray) -> None:
+def add_box(scene: mujoco.MjvScene, size: ArrayLike, position: ArrayLike, rgba: ArrayLike) -> None:
     """Add an upright box of half edges `size` (3,) at `position` (3,) [m]; where the scene is full, nothing."""
-    _add(scene, _GEOM.mjGEOM_BOX, np.asarray(size, float), np.asarray(position, float), np.float32(rgba))
+    _add(scene, _GEOM.mjGEOM_BOX, np.asarray(size, float), np.asarray(position, float), np.asarray(rgba, np.float32))
 
 
 def add_lines(scene: mujoco.MjvScene, starts: np.ndarray, ends: np.ndarray, radius: float, rgba: np.ndarray) -> None:

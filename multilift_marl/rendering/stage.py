@@ -115,7 +115,7 @@ class Stage:
             add_box(scene, *box)
         if len(path):
             starts, ends = dashes(path, dash)
-            add_lines(scene, starts, ends, line, np.tile(np.float32(_PATH_COLOUR), (len(starts), 1)))
+            add_lines(scene, starts, ends, line, np.tile(np.array(_PATH_COLOUR, np.float32), (len(starts), 1)))
         if self._trail.seconds > 0 and not self._vec.world.diverged[env]:
             bodies = np.vstack([state.payload_position[env], state.drone_position[env]])
             self._trail.add(time, bodies)

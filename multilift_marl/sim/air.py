@@ -67,7 +67,7 @@ def make_air(system: System) -> AirConstants:
     return AirConstants(
         gusts=bool(air.turbulence or any(air.gust)),
         turbulence=air.turbulence,
-        gust=tuple(float(x) for x in air.gust),
+        gust=air.gust,
         gust_start=float(air.gust_start),
         gust_rise=float(air.gust_rise),
         gust_hold=float(hold),

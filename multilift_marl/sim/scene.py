@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from multilift_marl.config.mesh import add_mesh
-from multilift_marl.config.system import GRAVITY, System
-from multilift_marl.config.vehicles import Vehicle
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY, Vehicle
 from multilift_marl.sim.cables import IMPEDANCE, limit_solref
 
 _GEOM, _OBJECT = mujoco.mjtGeom, mujoco.mjtObj
@@ -226,8 +226,9 @@ def _add_chain(payload: mujoco.MjsBody, system: System, i: int, visuals: bool) -
     length = system.cable_length[i] / n
     mass = system.cable_mass[i] / n
     bending = {"stiffness": [system.bending_stiffness[i], 0, 0], "damping": [system.bending_damping[i], 0, 0]}
-    parent, place, quat = payload, system.anchors[i], np.zeros(4)
-    mujoco.mju_mat2Quat(quat, link_frame(system.formation_force[i]).ravel())
+    parent, place, turned = payload, system.anchors[i], np.zeros(4)
+    mujoco.mju_mat2Quat(turned, link_frame(system.formation_force[i]).ravel())
+    quat = turned.tolist()
     joint = mujoco.mjtJoint
     for j in range(n):
         link = parent.add_body(name=f"cable_{i}/link_{j}", pos=place, quat=quat)
@@ -243,7 +244,7 @@ def _add_chain(payload: mujoco.MjsBody, system: System, i: int, visuals: bool) -
                 type=_GEOM.mjGEOM_CAPSULE, fromto=[0, 0, 0, 0, 0, length], size=[0.006, 0, 0],
                 rgba=[0.08, 0.08, 0.1, 1], contype=0, conaffinity=0, group=_VISUAL_GROUP, mass=0,
             )  # fmt: skip
-        parent, place, quat = link, [0, 0, length], [1, 0, 0, 0]
+        parent, place, quat = link, np.array([0, 0, length]), [1, 0, 0, 0]
     return parent
 
 

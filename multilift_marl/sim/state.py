@@ -37,11 +37,9 @@ class SystemState(NamedTuple):
     def zeros(cls, num_envs: int, num_drones: int) -> SystemState:
         """Return a state at the origin."""
         e, n = num_envs, num_drones
-        state = cls(
-            *(np.zeros(shape) for shape in ((e, 3), (e, 3, 3), (e, 3), (e, 3))),
-            *(np.zeros(shape) for shape in ((e, n, 3), (e, n, 3, 3), (e, n, 3), (e, n, 3), (e, n, 4), (e, n))),
-            np.zeros((e, n), bool),
-        )
+        payload = ((e, 3), (e, 3, 3), (e, 3), (e, 3))
+        drones = ((e, n, 3), (e, n, 3, 3), (e, n, 3), (e, n, 3), (e, n, 4), (e, n))
+        state = cls._make((*(np.zeros(shape) for shape in (*payload, *drones)), np.zeros((e, n), bool)))
         state.payload_rotation[:] = np.eye(3)
         state.drone_rotation[:] = np.eye(3)
         return state

@@ -98,7 +98,7 @@ class World:
         self.diverged = np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
-        self._pool, self._pool_owner = None, 0
+        self._pool: tuple[int, ThreadPoolExecutor] | None = None  # with its process
         self.reset()
 
     def reset(self, mask: np.ndarray | None = None) -> SystemState:
@@ -110,14 +110,14 @@ class World:
         state.payload_velocity[mask] = state.payload_body_rates[mask] = 0
         state.drone_position[mask] = system.slots + [0, 0, REST_HEIGHT]
         state.drone_velocity[mask] = state.drone_body_rates[mask] = 0
-        for e in np.flatnonzero(mask):
+        for e in np.flatnonzero(mask).tolist():
             for n, pull in enumerate(system.drone_pull):
                 hover_drone(e, n, state, tuple(pull), 0.0, self.drones)
         self.set_parameters(mask, **nominal_parameters(system, self.num_envs)._asdict())
         self.plant.payload_force[mask], self.plant.wind[mask] = 0, system.wind
         if system.air.turbulence:
-            for e in np.flatnonzero(mask):
-                self.seed_turbulence(e, np.random.SeedSequence(self.seed, spawn_key=(int(e),)))
+            for e in np.flatnonzero(mask).tolist():
+                self.seed_turbulence(e, np.random.SeedSequence(self.seed, spawn_key=(e,)))
         self.load(mask)
         return state
 
@@ -160,10 +160,9 @@ class World:
         """Call `work` for every shard, each on a thread of its own."""
         if len(self.shards) == 1:
             return work(self.shards[0])
-        if self._pool is None or self._pool_owner != os.getpid():  # threads do not survive a fork
-            self._pool = ThreadPoolExecutor(len(self.shards) - 1, thread_name_prefix="multilift")
-            self._pool_owner = os.getpid()
-        others = [self._pool.submit(work, shard) for shard in self.shards[1:]]
+        if self._pool is None or self._pool[0] != os.getpid():  # threads do not survive a fork
+            self._pool = os.getpid(), ThreadPoolExecutor(len(self.shards) - 1, thread_name_prefix="multilift")
+        others = [self._pool[1].submit(work, shard) for shard in self.shards[1:]]
         try:
             work(self.shards[0])
         finally:
@@ -275,7 +274,8 @@ class World:
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int).tolist()
         chain = self.system.cable_model == "chain"
-        read, self._write = (read_chains, write_chains) if chain else (read_rows, write_rows)
+        read: Callable[..., None] = read_chains if chain else read_rows
+        self._write: Callable[..., None] = write_chains if chain else write_rows
         self._chain = make_chain(self.system, self.parameters) if chain else None
         shards = []
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
@@ -284,10 +284,10 @@ class World:
             step = functools.partial(batch.step, stage=mujoco.mjtStage.mjSTAGE_VEL) if chain else batch.step
             constants = make_constants(self.system, self.layout, batch)
             places = make_places(self.system, self.layout, self.parameters, batch)  # the same for every shard
-            self._places = (places, self._chain) if chain else (places,)
+            self._places: tuple[object, ...] = (places, self._chain) if chain else (places,)
             span, told, flow = (batch.state, lo, hi), batch.bind("sensordata"), make_air(self.system)
-            air, flow = (None, None) if flow.still else (self.air, flow)
-            blown = (self.thrust, self.state, self.plant, self.record, constants, air, flow, self._varied)
+            air = (None, None) if flow.still else (self.air, flow)
+            blown = (self.thrust, self.state, self.plant, self.record, constants, *air, self._varied)
             apply = bind(apply_loads, *span, *blown)
             follow = bind(read, *span, told, self.state, self.record, self.diverged, *self._places)
             shards.append(Shard(lo, hi, batch, step, apply, follow, np.zeros((hi - lo, self.num_drones), bool)))

@@ -21,7 +21,7 @@ from multilift_marl.tasks.observations import Component, observation_names, obse
 from multilift_marl.tasks.starts import make_hanging, true_hanging
 from multilift_marl.tasks.terms import Errors, measure
 
-Look = tuple[Any, tuple]  # a kernel and its arguments
+Look = tuple[Callable[..., None], tuple[Any, ...]]  # a kernel and its arguments
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
 INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
 
@@ -164,7 +164,7 @@ class Task:
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
         self.good_time[env], self.min_separation[env], self.terms[env], self.time[env] = 0.0, 1e9, 0.0, 0.0
         self.check(env, env + 1, 0.0)
-        return self.cause[env] == 0
+        return bool(self.cause[env] == 0)
 
     def check(self, lo: int, hi: int, dt: float) -> None:
         """Measure errors of environments lo to hi, integrate them over `dt` [s], and look for failures."""
@@ -201,7 +201,7 @@ class Task:
         plant, goal, reference, rig, nominal = self.world.plant, self.goal, self.reference, self.rig, self._nominal
         common, span, through = (action, rig, nominal, observation), (lo, hi), self._imperfections
         state, errors = self.world.state, self.errors
-        looks = [(observe_team, (*span, state, plant, goal, reference, errors, *common, critic))]
+        looks: list[Look] = [(observe_team, (*span, state, plant, goal, reference, errors, *common, critic))]
         if through is None:
             return looks, []
         if through.noisy:
@@ -215,7 +215,7 @@ class Task:
         late = [through.delay(*span, observation, (own, own + action.shape[2]))] if through.late else []
         return looks, late
 
-    def _checked(self, lo: int, hi: int, dt: float) -> tuple:
+    def _checked(self, lo: int, hi: int, dt: float) -> tuple[Any, ...]:
         state, goal, way, errors = self.world.state, self.goal, self.way, self.errors
         found = (self.limits, self.watch, self.cause, self.min_separation)
         return lo, hi, state, goal, way, way is not goal, errors, dt, *found

@@ -9,7 +9,21 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import MIN_SEPARATION, System
-from multilift_marl.math3d import add, column, dot, mat, matrow, mul, norm, row, segment_distance, sub, unit, vec
+from multilift_marl.math3d import (
+    add,
+    column,
+    dot,
+    mat,
+    matrow,
+    mul,
+    norm,
+    row,
+    segment_distance,
+    sub,
+    triple,
+    unit,
+    vec,
+)
 from multilift_marl.sim.scene import drone_half_size
 from multilift_marl.sim.standing import hook_place
 
@@ -86,7 +100,7 @@ def make_limits(system: System) -> Limits:
         anchors=np.ascontiguousarray(anchors),
         hooks=np.ascontiguousarray(system.hooks),
         payload_half=system.payload_size / 2,
-        payload_center=tuple(float(x) for x in system.payload_center),
+        payload_center=triple(system.payload_center),
         payload_round=system.payload_shape == "cylinder",
         drone_half=np.array([drone_half_size(vehicle) for vehicle in system.vehicles]),
     )

@@ -12,7 +12,7 @@ from pydantic import Field
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Int, Section
 from multilift_marl.control.formation import Reference, place_formation
-from multilift_marl.math3d import add, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, turn, vec
+from multilift_marl.math3d import add, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, triple, turn, vec
 from multilift_marl.sim.scene import drone_half_size
 from multilift_marl.sim.standing import hook_place
 from multilift_marl.sim.world import World
@@ -82,6 +82,7 @@ class Gate(Task):
 
     name: ClassVar[str] = "gate"
     Options: ClassVar[type[Section]] = GateOptions
+    options: GateOptions
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.4,
         "precision": 0.2,
@@ -108,7 +109,7 @@ class Gate(Task):
         )  # fmt: skip
         self.bodies = Bodies(
             np.array([drone_half_size(vehicle) for vehicle in system.vehicles]), system.payload_size / 2,
-            tuple(float(c) for c in system.payload_center), np.ascontiguousarray(system.anchors),
+            triple(system.payload_center), np.ascontiguousarray(system.anchors),
             np.ascontiguousarray(system.hooks),
         )  # fmt: skip
 

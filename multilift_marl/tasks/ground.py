@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY, MIN_SEPARATION, System
+from multilift_marl.config.system import MIN_SEPARATION, System
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.sim.scene import drone_half_size

@@ -32,6 +32,7 @@ class Hover(Task):
 
     name: ClassVar[str] = "hover"
     Options: ClassVar[type[Section]] = HoverOptions
+    options: HoverOptions
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.4,
         "precision": 0.25,

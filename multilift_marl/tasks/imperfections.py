@@ -66,9 +66,9 @@ class Imperfections:
         self.bias = STANDARD * ranges.observation_bias
         (_, slowest), (_, latest) = ranges.action_delay, ranges.observation_delay
         self.noisy, self.late, self.slow = bool(self.noise.any() or self.bias.any()), latest > 0, slowest > 0
-        counts = (np.zeros(e, np.int64) for _ in range(4))
+        sent, seen, action_delay, observation_delay = (np.zeros(e, np.int64) for _ in range(4))
         self.memory = Memory(
-            np.zeros(e, np.uint64), np.zeros((e, n + 1, 4, 3)), *counts,
+            np.zeros(e, np.uint64), np.zeros((e, n + 1, 4, 3)), sent, seen, action_delay, observation_delay,
             np.zeros((e, (slowest + 1) * self.slow, n, a)), np.zeros((e, (latest + 1) * self.late, n, d), np.float32),
         )  # fmt: skip
         self.state, self.errors = SystemState.zeros(e, n), Errors.zeros(e)
@@ -86,15 +86,15 @@ class Imperfections:
         memory.actions[env] = 0.0
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
 
-    def sense(self, lo: int, hi: int, state: SystemState) -> tuple[Any, tuple]:
+    def sense(self, lo: int, hi: int, state: SystemState) -> tuple[Any, tuple[Any, ...]]:
         """Return the kernel that measures, with its arguments."""
         return sense, (lo, hi, state, self.state, self.memory, self.noise, self._attitude)
 
-    def delay(self, lo: int, hi: int, observation: np.ndarray, own: tuple[int, int]) -> tuple[Any, tuple]:
+    def delay(self, lo: int, hi: int, observation: np.ndarray, own: tuple[int, int]) -> tuple[Any, tuple[Any, ...]]:
         """Return the kernel that holds observations back, with its arguments; see `delay_observations`."""
         return delay_observations, (lo, hi, observation, self.memory, *own)
 
-    def send(self, lo: int, hi: int, action: np.ndarray) -> tuple[Any, tuple]:
+    def send(self, lo: int, hi: int, action: np.ndarray) -> tuple[Any, tuple[Any, ...]]:
         """Return the kernel that holds actions back, with its arguments."""
         return delay_actions, (lo, hi, action, self.memory, self.applied)
 

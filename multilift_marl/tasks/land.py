@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import cos, hypot, radians, sin
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -74,6 +74,7 @@ class Land(Task):
 
     name: ClassVar[str] = "land"
     Options: ClassVar[type[Section]] = LandOptions
+    options: LandOptions
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.4,
         "precision": 0.25,
@@ -142,7 +143,7 @@ class Land(Task):
         """Touched down softly, and at rest, slack and clear throughout the last seconds."""
         return (self.touch == LANDED) & (self.good_time >= self.options.success_seconds - 1e-9)
 
-    def _planned(self) -> tuple:
+    def _planned(self) -> tuple[Any, ...]:
         return (
             self.time, self.course, self.touch, self.speed, self.share, self.world.state, self.goal, self.rig,
             self._ground, self.limits, self._down, self.watch,

@@ -38,6 +38,7 @@ class Loss(Task):
 
     name: ClassVar[str] = "loss"
     Options: ClassVar[type[Section]] = LossOptions
+    options: LossOptions
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.45,
         "precision": 0.25,

@@ -42,6 +42,7 @@ class Pose(Task):
 
     name: ClassVar[str] = "pose"
     Options: ClassVar[type[Section]] = PoseOptions
+    options: PoseOptions
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.3,
         "precision": 0.25,
@@ -110,7 +111,7 @@ class Pose(Task):
 
     def succeeded(self) -> np.ndarray:
         """Within the success region throughout the last second of every target."""
-        return self.reached.all(axis=1)
+        return np.asarray(self.reached.all(axis=1))
 
     def counts(self, time: float, length: float) -> bool:
         """Count the last second of every target."""

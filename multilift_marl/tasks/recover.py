@@ -11,7 +11,7 @@ from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import (
     add,
@@ -57,6 +57,7 @@ class Recover(Task):
 
     name: ClassVar[str] = "recover"
     Options: ClassVar[type[Section]] = RecoverOptions
+    options: RecoverOptions
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.4,
         "precision": 0.25,

@@ -10,7 +10,8 @@ from pydantic import Field
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import Float, Section
-from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec

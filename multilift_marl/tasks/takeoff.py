@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import radians
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -59,6 +59,7 @@ class Takeoff(Task):
 
     name: ClassVar[str] = "takeoff"
     Options: ClassVar[type[Section]] = TakeoffOptions
+    options: TakeoffOptions
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.4,
         "precision": 0.25,
@@ -122,7 +123,7 @@ class Takeoff(Task):
         gentle = self.world.record.tension_max <= self.options.success_tension * static
         return gentle & (self.good_time >= self.options.success_seconds - 1e-9)
 
-    def _planned(self) -> tuple:
+    def _planned(self) -> tuple[Any, ...]:
         return (
             self.time, self.place, self.stand, self.stage, self.share, self.peak, self.world.state, self.goal,
             self.rig, self._ground, self.limits, self._climb, self._static, self.watch,

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import goal_hook
 from multilift_marl.control.pulls import place_balanced
 from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, row, scale, segment_distance, sub, turn, vec

@@ -59,6 +59,7 @@ class Track(Task):
 
     name: ClassVar[str] = "track"
     Options: ClassVar[type[Section]] = TrackOptions
+    options: TrackOptions
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.4,
         "precision": 0.3,

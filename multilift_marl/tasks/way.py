@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import place_formation, wrap
 from multilift_marl.control.pulls import place_slots, solve_pulls
 from multilift_marl.math3d import (

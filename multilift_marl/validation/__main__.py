@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from multilift_marl.errors import nearest
 from multilift_marl.validation import air, bodies, cables, flight, momentum, symmetry, teams
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if failed else 0
 
 
-def write(results: dict[str, Result], out: Path) -> list[dict]:
+def write(results: dict[str, Result], out: Path) -> list[dict[str, Any]]:
     """Write validation.json, experiments.json and the plots into a folder, and return the rows."""
     out.mkdir(parents=True, exist_ok=True)
     rows = [row.as_dict() for result in results.values() for row in result.rows]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.load import load_config
-from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.sim.air import AIR_DENSITY, GROWTH, SPREADING, ground_gain, make_air, wash_at
 from multilift_marl.sim.gusts import advance_turbulence, dryden, start_turbulence, turbulence
 from multilift_marl.sim.state import Air
@@ -48,7 +50,7 @@ def _sample(air, height, timestep, every, out):
                 advance_turbulence(e, air, timestep * WIND / long, timestep * WIND / high)
 
 
-def correlation(component: str, height: float, lag: np.ndarray) -> np.ndarray:
+def correlation(component: str, height: float, lag: float | np.ndarray) -> np.ndarray:
     """Return the closed form of a component's autocorrelation [m²/s²] at a time lag [s]: that of its spectrum."""
     across, upward, long, high = dryden(height, WIND)
     sigma, length = (upward, high) if component == "w" else (across, long)
@@ -102,7 +104,8 @@ def _spectrum_rows(height: float, fast: bool, rows: list[Row]) -> Plot:
     plot.x_label, plot.y_label = "frequency [Hz]", "spectral density [m²/s² per Hz]"
     rate = 1 / interval
     for i, name in enumerate(COMPONENTS):
-        folded = sum(spectrum(name, height, np.abs(frequency + k * rate)) for k in range(-20, 21))  # as sampled
+        aliases = (spectrum(name, height, np.abs(frequency + k * rate)) for k in range(-20, 21))
+        folded = sum(aliases, np.zeros_like(frequency))  # as sampled
         found, theory = (
             np.array([values[band == j].mean() for j in range(1, len(edges))]) for values in (density[:, i], folded)
         )
@@ -115,8 +118,8 @@ def _spectrum_rows(height: float, fast: bool, rows: list[Row]) -> Plot:
     return plot
 
 
-def _system(num_drones: int = 1, **values) -> System:
-    return load_config("hover", {"env.num_drones": num_drones} | values).system
+def _system(values: dict[str, Any]) -> System:
+    return load_config("hover", {"env.num_drones": 1} | values).system
 
 
 def _apart(system: System) -> World:
@@ -132,7 +135,7 @@ def _apart(system: System) -> World:
 def gust(fast: bool) -> Result:
     """A "1 - cosine" gust: its profile, and what it does to a drone with linear drag."""
     settings = {"wind.gust": [2.0, -1.0, 0.5], "wind.gust_start": 0.2, "wind.gust_rise": 0.5, "wind.gust_hold": 0.3}
-    system = _system(**{"cable.length": 20.0}, **settings)
+    system = _system({"cable.length": 20.0} | settings)
     world, vehicle = _apart(system), system.vehicle
     amplitude, h, steps = np.array([2.0, -1.0, 0.5]), system.timestep, round(2.0 / system.timestep)
     t = h * np.arange(steps)
@@ -162,7 +165,7 @@ def gust(fast: bool) -> Result:
 
 def wash(fast: bool) -> Result:
     """The wash below a hovering drone: momentum theory at the rotors, momentum at any distance, nothing above."""
-    system = _system(**{"cable.length": 20.0, "wind.wash": True})
+    system = _system({"cable.length": 20.0, "wind.wash": True})
     world, c, vehicle = _apart(system), make_air(system), system.vehicle
     thrust, result = vehicle.mass * GRAVITY, Result()
 
@@ -206,7 +209,7 @@ def wash(fast: bool) -> Result:
 
 def ground_effect(fast: bool) -> Result:
     """Thrust near the ground, from a drone's acceleration at constant rotor speed."""
-    system = _system(**{"cable.length": 20.0, "wind.ground_effect": True})
+    system = _system({"cable.length": 20.0, "wind.ground_effect": True})
     vehicle, result, radius = system.vehicle, Result(), system.vehicle.rotor_radius
     squares = ((vehicle.rotor_positions - vehicle.rotor_positions[0]) ** 2).sum(axis=1)
     thrust = vehicle.mass * GRAVITY

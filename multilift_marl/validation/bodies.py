@@ -9,7 +9,7 @@ import numpy as np
 
 from multilift_marl.config.load import load_config
 from multilift_marl.config.schema import Config
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.sim.air import AIR_DENSITY
 from multilift_marl.sim.scene import drone_half_size
 from multilift_marl.sim.world import World

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.sim.cables import IMPEDANCE, limit_solref
 from multilift_marl.sim.scene import set_options
 from multilift_marl.sim.world import World

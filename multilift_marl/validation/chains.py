@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.sim.scene import build_model
 
 ROPE = 0.01  # [kg/m]
@@ -14,7 +17,9 @@ SEGMENTS = 10
 _ANCHOR_MASS = 1e6  # [kg] of what holds the upper ends; it moves by less than 1e-6 m
 
 
-def hanging_chain(mass: float, timestep: float, cables: int = 1, angle: float = 0.0, **overrides):
+def hanging_chain(
+    mass: float, timestep: float, cables: int = 1, angle: float = 0.0, **overrides: Any
+) -> tuple[mujoco.MjModel, mujoco.MjData, System]:
     """Return a load below fixed anchors on chains of 1 m, straight and at their natural length.
 
     It is the package's own model, with drones so heavy that they stay where they are, held against gravity and
@@ -142,7 +147,9 @@ def inclined_chains(
     return np.array(depth)
 
 
-def _pulls(place: np.ndarray, velocity: np.ndarray, top: np.ndarray, length: float, stiffness: float, damping: float):
+def _pulls(
+    place: np.ndarray, velocity: np.ndarray, top: np.ndarray, length: float, stiffness: float, damping: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return forces (n, 2) of eqs 14-15 on the nodes, and minus their derivatives by place and velocity (2n, 2n)."""
     n = len(place)
     link = np.diff(np.vstack([place, top]), axis=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 from multilift_marl.validation.experiment import Experiment, Result
 
@@ -12,14 +13,14 @@ MARKER = "<!-- results -->\n"
 _KEYS = ("theory", "simulated", "error", "limit")
 
 
-def describe(name: str, experiment: Experiment, result: Result) -> dict:
+def describe(name: str, experiment: Experiment, result: Result) -> dict[str, Any]:
     """Return what experiments.json tells of an experiment: its name, purpose, number of rows, and figures."""
     about = " ".join((experiment.__doc__ or "").split("\n\n")[0].split())
     figures = [{"file": f"{plot.name}.png", "caption": plot.caption or plot.title} for plot in result.plots]
     return {"name": name, "about": about, "rows": len(result.rows), "figures": figures}
 
 
-def format_table(rows: list[dict]) -> str:
+def format_table(rows: list[dict[str, Any]]) -> str:
     """Return the rows of validation.json as a Markdown table."""
     lines = ["| experiment | quantity | theory | simulated | error | limit | pass |", "|---|---|---|---|---|---|---|"]
     for row in rows:

@@ -5,8 +5,12 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from multilift_marl.validation.experiment import Plot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B", "#7F7F7F")  # Okabe & Ito 2008
 _DOTS = 90  # per inch
@@ -42,7 +46,7 @@ def draw(plots: list[Plot], out: Path) -> list[Path]:
     return files
 
 
-def _draw_panel(axes, plot: Plot) -> None:
+def _draw_panel(axes: Axes, plot: Plot) -> None:
     from matplotlib.ticker import NullFormatter
 
     simulated = [curve for curve in plot.curves if not curve.theory]
@@ -73,19 +77,20 @@ def _draw_panel(axes, plot: Plot) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     named = [curve for curve in plot.curves if curve.label.strip("_")]
     crowded = len(named) > (3 if plot.phases else 4) or plot.equal
-    beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)} if crowded else {}
+    beside: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)} if crowded else {}
     axes.legend(frameon=False, fontsize=9, **beside)
 
 
-def _name_phases(axes, plot: Plot) -> None:
+def _name_phases(axes: Axes, plot: Plot) -> None:
     """Write the phases' names above the panel, upright where they have no room."""
     span = plot.phases[-1][2] - plot.phases[0][1]
     axes.set_title(plot.title, fontsize=11, pad=62 if any(_narrow(p, span) for p in plot.phases) else 18)
     for phase in plot.phases:
         name, start, end = phase
         upright = 90 if _narrow(phase, span) else 0
-        place = {"x": 0.5 * (start + end), "y": 1.02, "s": name, "transform": axes.get_xaxis_transform()}
-        axes.text(**place, rotation=upright, ha="center", va="bottom", fontsize=8, color="0.3")
+        looks: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 8, "color": "0.3"}
+        place, above = 0.5 * (start + end), axes.get_xaxis_transform()
+        axes.text(place, 1.02, name, transform=above, rotation=upright, **looks)
 
 
 def _narrow(phase: tuple[str, float, float], span: float) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ class Row(NamedTuple):
         """Whether the error is within its limit; False for NaN."""
         return bool(self.error <= self.limit)
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """Return the row as it stands in validation.json; what is not finite is None."""
         numbers = {key: float(getattr(self, key)) for key in ("theory", "simulated", "error", "limit")}
         finite = {key: value if np.isfinite(value) else None for key, value in numbers.items()}

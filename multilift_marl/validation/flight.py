@@ -256,5 +256,6 @@ def _path_plot(rig: str, flown: Flight) -> Plot:
     for n in range(flown.system.num_drones):
         plot.curves.append(Curve(f"drone {n}", *flown.drones[circling, n, :2].T))
     plot.curves.append(Curve("payload", *flown.payload[circling, :2].T))
-    plot.curves.append(Curve("payload's path", *flown.way.payload[circling, :2].T, theory=True))
+    x, y = flown.way.payload[circling, :2].T
+    plot.curves.append(Curve("payload's path", x, y, theory=True))
     return plot

@@ -7,7 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.sim.dynamics import make_constants
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row, order_row

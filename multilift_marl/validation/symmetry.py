@@ -10,6 +10,7 @@ import numpy as np
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row
 from multilift_marl.validation.team import CONTROL_HZ, Team, about_z, make_team, poses, take_off
 
+Map = Callable[[np.ndarray], np.ndarray]
 _LIMIT = 1e-6
 _TURN = np.deg2rad(73.0)
 _ORDER = np.array([2, 0, 3, 1])
@@ -81,7 +82,7 @@ def symmetry(fast: bool) -> Result:
     return result
 
 
-def _twins(team: Team) -> list[tuple[str, Team, Callable, Callable]]:
+def _twins(team: Team) -> list[tuple[str, Team, Map, Map]]:
     """Return names, teams, and how positions and attitudes of the first team map to each one's."""
     r, m = about_z(_TURN), _MIRROR
     rows = np.concatenate([[0], 1 + _ORDER])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from multilift_marl.config.schema import Config
-from multilift_marl.config.system import GRAVITY, System
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.sim.world import World
 from multilift_marl.validation.bodies import make_config
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row, ms, order_row, relative

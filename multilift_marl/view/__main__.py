@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import closing, suppress
 from typing import Any
 
 from multilift_marl.cli.common import run_command
@@ -36,12 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _view(values: dict[str, Any]) -> int:
     page = Page(*make_session(values))
     print(f"watch at http://{HOST}:{page.port} (Ctrl-C ends it)", flush=True)
-    try:
+    with closing(page), suppress(KeyboardInterrupt):
         page.run()
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        page.close()
+    return 0
 
 
 def make_session(values: dict[str, Any]) -> tuple[Session, int]:

@@ -180,7 +180,8 @@ class _Batch:
 
     def __init__(self, server: Any, name: str, mesh: tuple[np.ndarray, np.ndarray], clear: bool):
         self._server, self._name, self._mesh, self._clear = server, name, mesh, clear
-        self._slots, self._handle, self._shown = 0, None, None
+        self._slots, self._handle = 0, None
+        self._shown: dict[str, np.ndarray] | None = None
 
     def show(self, geoms: tuple[np.ndarray, ...] | None) -> None:
         """Show geoms: positions (K, 3), quaternions (K, 4), sizes (K, 3), colours (K, 4); None for none."""

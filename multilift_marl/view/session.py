@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -159,10 +160,14 @@ def _fitting(vec: MultiliftVec, learned: dict[str, Any]) -> dict[str, Callable[[
     makers: dict[str, Callable[[MultiliftVec], Policy]] = {}
     for name, policy in learned.items():
         if not _misfit(vec, policy):
-            makers[name] = lambda _, policy=policy: policy
+            makers[name] = _keep(policy)
     if vec.config.control.action == "reference":
-        makers |= {name: lambda vec, name=name: make_scripted(name, vec) for name in SCRIPTED}
+        makers |= {name: functools.partial(make_scripted, name) for name in SCRIPTED}
     return makers
+
+
+def _keep(policy: Policy) -> Callable[[MultiliftVec], Policy]:
+    return lambda vec: policy
 
 
 def _misfit(vec: MultiliftVec, policy: Any) -> str:
