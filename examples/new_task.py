@@ -33,6 +33,7 @@ class Lift(Task):
 
     name = "lift"
     Options = LiftOptions
+    options: LiftOptions
     REWARD = {"height": 0.7, "still": 0.3, "action_rate": -0.05}  # noqa: RUF012
 
     def start(self, env, rng, mass):

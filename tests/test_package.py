@@ -39,6 +39,7 @@ def test_wheel_carries_code_configs_and_policies(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert "multilift_marl/configs/hover.yaml" in names
     assert "multilift_marl/policies/hover.pt" in names
+    assert "multilift_marl/py.typed" in names
     assert {name.split("/")[0] for name in names if "dist-info" not in name} == {"multilift_marl"}
 
 

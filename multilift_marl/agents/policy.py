@@ -20,9 +20,19 @@ _KEPT = ("config", "actor", "observation_names", "action_names", "frames")  # wh
 class LearnedPolicy:
     """The deterministic policy of a checkpoint, the same network for every drone and any number of them.
 
+    Args:
+        content: of a checkpoint; see `load_policy`.
+        source: where it comes from, for messages.
+
     Attributes:
         config: the configuration it was trained with.
         observation_names, action_names: what its inputs and outputs mean.
+        source: as given.
+        actor: the network.
+
+    Raises:
+        CheckpointError: the weights are of a network of another shape.
+        ConfigError: the configuration is of another version.
     """
 
     def __init__(self, content: dict[str, Any], source: str):

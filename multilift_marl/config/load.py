@@ -42,7 +42,16 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
 
 
 def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, where: str = "") -> Config:
-    """Return the validated configuration of nested `values` with dotted `overrides` applied."""
+    """Return the validated configuration of nested `values` with dotted `overrides` applied.
+
+    Args:
+        values: by section, as in a YAML file.
+        overrides: by dotted name.
+        where: the file that the values come from, for messages.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type or a value out of range.
+    """
     merged = _merge({}, values)
     for dotted, value in (overrides or {}).items():
         *sections, key = dotted.split(".")
@@ -57,8 +66,26 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
     return validate(Config, merged, where=where)
 
 
+def resolve_config(
+    task: str | Config, *, num_envs: int | None = None, num_threads: int | None = None,
+    num_drones: int | None = None, seed: int | None = None, **overrides: Any,
+) -> Config:  # fmt: skip
+    """Return the configuration that every door builds from; None means the configured value.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    named = {"env.num_envs": num_envs, "env.num_threads": num_threads, "env.num_drones": num_drones, "seed": seed}
+    overrides |= {key: value for key, value in named.items() if value is not None}
+    return build_config(task.model_dump(), overrides) if isinstance(task, Config) else load_config(task, overrides)
+
+
 def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:
-    """Return {"a.b": value} of command-line arguments a.b=value, read as YAML."""
+    """Return {"a.b": value} of command-line arguments a.b=value, read as YAML.
+
+    Raises:
+        ConfigError: an argument of another form, or a value that is no YAML.
+    """
     overrides = {}
     for argument in arguments:
         key, separator, text = argument.partition("=")

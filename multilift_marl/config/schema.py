@@ -292,7 +292,7 @@ class Config(Section):
 
     @cached_property
     def system(self) -> System:
-        """The physical system that this configuration describes, checked for possibility."""
+        """The physical system that this configuration describes; a ConfigError if it cannot be or cannot fly."""
         from multilift_marl.config.system import resolve_system
 
         return resolve_system(self)

@@ -105,7 +105,7 @@ class Reference(NamedTuple):
 
 
 @kernel
-def place_formation(e, goal, rig):
+def place_formation(e: int, goal: Goal, rig: Rig) -> None:
     """Write slots, slot frames and pulls of environment e for its target pose."""
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     yaw = heading(target)

@@ -67,7 +67,12 @@ MAX_FORCE = 0.5  # of the payload's weight, that corrects errors
 class PayloadGeometric:
     """Centralised: it reads the true state of payload and goal in `vec`, but neither masses nor forces that are hidden.
 
-    It flies about `task.way`, and remembers only its last offsets, for the lead: the integrals are the task's.
+    It flies about `task.way`, and remembers only its last offsets, for the lead: the integrals are the task's. The law
+    is that of Lee (IEEE TCST 26(4), 2018), see the head of this file.
+
+    Args:
+        vec: environments with the interface `reference`; read at every `act`.
+        gains: None for the tuned ones.
     """
 
     def __init__(self, vec: MultiliftVec, gains: PayloadGains | None = None):
@@ -82,7 +87,7 @@ class PayloadGeometric:
         self._fresh = np.ones(vec.num_envs, bool)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (E, N, 4) for the present state of the environments, whose observations these are.
+        """Return actions (E, N, 4) in [-1, 1] for the present state of the environments, whose observations these are.
 
         Raises:
             ValueError: observations of another number of environments.

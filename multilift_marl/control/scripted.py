@@ -16,7 +16,11 @@ INTEGRAL_GAIN = 0.5  # [1/s]
 
 
 class Formation:
-    """Every drone holds its slot about the target payload pose: the zero action of the `reference` interface."""
+    """Every drone holds its slot about the target payload pose: the zero action of the `reference` interface.
+
+    Args:
+        vec: environments with the interface `reference`.
+    """
 
     def __init__(self, vec: MultiliftVec):
         self._names, self._actions = vec.observation_names, vec.action_names
@@ -28,7 +32,7 @@ class Formation:
         return np.zeros((len(self._actions), len(self._names)), np.float32)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (..., N, A) for observations (..., N, D)."""
+        """Return actions (..., N, A) float32 in [-1, 1] for observations (..., N, D)."""
         return np.clip(np.einsum("...d,ad->...a", np.asarray(observation, np.float32), self._matrix), -1, 1)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
@@ -36,7 +40,10 @@ class Formation:
 
 
 class FormationIntegral(Formation):
-    """The formation with its slots moved against the clipped integral of the payload's position error."""
+    """The formation with its slots moved against the clipped integral of the payload's position error.
+
+    By -k ∫ e dt [m], k = 0.5 1/s, along each axis of a drone's slot frame; a full action is `control.max_offset`.
+    """
 
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
@@ -64,7 +71,7 @@ def make_scripted(name: str, vec: MultiliftVec) -> Formation | PayloadGeometric:
 
 
 def check_interface(name: str, action: str) -> None:
-    """Refuse the script `name` with an action interface that it does not know."""
+    """Refuse the script `name` with an action interface that it does not know, by a ConfigError."""
     if action != "reference":
         raise ConfigError(
             f"the scripted policy '{name}' acts by control.action=reference and cannot fly control.action={action}; "

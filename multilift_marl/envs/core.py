@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from multilift_marl._jit import bind
-from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.load import resolve_config
 from multilift_marl.config.schema import Config
 from multilift_marl.config.system import whole_ratio
 from multilift_marl.control.actions import Call
@@ -33,15 +33,20 @@ class MultiliftVec:
         first_env: number of the first environment; environment e here is number first_env + e.
 
     Attributes:
+        config, purpose, first_env: as given.
         num_envs, num_drones, observation_size, action_size, state_size: E, N, D, A, S.
         observation_names, action_names: names of the D and A numbers.
         reward_terms: names of the reward terms.
         failure_causes: names of the values of `info["failure_cause"]`.
         max_steps: policy steps of an episode.
         control_ticks: control steps of a policy step.
+        seeds, episodes, steps: of the episodes in progress: seed, number, policy steps flown (E,) int64.
         world: the physics; `world.state` is the true state.
         pilot: what flies the drones; `reference` is its reference.
         task: the task; `task.goal` and `task.errors` say where the payload should be.
+
+    Raises:
+        ConfigError: an unknown task, an impossible system, or settings that do not go together.
     """
 
     def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
@@ -90,9 +95,10 @@ class MultiliftVec:
                 the mask or with a row for each.
 
         Returns:
-            Observations of all environments (E, N, D) float32, rows outside the mask unchanged, and info.
+            Observations of all environments (E, N, D) float32, rows outside the mask unchanged, and info, see `step`.
 
         Raises:
+            ConfigError: no start is free of failure.
             ValueError: a mask of wrong shape or type, a negative seed, an unknown option or one that cannot be; after
                 the last, environments in the mask must be reset again.
         """
@@ -117,7 +123,9 @@ class MultiliftVec:
             action: (E, N, A) floating point; values beyond [-1, 1] are clipped.
 
         Returns:
-            observation (E, N, D) float32, reward (E, N) float32, terminated (E,), truncated (E,), info.
+            observation (E, N, D) float32, reward (E, N) float32, terminated (E,), truncated (E,) bool, and info:
+            `success`, `failure`, `diverged` (E,) bool; `failure_cause` (E,), indices into `failure_causes`;
+            `reward_terms` {name: (E,)}, weighted; `randomization` {name: (E, ...)}, the hidden draw, read-only.
 
         Raises:
             ValueError: wrong shape or dtype, or an action that is not finite.
@@ -159,7 +167,7 @@ class MultiliftVec:
         return self._state.copy()
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Return copies of everything that later steps depend on."""
+        """Return copies of everything that later steps depend on, by dotted name, environment first."""
         saved = {f"world.{key}": array for key, array in self.world.state_dict().items()}
         saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
         saved |= self.pilot.state_dict()
@@ -169,7 +177,11 @@ class MultiliftVec:
         return saved
 
     def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
-        """Continue bit for bit from what `state_dict` returned."""
+        """Continue bit for bit from what `state_dict` returned, at any number of threads.
+
+        Raises:
+            ValueError: it is of other environments: an array is missing or of another shape.
+        """
         for key, array in self.state_dict().items():
             found = np.shape(saved[key]) if key in saved else None
             if found != array.shape:
@@ -261,16 +273,6 @@ class MultiliftVec:
         }
 
 
-def resolve_config(
-    task: str | Config, *, num_envs: int | None = None, num_threads: int | None = None,
-    num_drones: int | None = None, seed: int | None = None, **overrides: Any,
-) -> Config:  # fmt: skip
-    """Return the configuration that every door builds from; None means the configured value."""
-    named = {"env.num_envs": num_envs, "env.num_threads": num_threads, "env.num_drones": num_drones, "seed": seed}
-    overrides |= {key: value for key, value in named.items() if value is not None}
-    return build_config(task.model_dump(), overrides) if isinstance(task, Config) else load_config(task, overrides)
-
-
 def make_vec(
     task: str | Config = "hover", *, num_envs: int | None = None, num_threads: int | None = None,
     num_drones: int | None = None, seed: int | None = None, first_env: int = 0, **overrides: Any,
@@ -279,12 +281,13 @@ def make_vec(
 
     Args:
         task: a configuration's name, the path of one, or a Config.
-        num_envs: E.
+        num_envs: E; None for the configured value, likewise the next three.
         num_threads: threads that step them; 0 for one on each CPU. Results do not depend on it.
         num_drones: N.
         seed: seed of the first reset.
         first_env: number of the first environment, for replaying one of a larger batch.
-        **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
+        **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`; type checkers want them in a
+            `dict[str, Any]`.
 
     Raises:
         ConfigError: an unknown key, a wrong value or an impossible system.

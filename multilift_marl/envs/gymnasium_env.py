@@ -20,8 +20,9 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A team of N drones as one agent: observations (N·D,) float32, actions (N·A,) in [-1, 1], the drones' mean reward.
 
     Drone n has the n-th D numbers of an observation and the n-th A numbers of an action. Info holds `success`,
-    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one) and `reward_terms` {name: float}. A
-    copy, also by pickle, is a new environment of the same configuration, not yet reset.
+    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms` {name: float} and
+    `randomization` {name: array}, the hidden draw. A copy, also by pickle, is a new environment of the same
+    configuration, not yet reset.
 
     Without a seed an environment starts with the configured one, so environments that are to fly different episodes
     need different seeds.
@@ -67,7 +68,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             Observation (N·D,) float32 and info.
 
         Raises:
-            ValueError: a negative seed or an unknown option.
+            ValueError: a negative seed, an unknown option or one that cannot be.
         """
         observation, info = self.vec.reset(seed, options=options)
         self._pictures.show()
@@ -176,7 +177,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             Observations (E, N·D) float32 of all environments, and info of those that were reset.
 
         Raises:
-            ValueError: a negative seed, a mask of wrong shape or type, or an unknown option.
+            ValueError: a negative seed, a mask of wrong shape or type, an unknown option or one that cannot be.
         """
         options = dict(options or {})
         mask = options.pop("reset_mask", None)

@@ -9,8 +9,9 @@ import pettingzoo
 from gymnasium.spaces import Box
 from pettingzoo import ParallelEnv
 
+from multilift_marl.config.load import resolve_config
 from multilift_marl.config.schema import Config
-from multilift_marl.envs.core import MultiliftVec, resolve_config
+from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.faces import RENDER_MODES, Pictures, solo_info
 from multilift_marl.errors import nearest
 from multilift_marl.tasks import list_tasks
@@ -30,9 +31,12 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
 
     Attributes:
         vec: the batched core underneath, of one environment.
+        possible_agents: the names of all drones; `agents` is empty before the first episode and between two.
+        observation_spaces, action_spaces: by agent, (D,) and (A,) float32.
         state_space: of `state`, (S,) float32.
 
     Raises:
+        ConfigError: see `MultiliftVec`.
         ValueError: an unknown render mode.
     """
 
@@ -87,7 +91,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
             actions: {agent: (A,) floating point} of every agent; values beyond [-1, 1] are clipped.
 
         Returns:
-            Observations, rewards, terminations, truncations and infos by agent.
+            Observations (D,) float32, rewards, terminations, truncations and infos by agent.
 
         Raises:
             ValueError: an agent without an action, an action without an agent, or one of wrong shape or type or not

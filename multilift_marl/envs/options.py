@@ -21,7 +21,7 @@ MOST_TENSION = 5.0  # [-] ... as much as this times its tension at rest stretche
 
 
 def check_mask(mask: Any, num_envs: int) -> np.ndarray:
-    """Return a mask as an array, refused if it is none of `num_envs` environments."""
+    """Return a mask as an array (E,) bool; a ValueError if it is none of `num_envs` environments."""
     mask = np.asarray(mask)
     if mask.shape != (num_envs,) or mask.dtype != bool:
         raise ValueError(f"mask has shape {mask.shape} and dtype {mask.dtype}, expected bool {(num_envs,)}")
@@ -29,7 +29,7 @@ def check_mask(mask: Any, num_envs: int) -> np.ndarray:
 
 
 def check_seed(seed: Any) -> None:
-    """Refuse what is no seed."""
+    """Refuse what is no seed, None excepted, by a ValueError."""
     whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
     if seed is not None and not (whole and 0 <= seed < 2**63):
         raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, but is {seed!r}")

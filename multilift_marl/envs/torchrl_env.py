@@ -10,8 +10,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from multilift_marl.config.load import resolve_config
 from multilift_marl.config.schema import Config
-from multilift_marl.envs.core import TRAINING, MultiliftVec, resolve_config
+from multilift_marl.envs.core import TRAINING, MultiliftVec
 
 
 class MultiliftEnv(EnvBase):
@@ -28,6 +29,9 @@ class MultiliftEnv(EnvBase):
 
     Attributes:
         vec: the batched core underneath.
+
+    Raises:
+        ConfigError: see `MultiliftVec`.
     """
 
     def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
@@ -98,7 +102,11 @@ class MultiliftEnv(EnvBase):
         return {key: torch.from_numpy(array) for key, array in self.vec.state_dict().items()}
 
     def set_state(self, saved: dict[str, torch.Tensor]) -> None:
-        """Continue bit for bit from what `get_state` returned: the next full reset returns the restored episodes."""
+        """Continue bit for bit from what `get_state` returned: the next full reset returns the restored episodes.
+
+        Raises:
+            ValueError: it is of other environments.
+        """
         self.vec.load_state_dict({key: tensor.numpy() for key, tensor in saved.items()})
         self._resumed = True
 
@@ -107,7 +115,11 @@ def torchrl_env(
     task: str | Config = "hover", *, num_envs: int | None = None, num_threads: int | None = None,
     num_drones: int | None = None, seed: int | None = None, first_env: int = 0, **overrides: Any,
 ) -> MultiliftEnv:  # fmt: skip
-    """Return E environments of a task as a TorchRL environment; arguments as for `make_vec`."""
+    """Return E environments of a task as a TorchRL environment of batch size [E]; arguments as for `make_vec`.
+
+    Raises:
+        ConfigError: an unknown key, a wrong value or an impossible system.
+    """
     config = resolve_config(
         task, num_envs=num_envs, num_threads=num_threads, num_drones=num_drones, seed=seed, **overrides
     )

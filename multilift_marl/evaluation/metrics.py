@@ -15,7 +15,7 @@ _SUCCESSFUL = ("payload_position_error_m", "payload_attitude_error_deg", "payloa
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Return the 95 % Wilson score interval of a rate (Wilson 1927)."""
+    """Return the 95 % Wilson score interval of the rate of `successes` in `trials`, at least one (Wilson 1927)."""
     rate, square = successes / trials, _Z**2 / trials
     centre = (rate + square / 2) / (1 + square)
     half = _Z / (1 + square) * sqrt(rate * (1 - rate) / trials + square / (4 * trials))
@@ -52,7 +52,10 @@ def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
 
 
 def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Return the mean paired difference, policy minus baseline, of every metric on the same episodes."""
+    """Return the mean paired difference, policy minus baseline, of every metric of `fly_episodes`.
+
+    Both on the same episodes, (n,) each; the form is that of `summarize`.
+    """
     return {
         name: _mean(values.astype(float) - baseline[name].astype(float))
         for name, values in policy.items()

@@ -50,7 +50,7 @@ def make_report(
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
-    """Write metrics.json."""
+    """Write what `make_report` returned to `path`, metrics.json by custom."""
     path.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

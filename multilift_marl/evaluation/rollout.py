@@ -20,10 +20,10 @@ class Policy(Protocol):
     """What can fly a team: learned or scripted."""
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (..., N, A) for observations (..., N, D)."""
+        """Return actions (..., N, A) in [-1, 1] for observations (..., N, D)."""
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Begin new episodes in the environments of the mask."""
+        """Begin new episodes in the environments of the mask (E,) bool (None: all)."""
 
 
 class Trace(NamedTuple):
@@ -60,8 +60,12 @@ def fly_episodes(
         progress: called with the number of episodes finished.
 
     Returns:
-        Metrics of each episode by name, (episodes,) each; see the contract in docs/evaluation.md. Errors of a failed
-        episode stand at the failure bound. "failure_cause" holds indices into `CAUSES`.
+        Metrics of each episode by name, (episodes,) each, units in their names; see docs/evaluation.md. Errors of a
+        failed episode stand at the failure bound. "failure_cause" holds indices into `CAUSES`.
+
+    Raises:
+        ConfigError: see `MultiliftVec`.
+        ValueError: the policy's actions do not fit the environment.
     """
     parts = []
     for first in range(0, episodes, _BATCH):
@@ -142,7 +146,18 @@ def trace_episode(
     config: Config, make_policy: Callable[[MultiliftVec], Policy], episode: int, seed: int,
     on_step: Callable[[MultiliftVec], None] | None = None,
 ) -> Trace:  # fmt: skip
-    """Fly one evaluation episode and return its trace; `on_step` sees the environment after every step."""
+    """Fly one evaluation episode and return its trace.
+
+    Args:
+        config: the environment.
+        make_policy: returns the policy for given environments.
+        episode: which one of `fly_episodes`.
+        seed: evaluation seed.
+        on_step: called with the environment after every step.
+
+    Raises:
+        ConfigError, ValueError: see `fly_episodes`.
+    """
     vec = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}), EVALUATION, first_env=episode)
     policy = make_policy(vec)
     observation, _ = vec.reset(seed=seed)

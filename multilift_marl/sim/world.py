@@ -64,6 +64,7 @@ class World:
         seed: of the turbulence that each `reset` starts with; `seed_turbulence` gives another.
 
     Attributes:
+        system, num_envs, num_drones, model, layout: as given, E, N, MuJoCo's model and where what stands in it.
         state: SystemState of all environments; live arrays, E first.
         thrust: commanded thrust of each rotor (E, N, 4) [N].
         parameters: true parameters; changed by `set_parameters` alone.
@@ -73,13 +74,15 @@ class World:
         record: what accumulated since the reset.
         diverged: (E,) bool, until reset.
         breakable: whether `state.cable_broken` is looked at after every physics step.
+
+    Raises:
+        ValueError: fewer than one environment, or a negative number of threads or seed.
     """
 
     def __init__(self, system: System, num_envs: int, num_threads: int = 0, seed: int = 0):
-        if num_envs < 1 or num_threads < 0:
-            raise ValueError(f"num_envs={num_envs} must be at least 1 and num_threads={num_threads} at least 0")
-        if seed < 0:
-            raise ValueError(f"seed={seed} must be at least 0")
+        for name, value, least in (("num_envs", num_envs, 1), ("num_threads", num_threads, 0), ("seed", seed, 0)):
+            if value < least:
+                raise ValueError(f"{name}={value} must be at least {least}")
         _quiet_mujoco()
         self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
         self.model, self.layout = build_model(system)
@@ -88,21 +91,18 @@ class World:
         self.parameters = nominal_parameters(system, num_envs)
         self._varied = make_varied(system, self.parameters)
         self.plant = Plant(
-            payload_mass=self.parameters.payload_mass,
-            payload_force=np.zeros((num_envs, 3)),
-            wind=np.tile(system.wind, (num_envs, 1)),
-            motors_off=np.zeros((num_envs, system.num_drones), bool),
-        )
+            payload_mass=self.parameters.payload_mass, payload_force=np.zeros((num_envs, 3)),
+            wind=np.tile(system.wind, (num_envs, 1)), motors_off=np.zeros((num_envs, self.num_drones), bool),
+        )  # fmt: skip
         self.air, self.seed = Air.zeros(num_envs, self.num_drones), seed
-        self.record = Record.zeros(num_envs)
-        self.diverged = np.zeros(num_envs, bool)
+        self.record, self.diverged = Record.zeros(num_envs), np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool: tuple[int, ThreadPoolExecutor] | None = None  # with its process
         self.reset()
 
     def reset(self, mask: np.ndarray | None = None) -> SystemState:
-        """Put the environments in `mask` (E,) (None: all) at rest in formation, payload 1.5 m above the ground."""
+        """Put the environments in `mask` (E,) (None: all) at rest in formation, payload at 1.5 m; return the state."""
         mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool)
         system, state = self.system, self.state
         state.payload_position[mask] = [0, 0, REST_HEIGHT]
@@ -193,7 +193,7 @@ class World:
                 write_model(shard.batch, *shared, self._own(shard), local, names, shard.broken)
 
     def seed_turbulence(self, env: int, seed: np.random.SeedSequence) -> None:
-        """Start the turbulence of one environment anew, from its stationary distribution."""
+        """Start the turbulence of environment `env` anew from its stationary distribution, drawn from `seed`."""
         self.air.generator[env] = seed.generate_state(1, np.uint64)[0]
         start_turbulence(env, self.air)
 
@@ -225,7 +225,7 @@ class World:
                 self.diverged[shard.lo : shard.hi] |= shard.batch.warning[:, :, 1].any(axis=1)
 
     def qpos(self, env: int) -> np.ndarray:
-        """Return MuJoCo's generalised coordinates of one environment, to draw it."""
+        """Return MuJoCo's generalised coordinates (nq,) of one environment; ValueError if there is none such."""
         if not 0 <= env < self.num_envs:
             raise ValueError(f"there is no environment {env}; give one from 0 to {self.num_envs - 1}")
         shard = next(shard for shard in self.shards if shard.lo <= env < shard.hi)

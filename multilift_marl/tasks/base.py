@@ -61,7 +61,18 @@ class Task:
         LEAST_DRONES: with fewer it makes no sense.
         KEPT: names of further arrays, environment first, that outlive a step.
 
+    Args:
+        config: of the environments; `task_options`, `reward`, `env` and `sim` count.
+        world: what is flown.
+        reference: what the drones are told to follow.
+
     Attributes:
+        world, reference: as given.
+        options: `task_options`, checked; a subclass that annotates it with its own `Options` has it typed.
+        weights: of the reward terms (T,), in the order of `REWARD`.
+        dt, control_dt: policy and control step [s].
+        rig: the nominal formation in the payload frame.
+        limits: lengths of the failures.
         goal, errors: Goal, Errors; live arrays.
         way: Goal that the drones fly about: `goal` itself, unless a task leads the team there.
         cause: failure cause (E,), an index into `failures.CAUSES`.
@@ -73,10 +84,14 @@ class Task:
         seen: the state as the drones are told it, for observers; live arrays.
         hanging: numbers of a hanging team; in `start`, the true ones of the environment, else nominal.
         nominal_hanging: always nominal, for goals.
+
+    Raises:
+        ConfigError: too few drones, an unknown option or reward term, or one that cannot be.
     """
 
     name: ClassVar[str]
     Options: ClassVar[type[Section]] = Section
+    options: Section
     REWARD: ClassVar[dict[str, float]] = {}
     EXTRA: ClassVar[tuple[Component, ...]] = ()
     EXTRA_STATE: ClassVar[int] = 0
@@ -108,7 +123,13 @@ class Task:
         self.terms = np.zeros((e, len(self.REWARD)))
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
-        """Draw a start of one environment: write its goal and `world.state`, for a payload of true `mass` [kg]."""
+        """Draw a start of one environment: write its goal and `world.state`; a start that is a failure is drawn again.
+
+        Args:
+            env: the environment.
+            rng: generator of this episode, the only source of what is random.
+            mass: true mass of the payload [kg].
+        """
         raise NotImplementedError
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
@@ -136,7 +157,13 @@ class Task:
         return time > length - FINAL_SECONDS + 1e-9
 
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None] | None:
-        """Return what writes `EXTRA` and `EXTRA_STATE`, the last numbers of each row, of environments lo to hi."""
+        """Return what writes `EXTRA` and `EXTRA_STATE`, the last numbers of each row, of environments lo to hi.
+
+        Args:
+            lo, hi: the environments.
+            observation: (E, N, D) float32, live array.
+            critic: global state (E, S) float32, live array.
+        """
         return None
 
     def blur(self, imperfections: Imperfections) -> None:
@@ -145,14 +172,17 @@ class Task:
         self.seen = imperfections.state if imperfections.noisy else self.world.state
 
     def draw_start(self, env: int, rng: np.random.Generator, parameters: Parameters) -> bool:
-        """Draw a start of one environment, whose team has true `parameters`; return whether it is sound."""
+        """Draw a start of environment `env`, whose team has true `parameters`; return whether it is sound.
+
+        That is what the core calls, for as many draws as it takes; tasks say by `start` what is drawn.
+        """
         self.hanging = true_hanging(self.nominal_hanging, parameters, env)
         self.start(env, rng, float(parameters.payload_mass[env]))
         self.hanging = self.nominal_hanging
         return self.begin(env)
 
     def route(self, env: int) -> np.ndarray:
-        """Return points (P, 3) of the way that the target takes in this episode, to draw it; none if it stays."""
+        """Return points (P, 3) [m] of the way that the target takes in this episode, to draw it; none if it stays."""
         return np.zeros((0, 3))
 
     def scenery(self, env: int) -> list[Box]:

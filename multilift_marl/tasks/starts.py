@@ -12,12 +12,13 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.schema import Float, Section
 from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
-from multilift_marl.control.formation import goal_hook, place_formation
+from multilift_marl.control.formation import Goal, Rig, goal_hook, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
 from multilift_marl.sim.cables import cable_end
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.standing import Drones, hold_hook, hover_drone, make_drones
+from multilift_marl.sim.state import SystemState
 
 
 class Hanging(NamedTuple):
@@ -147,7 +148,10 @@ def make_ranges(option: StartOptions) -> StartRanges:
 
 
 @kernel
-def start_near_target(e, rng, state, goal, rig, ranges, hanging, mass):
+def start_near_target(
+    e: int, rng: np.random.Generator, state: SystemState, goal: Goal, rig: Rig, ranges: StartRanges, hanging: Hanging,
+    mass: float,
+) -> None:  # fmt: skip
     """Draw a target, and a team in hanging equilibrium there, then moved, tilted and set in motion as one."""
     x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
     put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))

@@ -8,17 +8,19 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
+from multilift_marl.control.formation import Goal
 from multilift_marl.math3d import clip, matmul, matrow, norm, put, rotation_vector, row, sub, transpose
+from multilift_marl.sim.state import SystemState
 
 
 @kernel
-def tolerance(value, margin):
+def tolerance(value: float, margin: float) -> float:
     """Return 1 at value 0, falling with a long tail: 1/2 at `margin`, 1/10 at three times the margin."""
     return 1.0 / (1.0 + (value / margin) ** 2)
 
 
 @kernel
-def mean_change(e, action, previous):
+def mean_change(e: int, action: np.ndarray, previous: np.ndarray) -> float:
     """Return the mean square of how an action (E, N, A) of environment e differs from the last one."""
     change, count = 0.0, action.shape[1] * action.shape[2]
     for n in range(action.shape[1]):
@@ -75,7 +77,9 @@ def measure(lo, hi, state, goal, way, led, errors, dt, largest):
 
 
 @kernel
-def pay_pose(e, state, goal, errors, share, weights, terms):
+def pay_pose(
+    e: int, state: SystemState, goal: Goal, errors: Errors, share: float, weights: np.ndarray, terms: np.ndarray
+) -> None:
     """Write the first five reward terms of environment e, those of a payload that is to be at its target.
 
     They are position, precision, attitude, level and stillness, each times its weight and `share`.

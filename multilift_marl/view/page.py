@@ -180,7 +180,8 @@ class _Batch:
 
     def __init__(self, server: Any, name: str, mesh: tuple[np.ndarray, np.ndarray], clear: bool):
         self._server, self._name, self._mesh, self._clear = server, name, mesh, clear
-        self._slots, self._handle = 0, None
+        self._slots = 0
+        self._handle: Any = None
         self._shown: dict[str, np.ndarray] | None = None
 
     def show(self, geoms: tuple[np.ndarray, ...] | None) -> None:
