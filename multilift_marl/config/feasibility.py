@@ -19,7 +19,11 @@ MIN_THRUST_TO_WEIGHT = 1.18
 
 
 def check_possible(system: System, ranges: RandomizationConfig) -> None:
-    """Refuse what cannot fly, the heaviest payload and the heaviest and weakest drones included."""
+    """Refuse what cannot fly, the heaviest payload and the heaviest and weakest drones included.
+
+    Raises:
+        ConfigError: why not, and what to change.
+    """
     n, vehicles, heaviest = system.num_drones, system.vehicles, 1 + ranges.payload_mass
     if system.air.wash or system.air.ground_effect:
         for vehicle in vehicles:

@@ -38,7 +38,18 @@ def find_mesh(payload: PayloadConfig) -> Mesh | None:
 def place_anchors(
     config: Config, n: int, length: np.ndarray, scale: float, mesh: Mesh | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return anchors (n, 3) from the geometric centre and edges (3,): the configured or the standard ones."""
+    """Return anchors (n, 3) from the geometric centre and edges (3,) [m]: the configured or the standard ones.
+
+    Args:
+        config: payload and cables count.
+        n: number of drones.
+        length: of the cables (n,) [m].
+        scale: of the vehicles, a falcon's being 1.
+        mesh: of the payload, None for other shapes.
+
+    Raises:
+        ConfigError: another number of anchors than of drones, or what means nothing to a point.
+    """
     payload = config.payload
     reach = length.min() * np.sin(np.deg2rad(config.cable.angle))
     ring = max(0.27 * scale, REST_SEPARATION * scale / (2 * np.sin(np.pi / n)) - reach) if n > 1 else 0.0
@@ -82,7 +93,16 @@ def uniform_inertia(shape: str, mass: float, size: np.ndarray) -> np.ndarray:
 
 
 def check_body(shape: str, size: np.ndarray, center_of_mass: np.ndarray, anchors: np.ndarray) -> None:
-    """Refuse bodies that cannot be, and anchors (N, 3) off the body, counted from its geometric centre."""
+    """Refuse bodies that cannot be, and anchors off the body.
+
+    Args:
+        shape: of the payload.
+        size: its edges (3,) [m].
+        center_of_mass, anchors: from the geometric centre (3,), (N, 3) [m].
+
+    Raises:
+        ConfigError: why not, and what to change.
+    """
     if shape == "cylinder" and size[0] != size[1]:
         raise ConfigError(
             f"payload.size {size.tolist()} of a cylinder must give its diameter twice, then its height; "

@@ -64,7 +64,7 @@ def _resolve(fields: dict[str, Any]) -> Vehicle:
 
 
 def check_rotors(vehicle: Vehicle) -> None:
-    """Refuse rotors that overlap, which the models of wash and ground effect know nothing of."""
+    """Refuse rotors that overlap, which the models of wash and ground effect know nothing of: a ConfigError."""
     rotors = vehicle.rotor_positions
     apart = min(float(np.linalg.norm(a - b)) for i, a in enumerate(rotors) for b in rotors[:i])
     if 2 * vehicle.rotor_radius > apart:

@@ -146,7 +146,7 @@ class MultiliftVec:
         return self._observation.copy(), reward.astype(np.float32), terminated, truncated, info
 
     def current(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return observation and info of the episodes in progress, as `reset` does, and change nothing."""
+        """Return observation (E, N, D) and info of the episodes in progress, as `reset` does, and change nothing."""
         none = np.zeros(self.num_envs, bool)
         return self._observation.copy(), self._info(none, none)
 

@@ -108,7 +108,7 @@ def _check_field(name: str, rows: np.ndarray) -> None:
 
 
 def check_delays(fixed: Rows, longest: dict[str, int]) -> None:
-    """Refuse delays longer than those that are remembered."""
+    """Refuse delays longer than those that are remembered, by a ValueError."""
     for name, most in longest.items():
         if name in fixed and not ((fixed[name] >= 0) & (fixed[name] <= most)).all():
             raise ValueError(f"{name} must be from 0 to {most}, the longest of randomization.{name}; raise that")

@@ -110,7 +110,7 @@ def write_lags(varied: Varied, system: System, parameters: Parameters, mask: np.
 
 
 def check_parameters(system: System, old: Parameters, mask: np.ndarray, values: dict[str, np.ndarray]) -> None:
-    """Refuse values of the environments in `mask` that cannot be.
+    """Refuse values of the environments in `mask` (E,) that cannot be.
 
     Raises:
         ValueError: not finite, not positive where they must be, or of what the configuration does not vary.
@@ -130,7 +130,7 @@ def check_parameters(system: System, old: Parameters, mask: np.ndarray, values: 
 def adopt(
     system: System, parameters: Parameters, mask: np.ndarray, values: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, set[str]]:
-    """Write values into the parameters of the environments in `mask`; return which of them changed, and by what.
+    """Write values into the parameters of the environments in `mask` (E,); return which of them changed (E,), and what.
 
     Raises:
         ValueError: see `check_parameters`.

@@ -57,7 +57,7 @@ class Draw:
             self._draw_more(env, np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key))))
 
     def fix(self, env: int, name: str, value: np.ndarray) -> None:
-        """Replace what was drawn for one environment."""
+        """Replace what was drawn for one environment by `value`, a row of `values[name]`."""
         self.values[name][env] = value
         if name in Parameters._fields:
             self.changing.add(name)

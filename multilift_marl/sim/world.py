@@ -232,7 +232,7 @@ class World:
         return shard.batch.bind("qpos")[env - shard.lo]
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Return copies of all that the future of the simulations depends on."""
+        """Return copies of all that the future of the simulations depends on, by dotted name, environment first."""
         saved = {
             f"{prefix}.{name}": array.copy()
             for prefix, group in self._groups().items()

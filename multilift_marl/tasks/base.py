@@ -213,7 +213,13 @@ class Task:
     def after_step(
         self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray, observation: np.ndarray, critic: np.ndarray
     ) -> list[Callable[[], None]]:
-        """Return what is called in turn for environments lo to hi after each policy step: check, score, observe."""
+        """Return what is called in turn for environments lo to hi after each policy step: check, score, observe.
+
+        Args:
+            lo, hi: the environments.
+            action, previous: this action and the last one (E, N, A), live arrays.
+            observation, critic: observations (E, N, D) and global states (E, S), written.
+        """
         extra = self.observer(lo, hi, observation, critic)
         looks, late = self._looks(lo, hi, self.dt, action, observation, critic)
         return [

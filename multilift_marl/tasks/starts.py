@@ -121,7 +121,7 @@ class StartOptions(TargetOptions):
 
 
 def check_heights(option: TargetOptions) -> None:
-    """Refuse heights of a target in the wrong order."""
+    """Refuse heights of a target in the wrong order, by a ConfigError."""
     if option.target_height[0] > option.target_height[1]:
         raise ConfigError(f"task_options.target_height={option.target_height} must list the lower one first")
 
@@ -139,7 +139,7 @@ class StartRanges(NamedTuple):
 
 
 def make_ranges(option: StartOptions) -> StartRanges:
-    """Return the ranges of `option`, checked."""
+    """Return the ranges of `option`; a ConfigError if the heights are in the wrong order."""
     check_heights(option)
     return StartRanges(
         option.target_xy, *option.target_height, radians(option.target_yaw),
