@@ -123,15 +123,22 @@ def place_formation(e: int, goal: Goal, rig: Rig) -> None:
 @kernel
 def goal_arm(e, n, goal, rig, yaw):
     """Return where the hook of drone n is from its centre as it rests at the target with heading `yaw`, world frame."""
-    force = add(vec(goal.pull, e, n), (0.0, 0.0, rig.drones.mass[n] * GRAVITY))
+    return hook_arm(n, vec(goal.pull, e, n), yaw, rig)
+
+
+@kernel
+def hook_arm(n, pull, yaw, rig):
+    """Return where the hook of drone n is from its centre as it pulls by `pull` [N] with heading `yaw`, world frame."""
+    if not rig.drones.hooked:
+        return (0.0, 0.0, 0.0)
+    force = add(pull, (0.0, 0.0, rig.drones.mass[n] * GRAVITY))
     return mul(thrust_frame(force, yaw), row(rig.drones.hooks, n))
 
 
 @kernel
 def goal_hook(e, n, goal, rig):
     """Return where the hook of drone n is at the target, world frame [m]."""
-    slot = vec(goal.slots, e, n)
-    return add(slot, goal_arm(e, n, goal, rig, goal.drone_yaw[e])) if rig.drones.hooked else slot
+    return add(vec(goal.slots, e, n), goal_arm(e, n, goal, rig, goal.drone_yaw[e]))
 
 
 @kernel

@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.vehicles import GRAVITY
-from multilift_marl.control.formation import goal_arm, place_formation
-from multilift_marl.math3d import add, cross, dot, matmul, matrow, mul, norm, put, row, scale, sub, transpose, unit, vec
+from multilift_marl.control.formation import hook_arm, place_formation
+from multilift_marl.math3d import (
+    add,
+    cross,
+    dot,
+    matmul,
+    matrow,
+    mul,
+    norm,
+    put,
+    row,
+    scale,
+    sub,
+    tmul,
+    transpose,
+    unit,
+    vec,
+)
 from multilift_marl.sim.cables import cable_end
 
 LEAST = 0.2  # of its tension in the level formation, with which every cable is to pull
@@ -15,6 +33,45 @@ BALANCED = 1e-6  # [N] and [N m] for each N of weight: balance to within roundin
 _DAMPING = 1e-9  # relative; makes moments that no pulls can exert harmless
 _ITERATIONS = 20
 _STILL = (0.0, 0.0, 0.0)
+
+
+class Spread(NamedTuple):
+    """What `spread` turns a wrench into its multipliers with: λ = A F + B M, μ = Bᵀ F + C M in the payload's frame."""
+
+    a: tuple[float, ...]
+    """9 numbers, like the next ones."""
+    b: tuple[float, ...]
+    c: tuple[float, ...]
+
+
+def make_spread(anchors: np.ndarray) -> Spread:
+    """Return the spread over anchors (N, 3) [m].
+
+    A wrench that they cannot exert is approached in force over weight, moment over weight times lever.
+    """
+    x, y, z = anchors.T
+    zero, lever = np.zeros_like(x), np.sqrt((anchors**2).sum(axis=1).mean() * 2 / 3) or 1.0
+    arms = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]) / lever  # r ×
+    exerted = np.vstack([np.tile(np.eye(3), len(anchors)), arms.transpose(0, 2, 1).reshape(3, -1)])
+    inverse = np.linalg.pinv(exerted @ exerted.T, rcond=1e-9, hermitian=True)
+    parts = inverse[:3, :3], inverse[:3, 3:] / lever, inverse[3:, 3:] / lever**2
+    return Spread(*(tuple(part.ravel().tolist()) for part in parts))
+
+
+@kernel
+def spread(force, moment, attitude, by):
+    """Return λ, μ such that changes of λ + μ × r_i in the pulls, the least that do so, add a wrench.
+
+    It is the first step of `solve_pulls`, exact where there are no bounds.
+
+    Args:
+        force, moment: added to what the pulls exert on the payload [N], [N m], world frame.
+        attitude: of the payload, 9 numbers.
+        by: Spread.
+    """
+    f, m = tmul(attitude, force), tmul(attitude, moment)
+    linear, angular = add(mul(by.a, f), mul(by.b, m)), add(tmul(by.b, f), mul(by.c, m))
+    return mul(attitude, linear), mul(attitude, angular)
 
 
 @kernel
@@ -144,12 +201,10 @@ def place_slots(e, goal, rig, hanging):
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     for n in range(rig.anchors.shape[0]):
         pull = vec(goal.pull, e, n)
-        anchor = add(position, mul(target, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
-        put(goal.slots[e, n], add(anchor, reach(n, pull, hanging)))
-        goal.pull[e, n, 2] += hanging.weight[n]
-        if rig.drones.hooked:
-            arm = goal_arm(e, n, goal, rig, goal.drone_yaw[e])
-            put(goal.slots[e, n], sub(vec(goal.slots, e, n), arm))
+        held = add(pull, (0.0, 0.0, hanging.weight[n]))
+        place = sub(reach(n, pull, hanging), hook_arm(n, held, goal.drone_yaw[e], rig))
+        put(goal.pull[e, n], held)
+        put(goal.slots[e, n], add(add(position, mul(target, row(rig.anchors, n))), place))
 
 
 @kernel

@@ -12,6 +12,7 @@ from pydantic import Field
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config, Float, Section
 from multilift_marl.control.formation import Goal, Reference
+from multilift_marl.control.pulls import make_spread
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import matmul, matrow, norm, put, rotation_vector, row, sub, transpose, turn
 from multilift_marl.sim.world import World
@@ -94,9 +95,10 @@ class Pose(Task):
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
         """Lead the way to each target in turn; see `Task.planner`."""
+        inertia, attitude = self.world.system.inertia_matrix, self.world.state.payload_rotation
         return bind(
             lead, lo, hi, self.time, self.control_dt, self.plan, self.goal, self.way, self.rig, self.hanging,
-            self.world.system.inertia_matrix, self.world.state.payload_rotation, self._hold, self.options.way_seconds,
+            inertia, make_spread(self.rig.anchors), attitude, self._hold, self.options.way_seconds,
         )  # fmt: skip
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:

@@ -14,12 +14,13 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.vehicles import GRAVITY
-from multilift_marl.control.formation import place_formation, wrap
-from multilift_marl.control.pulls import place_slots, solve_pulls
+from multilift_marl.control.formation import hook_arm, place_formation, wrap
+from multilift_marl.control.pulls import place_slots, reach, spread
 from multilift_marl.math3d import (
     add,
     cross,
     matmul,
+    matrow,
     mul,
     put,
     putmat,
@@ -31,8 +32,6 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
-
-NO_BOUND = -np.inf
 
 
 class Plan(NamedTuple):
@@ -93,7 +92,7 @@ def mat_row(a, i, j, n):
 
 
 @kernel
-def lead(lo, hi, time, dt, plan, goal, way, rig, hanging, inertia, payload_rotation, hold, seconds):
+def lead(lo, hi, time, dt, plan, goal, way, rig, hanging, inertia, balance, payload_rotation, hold, seconds):
     """Go on by one control step: the way of environments lo to hi, and their goals where a new target's time has come.
 
     Args:
@@ -105,69 +104,80 @@ def lead(lo, hi, time, dt, plan, goal, way, rig, hanging, inertia, payload_rotat
         way: Goal that the drones fly about.
         rig, hanging: Rig, Hanging.
         inertia: of the payload in its frame, 9 numbers [kg m²].
+        balance: Spread over the anchors.
         payload_rotation: (E, 3, 3) written if the payload is a point, which is turned as its way is.
         hold: how long each target stays [s].
         seconds: how long the way to it takes [s].
     """
-    point = not np.any(rig.anchors != 0.0)
     for e in range(lo, hi):
         time[e] += dt
         stage = min(int((time[e] - 0.5 * dt) / hold), plan.pose.shape[1] - 2)
         if stage != plan.stage[e]:
             plan.stage[e] = stage
             aim(e, stage + 1, plan, goal, rig, hanging)
-        gone = time[e] - stage * hold
-        if gone < seconds + 4.5 * dt:  # a little longer, until the differences of the slots are zero
-            _go(e, stage, min(gone / seconds, 1.0), dt, plan, way, rig, hanging, inertia, seconds)
-        if point:
-            payload_rotation[e] = way.rotation[e]
+    _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, seconds)
+    if not np.any(rig.anchors != 0.0):
+        for e in range(lo, hi):
+            putmat(payload_rotation[e], matrow(way.rotation, e))
 
 
 @kernel
-def _go(e, k, x, dt, plan, way, rig, hanging, inertia, seconds):
-    """Write the way of environment e at the share x of the time from pose k to the next."""
-    s, ds, dds, ddds = ease(x)
-    ds, dds, ddds = ds / seconds, dds / (seconds * seconds), ddds / (seconds * seconds * seconds)
-    a, b = plan.pose[e, k], plan.pose[e, k + 1]
-    before = row(way.position, e)
-    step = (b[0] - a[0], b[1] - a[1], b[2] - a[2])
-    turned, rolled, pitched = wrap(b[3] - a[3]), b[4] - a[4], b[5] - a[5]
-    yaw, roll, pitch = a[3] + s * turned, a[4] + s * rolled, a[5] + s * pitched
-    heading, attitude = rot_z(yaw), attitude_of(yaw, roll, pitch)
-    # angular velocity, and its change, of s = 1 per second
-    leaning = (rolled, cos(roll) * pitched, sin(roll) * pitched)
-    bending = (0.0, -sin(roll) * rolled * pitched, cos(roll) * rolled * pitched)
-    spin = mul(heading, leaning)
-    swing = add(cross((0.0, 0.0, turned), spin), mul(heading, bending))
-    spin = add(spin, (0.0, 0.0, turned))
-    acceleration, turning = scale(dds, step), add(scale(dds, spin), scale(ds * ds, swing))
-    rates = scale(ds, spin)
-    body = matmul(matmul(attitude, inertia), transpose(attitude))
-    moment = add(mul(body, turning), cross(rates, mul(body, rates)))
-    force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
-    put(way.position[e], add((a[0], a[1], a[2]), scale(s, step)))
-    put(way.velocity[e], scale(ds, step))
-    put(way.acceleration[e], acceleration)
-    put(way.jerk[e], scale(ddds, step))
-    put(way.angular_velocity[e], rates)
-    putmat(way.rotation[e], attitude)
-    way.yaw[e], way.drone_yaw[e], way.drone_yaw_rate[e] = yaw, yaw, ds * turned
-    c, si = cos(yaw), sin(yaw)
+def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, seconds):
+    """Write the way of environments lo to hi.
+
+    The loop is in here, as a call for each environment would count references to every array of these groups.
+    """
     count = rig.slots.shape[0]
-    for n in range(count):
-        old, new = mat_row(plan.pull, e, k, n), mat_row(plan.pull, e, k + 1, n)
-        put(way.pull[e, n], turn(c, si, add(scale(1.0 - s, old), scale(s, new))))
-        way.slot_jerk[e, n] = way.slots[e, n]  # kept for the differences below
-    solve_pulls(force, moment, attitude, rig.anchors, NO_BOUND, way.pull[e])
-    place_slots(e, way, rig, hanging)
-    moved = sub(row(way.position, e), before)
-    for n in range(count):
-        velocity, past = vec(way.slot_velocity, e, n), vec(way.slot_acceleration, e, n)
-        gained = scale(1.0 / dt, sub(sub(vec(way.slots, e, n), vec(way.slot_jerk, e, n)), moved))
-        change = scale(1.0 / dt, sub(gained, velocity))
-        put(way.slot_velocity[e, n], gained)
-        put(way.slot_acceleration[e, n], change)
-        put(way.slot_jerk[e, n], scale(1.0 / dt, sub(change, past)))
-        # the drones' controllers add the inertia of their share of the load, which these pulls hold already
-        share = rig.force[n, 2] / GRAVITY
-        put(way.pull[e, n], sub(vec(way.pull, e, n), scale(share, add(acceleration, change))))
+    for e in range(lo, hi):
+        k = plan.stage[e]
+        gone = time[e] - k * hold
+        if gone >= seconds + 4.5 * dt:  # a little later than the way ends: the differences of the slots are zero
+            continue
+        s, ds, dds, ddds = ease(min(gone / seconds, 1.0))
+        ds, dds, ddds = ds / seconds, dds / (seconds * seconds), ddds / (seconds * seconds * seconds)
+        a, b = plan.pose[e, k], plan.pose[e, k + 1]
+        before, start, step = row(way.position, e), (a[0], a[1], a[2]), (b[0] - a[0], b[1] - a[1], b[2] - a[2])
+        turned, rolled, pitched = wrap(b[3] - a[3]), b[4] - a[4], b[5] - a[5]
+        yaw, roll, pitch = a[3] + s * turned, a[4] + s * rolled, a[5] + s * pitched
+        c, si, attitude = cos(yaw), sin(yaw), attitude_of(yaw, roll, pitch)
+        # angular velocity, and its change, of s = 1 per second
+        spin = turn(c, si, (rolled, cos(roll) * pitched, sin(roll) * pitched))
+        bending = turn(c, si, (0.0, -sin(roll) * rolled * pitched, cos(roll) * rolled * pitched))
+        swing = add(cross((0.0, 0.0, turned), spin), bending)
+        spin = add(spin, (0.0, 0.0, turned))
+        acceleration, turning = scale(dds, step), add(scale(dds, spin), scale(ds * ds, swing))
+        rates, position = scale(ds, spin), add(start, scale(s, step))
+        put(way.position[e], position)
+        put(way.velocity[e], scale(ds, step))
+        put(way.acceleration[e], acceleration)
+        put(way.jerk[e], scale(ddds, step))
+        put(way.angular_velocity[e], rates)
+        putmat(way.rotation[e], attitude)
+        way.yaw[e], way.drone_yaw[e], way.drone_yaw_rate[e] = yaw, yaw, ds * turned
+        # what the pulls of the two poses, mixed, lack of the force and the moment of this motion
+        body = matmul(matmul(attitude, inertia), transpose(attitude))
+        moment = add(mul(body, turning), cross(rates, mul(body, rates)))
+        force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
+        for n in range(count):
+            old, new = mat_row(plan.pull, e, k, n), mat_row(plan.pull, e, k + 1, n)
+            pull = turn(c, si, add(scale(1.0 - s, old), scale(s, new)))
+            put(way.pull[e, n], pull)
+            force, moment = sub(force, pull), sub(moment, cross(mul(attitude, row(rig.anchors, n)), pull))
+        linear, angular = spread(force, moment, attitude, balance)
+        moved = sub(position, before)
+        for n in range(count):
+            arm = mul(attitude, row(rig.anchors, n))
+            pull = add(vec(way.pull, e, n), add(linear, cross(angular, arm)))
+            held = add(pull, (0.0, 0.0, hanging.weight[n]))
+            place = sub(reach(n, pull, hanging), hook_arm(n, held, yaw, rig))
+            slot = add(add(position, arm), place)
+            velocity, past = vec(way.slot_velocity, e, n), vec(way.slot_acceleration, e, n)
+            gained = scale(1.0 / dt, sub(sub(slot, vec(way.slots, e, n)), moved))
+            change = scale(1.0 / dt, sub(gained, velocity))
+            put(way.slots[e, n], slot)
+            put(way.slot_velocity[e, n], gained)
+            put(way.slot_acceleration[e, n], change)
+            put(way.slot_jerk[e, n], scale(1.0 / dt, sub(change, past)))
+            # the drones' controllers add the inertia of their share of the load, which these pulls hold already
+            share = rig.force[n, 2] / GRAVITY
+            put(way.pull[e, n], sub(held, scale(share, add(acceleration, change))))
