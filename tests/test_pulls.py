@@ -7,7 +7,7 @@ import pytest
 from conftest import floats, make_system
 
 from multilift_marl.control.formation import Goal, make_rig, place_formation
-from multilift_marl.control.pulls import BALANCED, place_balanced, solve_pulls
+from multilift_marl.control.pulls import BALANCED, make_spread, place_balanced, solve_pulls, spread
 from multilift_marl.math3d import axis_angle, matmul, rot_z
 from multilift_marl.tasks.starts import make_hanging
 
@@ -43,6 +43,21 @@ def test_without_bounds_the_change_is_the_pseudo_inverses():
     expected = OUTWARD.ravel() + np.linalg.pinv(matrix) @ (wrench - matrix @ OUTWARD.ravel())
     np.testing.assert_allclose(pull.ravel(), expected, atol=1e-9)
     assert left < 1e-9
+
+
+@pytest.mark.parametrize("anchors", [SQUARE, SQUARE[:3], SQUARE[:2], np.zeros((1, 3))])
+def test_the_spread_of_what_is_lacking_is_the_solution_without_bounds(anchors):
+    rng, given = np.random.default_rng(0), OUTWARD[: len(anchors)]
+    turn = np.reshape(axis_angle((0.6, 0.0, 0.8), 0.7), (3, 3))
+    arms = anchors @ turn.T
+    for _ in range(20):
+        wrench, matrix = rng.normal(size=6) + [0, 0, 12, 0, 0, 0], balance_matrix(arms)
+        pull, _ = solve(wrench[:3], wrench[3:], given, anchors, floats(turn))
+        lacking = wrench - matrix @ given.ravel()
+        linear, angular = spread(floats(lacking[:3]), floats(lacking[3:]), floats(turn), make_spread(anchors))
+        np.testing.assert_allclose(
+            given + linear + np.cross(angular, arms), pull, atol=1e-5 if len(anchors) < 3 else 1e-10
+        )
 
 
 def test_a_moment_shifts_pull_from_one_side_to_the_other():

@@ -139,14 +139,10 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         before, start, step = row(way.position, e), (a[0], a[1], a[2]), (b[0] - a[0], b[1] - a[1], b[2] - a[2])
         turned, rolled, pitched = wrap(b[3] - a[3]), b[4] - a[4], b[5] - a[5]
         yaw, roll, pitch = a[3] + s * turned, a[4] + s * rolled, a[5] + s * pitched
-        c, si, attitude = cos(yaw), sin(yaw), attitude_of(yaw, roll, pitch)
-        # angular velocity, and its change, of s = 1 per second
-        spin = turn(c, si, (rolled, cos(roll) * pitched, sin(roll) * pitched))
-        bending = turn(c, si, (0.0, -sin(roll) * rolled * pitched, cos(roll) * rolled * pitched))
-        swing = add(cross((0.0, 0.0, turned), spin), bending)
-        spin = add(spin, (0.0, 0.0, turned))
+        attitude, position = attitude_of(yaw, roll, pitch), add(start, scale(s, step))
+        spin, swing = _spin(yaw, roll, turned, rolled, pitched)
         acceleration, turning = scale(dds, step), add(scale(dds, spin), scale(ds * ds, swing))
-        rates, position = scale(ds, spin), add(start, scale(s, step))
+        rates, c, si = scale(ds, spin), cos(yaw), sin(yaw)
         put(way.position[e], position)
         put(way.velocity[e], scale(ds, step))
         put(way.acceleration[e], acceleration)
@@ -154,11 +150,10 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         put(way.angular_velocity[e], rates)
         putmat(way.rotation[e], attitude)
         way.yaw[e], way.drone_yaw[e], way.drone_yaw_rate[e] = yaw, yaw, ds * turned
-        # what the pulls of the two poses, mixed, lack of the force and the moment of this motion
         body = matmul(matmul(attitude, inertia), transpose(attitude))
         moment = add(mul(body, turning), cross(rates, mul(body, rates)))
         force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
-        for n in range(count):
+        for n in range(count):  # the pulls of both poses, mixed, lack some of that force and moment
             old, new = mat_row(plan.pull, e, k, n), mat_row(plan.pull, e, k + 1, n)
             pull = turn(c, si, add(scale(1.0 - s, old), scale(s, new)))
             put(way.pull[e, n], pull)
@@ -181,3 +176,13 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
             # the drones' controllers add the inertia of their share of the load, which these pulls hold already
             share = rig.force[n, 2] / GRAVITY
             put(way.pull[e, n], sub(held, scale(share, add(acceleration, change))))
+
+
+@kernel
+def _spin(yaw, roll, turned, rolled, pitched):
+    """Return the angular velocity of an attitude whose angles change at these rates, and its change at steady rates."""
+    c, s = cos(yaw), sin(yaw)
+    leaning = turn(c, s, (rolled, cos(roll) * pitched, sin(roll) * pitched))
+    bending = turn(c, s, (0.0, -sin(roll) * rolled * pitched, cos(roll) * rolled * pitched))
+    yawing = (0.0, 0.0, turned)
+    return add(leaning, yawing), add(cross(yawing, leaning), bending)
