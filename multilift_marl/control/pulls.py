@@ -36,7 +36,7 @@ _STILL = (0.0, 0.0, 0.0)
 
 
 class Spread(NamedTuple):
-    """What `spread` turns a wrench into its multipliers with: λ = A F + B M, μ = Bᵀ F + C M in the payload's frame."""
+    """How `spread` finds λ = A F + B M and μ = Bᵀ F + C M, all in the payload's frame."""
 
     a: tuple[float, ...]
     """9 numbers, like the next ones."""
@@ -45,9 +45,9 @@ class Spread(NamedTuple):
 
 
 def make_spread(anchors: np.ndarray) -> Spread:
-    """Return the spread over anchors (N, 3) [m].
+    """Return how wrenches are spread over anchors (N, 3) [m].
 
-    A wrench that they cannot exert is approached in force over weight, moment over weight times lever.
+    Where pulls cannot exert one, what is left is least, moments over a lever counted as forces are.
     """
     x, y, z = anchors.T
     zero, lever = np.zeros_like(x), np.sqrt((anchors**2).sum(axis=1).mean() * 2 / 3) or 1.0
@@ -60,14 +60,14 @@ def make_spread(anchors: np.ndarray) -> Spread:
 
 @kernel
 def spread(force, moment, attitude, by):
-    """Return λ, μ such that changes of λ + μ × r_i in the pulls, the least that do so, add a wrench.
+    """Return λ, μ such that pulls changed by λ + μ × r_i, the least change that does so, exert a wrench more.
 
-    It is the first step of `solve_pulls`, exact where there are no bounds.
+    With it `solve_pulls` is solved at once where no cable is at its bound.
 
     Args:
-        force, moment: added to what the pulls exert on the payload [N], [N m], world frame.
+        force, moment: to be exerted beside what the pulls exert [N], [N m], world frame.
         attitude: of the payload, 9 numbers.
-        by: Spread.
+        by: Spread over the anchors.
     """
     f, m = tmul(attitude, force), tmul(attitude, moment)
     linear, angular = add(mul(by.a, f), mul(by.b, m)), add(tmul(by.b, f), mul(by.c, m))
@@ -201,10 +201,10 @@ def place_slots(e, goal, rig, hanging):
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     for n in range(rig.anchors.shape[0]):
         pull = vec(goal.pull, e, n)
-        held = add(pull, (0.0, 0.0, hanging.weight[n]))
-        place = sub(reach(n, pull, hanging), hook_arm(n, held, goal.drone_yaw[e], rig))
+        anchor, held = add(position, mul(target, row(rig.anchors, n))), add(pull, (0.0, 0.0, hanging.weight[n]))
+        hook = add(anchor, reach(n, pull, hanging))
         put(goal.pull[e, n], held)
-        put(goal.slots[e, n], add(add(position, mul(target, row(rig.anchors, n))), place))
+        put(goal.slots[e, n], sub(hook, hook_arm(n, held, goal.drone_yaw[e], rig)))
 
 
 @kernel

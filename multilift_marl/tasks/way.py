@@ -123,9 +123,9 @@ def lead(lo, hi, time, dt, plan, goal, way, rig, hanging, inertia, balance, payl
 
 @kernel
 def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, seconds):
-    """Write the way of environments lo to hi.
+    """Write the way of environments lo to hi; arguments as of `lead`.
 
-    The loop is in here, as a call for each environment would count references to every array of these groups.
+    The loop is in here because a call for each environment would take longer than the work: see docs/architecture.md.
     """
     count = rig.slots.shape[0]
     for e in range(lo, hi):
@@ -150,10 +150,11 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         put(way.angular_velocity[e], rates)
         putmat(way.rotation[e], attitude)
         way.yaw[e], way.drone_yaw[e], way.drone_yaw_rate[e] = yaw, yaw, ds * turned
+        # the pulls of the two poses, mixed, lack some of the force and the moment of this motion
         body = matmul(matmul(attitude, inertia), transpose(attitude))
         moment = add(mul(body, turning), cross(rates, mul(body, rates)))
         force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
-        for n in range(count):  # the pulls of both poses, mixed, lack some of that force and moment
+        for n in range(count):
             old, new = mat_row(plan.pull, e, k, n), mat_row(plan.pull, e, k + 1, n)
             pull = turn(c, si, add(scale(1.0 - s, old), scale(s, new)))
             put(way.pull[e, n], pull)
@@ -163,9 +164,8 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         for n in range(count):
             arm = mul(attitude, row(rig.anchors, n))
             pull = add(vec(way.pull, e, n), add(linear, cross(angular, arm)))
-            held = add(pull, (0.0, 0.0, hanging.weight[n]))
-            place = sub(reach(n, pull, hanging), hook_arm(n, held, yaw, rig))
-            slot = add(add(position, arm), place)
+            held, hook = add(pull, (0.0, 0.0, hanging.weight[n])), add(add(position, arm), reach(n, pull, hanging))
+            slot = sub(hook, hook_arm(n, held, yaw, rig))
             velocity, past = vec(way.slot_velocity, e, n), vec(way.slot_acceleration, e, n)
             gained = scale(1.0 / dt, sub(sub(slot, vec(way.slots, e, n)), moved))
             change = scale(1.0 / dt, sub(gained, velocity))
