@@ -2,7 +2,10 @@
 
 import sys
 
-from multilift_marl.cli.train import main
-
 if __name__ == "__main__":
+    try:
+        from multilift_marl.cli.train import main  # takes a while, in which Ctrl-C may come
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        sys.exit(130)
     sys.exit(main())

@@ -10,6 +10,7 @@ from multilift_marl.envs.core import make_vec
 from multilift_marl.envs.gymnasium_env import register as _register_with_gymnasium
 from multilift_marl.envs.multilift_v0 import parallel_env
 from multilift_marl.envs.multilift_v0 import register as _register_with_pettingzoo
+from multilift_marl.errors import pip_install
 from multilift_marl.tasks import list_tasks
 
 if TYPE_CHECKING:
@@ -26,7 +27,11 @@ else:
         if name in _NEED_TORCH:
             from importlib import import_module
 
-            return getattr(import_module(_NEED_TORCH[name]), name)
+            try:
+                return getattr(import_module(_NEED_TORCH[name]), name)
+            except ModuleNotFoundError as error:
+                cure = pip_install("train")
+                raise ModuleNotFoundError(f"ml.{name} needs {error.name}: {cure}", name=error.name) from error
         raise AttributeError(f"module 'multilift_marl' has no attribute '{name}'")
 
 

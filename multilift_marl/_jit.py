@@ -35,6 +35,11 @@ def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Ca
     return functools.partial(compiled.overloads[types].entry_point, *arguments)
 
 
+def compiled() -> bool:
+    """Return whether the simulation was ever compiled, as far as the package's own folder knows."""
+    return any((Path(__file__).parent / "sim" / "__pycache__").glob("*.nbi"))
+
+
 def _drop_stale_kernels() -> None:
     """Delete compiled kernels when any source that they may depend on has changed.
 

@@ -181,7 +181,6 @@ def write(tmp_path):
 
 def make_trainer(tmp_path, **overrides):
     """Return the trainer of a new, small run; torch is imported here, since most tests do without it."""
-    from multilift_marl.agents.trainer import Trainer, new_run
+    from multilift_marl.agents.trainer import new_run
 
-    config = ml.load_config("hover", SMALL | overrides)
-    return Trainer(config, new_run(config, "test", tmp_path))
+    return new_run(ml.load_config("hover", SMALL | overrides), "test", tmp_path)

@@ -4,9 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from conftest import refusal
 
 import multilift_marl as ml
-from multilift_marl.agents.trainer import Trainer, new_run
+from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.trainer import new_run
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.config import load_config
 from multilift_marl.control.scripted import SCRIPTED, make_scripted
@@ -132,7 +135,7 @@ def test_evaluation_seeds_are_the_contracts():
 def run(tmp_path_factory):
     small = {"env.num_envs": 4, "train.horizon": 8, "train.frames": 64, "eval.episodes": 2, "eval.every": 1}
     config = load_config("hover", small)
-    trainer = Trainer(config, new_run(config, "hover", tmp_path_factory.mktemp("runs")))
+    trainer = new_run(config, "hover", tmp_path_factory.mktemp("runs"))
     trainer.run()
     return trainer.folder
 
@@ -226,13 +229,33 @@ def test_without_graphics_evaluation_goes_on(run, tmp_path, monkeypatch, capsys)
         ("trail=long", "trail must be a number of seconds from 0 to 1000, but is 'long'"),
         ("trail=-1", "trail must be a number of seconds from 0 to 1000, but is -1"),
         ("checkpoint=none.pt", "no checkpoint none.pt"),
-        ("control.action=ctbr", "was trained with control.action=reference and cannot fly control.action=ctbr"),
-        ("payload.mas=1", "unknown key 'payload.mas'; did you mean 'mass'?"),
+        (
+            "control.action=ctbr",
+            "cannot fly ctbr; set control.action=reference",
+        ),
+        ("control.action=velocity", "was trained with control.action=reference and cannot fly velocity"),
+        ("task=track", "was trained in task hover and cannot fly this track: number"),
+        ("payload.mas=1", "unknown key 'payload.mas'; did you mean 'payload.mass'?"),
+        ("episods=3", "unknown key 'episods'; did you mean 'episodes'?"),
     ],
 )
 def test_command_line_errors(run, capsys, argument, message):
     assert evaluate([f"run={run}", argument]) == 2
     assert message in capsys.readouterr().err
+    assert not (run / "eval").exists()
+
+
+def test_a_policy_of_the_same_size_but_another_meaning_is_refused(run, tmp_path, capsys):
+    content = load_checkpoint(run / "checkpoints" / "last.pt")
+    content["action_names"][3] = "yaw_rate"
+    save_checkpoint(tmp_path / "old.pt", content)
+    assert evaluate([f"run={run}", f"checkpoint={tmp_path / 'old.pt'}"]) == 2
+    assert "number 3 of the actions is yaw_rate there and yaw here" in capsys.readouterr().err
+    fast = ml.make_vec("hover", num_envs=1, **{"control.action": "acceleration"})
+    slow = ml.load_config("hover", {"control.action": "velocity"}).model_dump(mode="json")
+    policy = LearnedPolicy(content | {"config": slow, "action_names": list(fast.action_names)}, "mine")
+    message = "the policy of mine was trained with control.action=velocity and cannot fly acceleration"
+    assert policy.action_names == fast.action_names and message in refusal(policy.bind, fast)
 
 
 def test_shipped_policy_beats_the_scripts(tmp_path):

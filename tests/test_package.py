@@ -12,6 +12,7 @@ import yaml
 
 import multilift_marl as ml
 from multilift_marl.config.schema import RandomizationConfig
+from multilift_marl.errors import pip_install
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.failures import CAUSES
 from multilift_marl.tasks.observations import OBSERVATION
@@ -75,7 +76,17 @@ def test_missing_extra_is_named(tmp_path):
     code = "import sys; sys.modules['torch'] = None\nfrom multilift_marl.cli.train import main; sys.exit(main([]))"
     done = python(code, tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "error: torch is missing; pip install 'multilift_marl[train]'\n"
+    assert done.stderr == f"error: torch is missing; {pip_install('train')}\n"
+
+
+@pytest.mark.parametrize("name", ["load_policy", "torchrl_env"])
+def test_what_needs_torch_says_how_to_get_it(tmp_path, name):
+    code = f"import sys; sys.modules['torch'] = None\nimport multilift_marl as ml; ml.{name}('hover')"
+    last = python(code, tmp_path).stderr.splitlines()[-1]
+    assert last == (
+        f'ModuleNotFoundError: ml.{name} needs torch: pip install "multilift_marl[train]" '
+        '(in a clone: pip install -e ".[train]")'
+    )
 
 
 @pytest.mark.parametrize("command", [["check"], ["format", "--check"]])

@@ -11,6 +11,7 @@ from conftest import SMALL, make_trainer
 
 from multilift_marl.agents.checkpoint import load_checkpoint
 from multilift_marl.agents.logging import read_metrics
+from multilift_marl.cli import common
 from multilift_marl.cli.train import main as train
 from multilift_marl.config import load_config
 from multilift_marl.errors import ConfigError
@@ -42,6 +43,31 @@ def test_interrupt_saves_and_resume_finishes(tmp_path):
     assert len(read_metrics(folder)) == done + 2
 
 
+@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+def test_interrupt_while_importing_is_one_line(tmp_path, script):
+    process = subprocess.Popen(
+        [sys.executable, "-X", "importtime", str(ROOT / script)], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    )
+    while "numpy" not in process.stderr.readline():
+        pass
+    process.send_signal(signal.SIGINT)
+    said = [line for line in process.communicate(timeout=60)[1].splitlines() if not line.startswith("import time:")]
+    assert process.returncode == 130 and said == ["stopped"]
+
+
+def test_help_may_be_cut_short():
+    command = f"{sys.executable} {ROOT / 'train.py'} --help | head -1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("Train a team.\n", "")
+
+
+def test_the_first_time_the_wait_for_the_compiler_is_announced(monkeypatch, capsys):
+    for compiled, said in ((True, 0), (False, 1)):
+        monkeypatch.setattr(common, "compiled", lambda compiled=compiled: compiled)
+        common.announce_compiling()
+        assert capsys.readouterr().out.count("compiling the simulation, which takes about a minute") == said
+
+
 def test_help_explains_every_key(capsys):
     assert train(["--help"]) == 0
     text = capsys.readouterr().out
@@ -53,7 +79,12 @@ def test_help_explains_every_key(capsys):
     ("arguments", "message"),
     [
         (["config=hovr"], "no configuration named 'hovr'; did you mean 'hover'?"),
-        (["train.frmes=10"], "unknown key 'train.frmes'; did you mean 'frames'?"),
+        (["train.frmes=10"], "unknown key 'train.frmes'; did you mean 'train.frames'?"),
+        (["confg=hover"], "unknown key 'confg'; did you mean 'config'?"),
+        (["rseume=latest"], "unknown key 'rseume'; did you mean 'resume'?"),
+        (["reward.postion=1"], "did you mean 'reward.position'?"),
+        (["train.minibatches=1e9"], "train.minibatches=1000000000 exceeds"),
+        (["control.action=ctbr", "train.residual=formation_integral"], "cannot fly control.action=ctbr"),
         (["train.frames=ten"], "train.frames must be a whole number, but is 'ten'"),
         (["payload.mass=30"], "lower payload.mass"),
         (["frames"], "'frames' is not of the form key=value"),
@@ -67,6 +98,16 @@ def test_command_line_errors_are_one_sentence(tmp_path, monkeypatch, capsys, arg
     assert message in shown
     assert shown.startswith("error: ") and shown.count("\n") == 1
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_finished_run_says_so_and_how_to_go_on(tmp_path, capsys):
+    trainer = make_trainer(tmp_path, **{"train.frames": 128})
+    trainer.step()
+    trainer.save("last")
+    assert train([f"resume={trainer.folder}"]) == 0
+    shown = capsys.readouterr().out
+    assert f"{trainer.folder} is finished, with 128 steps" in shown
+    assert f"python train.py resume={trainer.folder} train.frames=256" in shown
 
 
 def test_resume_refuses_what_cannot_change(tmp_path, capsys):

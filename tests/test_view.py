@@ -8,7 +8,7 @@ import urllib.request
 import numpy as np
 import pytest
 
-from multilift_marl.errors import CheckpointError, ConfigError, RenderingError
+from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install
 from multilift_marl.view.__main__ import main, make_session
 from multilift_marl.view.page import HOST, Page, _group
 from multilift_marl.view.session import PUSH_SECONDS
@@ -134,9 +134,12 @@ def test_a_trained_policy_flies_first_and_one_that_does_not_fit_is_refused():
     flight = make_session({"run": "hover"} | SMALL)[0]
     assert flight.policy == "run" and flight.vec.task.name == "hover" and "formation" in flight.policies
     flight.advance(0.1)
-    with pytest.raises(ConfigError, match="the policy run was trained in task hover, whose observations differ"):
+    with pytest.raises(ConfigError, match="the policy run was trained in task hover and cannot fly this track: "):
         make_session({"run": "hover", "task": "track"} | SMALL)
-    with pytest.raises(ConfigError, match=r"the policy run acts by .*reference, not velocity"):
+    with pytest.raises(
+        ConfigError,
+        match=r"the policy run was trained .* and cannot fly velocity; set control\.action=reference",
+    ):
         make_session({"run": "hover", "control.action": "velocity"} | SMALL)
     with pytest.raises(CheckpointError, match="no run folder nowhere"):
         make_session({"run": "nowhere"})
@@ -151,6 +154,7 @@ def test_a_trained_policy_flies_first_and_one_that_does_not_fit_is_refused():
         (["port=70000"], "port must be a whole number from 0 to 65535, but is 70000"),
         (["seed=-1"], "seed must be a whole number from 0 to 9223372036854775807, but is -1"),
         (["env.num_drone=3"], "env.num_drone"),
+        (["prot=0"], "unknown key 'prot'; did you mean 'port'?"),
     ],
 )
 def test_what_cannot_be_watched_is_said_in_one_sentence(capsys, arguments, message):
@@ -164,7 +168,7 @@ def test_without_viser_the_error_names_the_extra():
     code = "import sys; sys.modules['viser'] = None\nfrom multilift_marl.view.__main__ import main; sys.exit(main([]))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 2
-    assert done.stderr == "error: the browser viewer needs viser: pip install 'multilift_marl[view]'\n"
+    assert done.stderr == f"error: the browser viewer needs viser: {pip_install('view')}\n"
 
 
 @pytest.fixture

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -11,7 +12,10 @@ import torch
 from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
 from multilift_marl.agents.networks import Actor
 from multilift_marl.config.load import build_config
-from multilift_marl.errors import CheckpointError
+from multilift_marl.errors import CheckpointError, ConfigError
+
+if TYPE_CHECKING:
+    from multilift_marl.envs.core import MultiliftVec
 
 _SHIPPED = Path(__file__).resolve().parents[1] / "policies"
 _KEPT = ("config", "actor", "observation_names", "action_names", "frames")  # what a policy needs of a checkpoint
@@ -62,6 +66,32 @@ class LearnedPolicy:
                 f"{len(self.observation_names)}; use the environment configuration that it was trained in"
             )
         return self.actor(torch.from_numpy(observation))[0].clamp(-1, 1).numpy()
+
+    def bind(self, vec: MultiliftVec) -> LearnedPolicy:
+        """Return this policy, checked to fit the environments `vec`.
+
+        Raises:
+            ConfigError: it was trained with other actions or observations, see `misfit`.
+        """
+        if reason := self.misfit(vec):
+            raise ConfigError(f"the policy of {self.source} {reason}")
+        return self
+
+    def misfit(self, vec: MultiliftVec) -> str:
+        """Return why the policy cannot fly `vec`, as the rest of a sentence, "" if it can."""
+        trained, asked = self.config.control.action, vec.config.control.action
+        if trained != asked:
+            return f"was trained with control.action={trained} and cannot fly {asked}; set control.action={trained}"
+        parts = {"actions": (self.action_names, vec.action_names)}
+        parts["observations"] = (self.observation_names, vec.observation_names)
+        for kind, names in parts.items():
+            for i, (mine, its) in enumerate(zip_longest(*names, fillvalue="nothing")):
+                if mine != its:
+                    return (
+                        f"was trained in task {self.config.task} and cannot fly this {vec.task.name}: number {i} of "
+                        f"the {kind} is {mine} there and {its} here; fly what it was trained in, or another policy"
+                    )
+        return ""
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget nothing: the policy has no memory of its own."""

@@ -31,7 +31,7 @@ class Trainer:
 
     Args:
         config: what to train.
-        folder: the run's folder, made by `new_run` or left by a run to resume.
+        folder: the run's folder; nothing is written there before `run` or `save`.
         checkpoint: content of the checkpoint to go on from.
     """
 
@@ -67,26 +67,26 @@ class Trainer:
             self.env.vec.stagger()
         else:
             torch.set_rng_state(checkpoint["rng"])
-        self.log = RunLog(folder, self.iteration, self.frames)
 
     def run(self) -> bool:
         """Train to the end; return False if the user stopped it. Ctrl-C saves and stops, a second one stops at once."""
         previous = signal.signal(signal.SIGINT, self._interrupt)
+        log = RunLog(self.folder, self.iteration, self.frames)
         name = f"{self.config.task} {self.config.train.algorithm}"
         bar = tqdm(total=self.iterations, initial=self.iteration, desc=name, unit="it", dynamic_ncols=True)
         shown: dict[str, str] = {}
         try:
-            while self.iteration < self.iterations and not self._stop:
+            while not (self.finished or self._stop):
                 start = time.perf_counter()
                 values = self.step()
                 if "return" in values:
                     shown["return"] = f"{values['return']:.0f}"
-                last = self.iteration == self.iterations
+                last = self.finished
                 if self.iteration % self.config.eval.every == 0 or last:
                     values |= self.evaluate()
                     shown["success"] = f"{values['eval/success_rate']:.0%}"
                     shown["error"] = f"{100 * values['eval/payload_position_error_m']:.1f} cm"
-                self.log.write({"iteration": self.iteration, "frames": self.frames}, values)
+                log.write({"iteration": self.iteration, "frames": self.frames}, values)
                 self.seconds += time.perf_counter() - start
                 if self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
                     self.save("last")
@@ -94,9 +94,14 @@ class Trainer:
                 bar.update()
         finally:
             bar.close()
-            self.log.close()
+            log.close()
             signal.signal(signal.SIGINT, previous)
         return not self._stop
+
+    @property
+    def finished(self) -> bool:
+        """Whether all of its iterations are done."""
+        return self.iteration >= self.iterations
 
     def step(self) -> dict[str, float]:
         """Collect one batch, learn from it, and return the iteration's numbers."""
@@ -215,17 +220,21 @@ class Trainer:
         tqdm.write("stopping after this iteration; press Ctrl-C again to stop at once")
 
 
-def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Path:
-    """Make and return runs/<name>-<time>-s<seed>/ with the resolved configuration and the versions in it."""
+def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Trainer:
+    """Return the trainer of a new run in runs/<name>-<time>-s<seed>/, with configuration and versions in it.
+
+    Raises:
+        ConfigError: what cannot be trained; no folder is made then.
+    """
     stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}-s{config.seed}"
-    folder, again = runs / stem, 1
-    while folder.exists():
+    trainer, again = Trainer(config, runs / stem), 1
+    while trainer.folder.exists():
         again += 1
-        folder = runs / f"{stem}-{again}"
-    (folder / "checkpoints").mkdir(parents=True)
-    (folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
-    write_versions(folder)
-    return folder
+        trainer.folder = runs / f"{stem}-{again}"
+    (trainer.folder / "checkpoints").mkdir(parents=True)
+    (trainer.folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
+    write_versions(trainer.folder)
+    return trainer
 
 
 def resume_run(folder: Path, overrides: dict[str, Any]) -> Trainer:

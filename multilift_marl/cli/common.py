@@ -2,31 +2,63 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from multilift_marl.config.load import explain, parse_overrides
-from multilift_marl.errors import CheckpointError, ConfigError, RenderingError
+from multilift_marl._jit import compiled
+from multilift_marl.config.load import check_names, explain, parse_overrides
+from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install
 from multilift_marl.tasks import TASKS
 
 
-def run_command(main: Callable[[dict[str, Any]], int], usage: str, arguments: Sequence[str] | None) -> int:
-    """Run a command on key=value arguments and return its exit status; a user's error is one sentence on stderr."""
+def run_command(
+    main: Callable[[dict[str, Any]], int], usage: str, own: Iterable[str], arguments: Sequence[str] | None
+) -> int:
+    """Run a command on key=value arguments and return its exit status; a user's error is one sentence on stderr.
+
+    Args:
+        main: the command, called with the values by key.
+        usage: the head of its help.
+        own: its keys beside those of a configuration.
+        arguments: None for those of this process.
+    """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if any(argument in ("-h", "--help") for argument in arguments):
-        print(f"{usage}\n\nConfiguration keys (default, meaning; - stands for none):\n{explain()}")
-        for name, task in TASKS.items():
-            print(f"\nTask {name}:\n{explain(task.Options, 'task_options.')}")
-            print("\n".join(f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in task.REWARD.items()))
-        return 0
     try:
-        return main(parse_overrides(arguments))
+        if any(argument in ("-h", "--help") for argument in arguments):
+            _explain(usage)
+            status = 0
+        else:
+            values = parse_overrides(arguments)
+            check_names(values, own)
+            status = main(values)
+        sys.stdout.flush()
+        return status
     except (ConfigError, CheckpointError, RenderingError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] == "multilift_marl":
             raise
-        print(f"error: {error.name} is missing; pip install 'multilift_marl[train]'", file=sys.stderr)
+        print(f"error: {error.name} is missing; {pip_install('train')}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # head, say, has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what the interpreter flushes at its end
+        return 141
+
+
+def announce_compiling() -> None:
+    """Say why nothing seems to happen, where nothing has been compiled before."""
+    if not compiled():
+        print("compiling the simulation, which takes about a minute the first time", flush=True)
+
+
+def _explain(usage: str) -> None:
+    print(f"{usage}\n\nConfiguration keys (default, meaning; - stands for none):\n{explain()}")
+    for name, task in TASKS.items():
+        print(f"\nTask {name}:\n{explain(task.Options, 'task_options.')}")
+        print("\n".join(f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in task.REWARD.items()))

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from multilift_marl.cli.common import run_command
+from multilift_marl.cli.common import announce_compiling, run_command
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
-from multilift_marl.control.scripted import SCRIPTED, check_interface, make_scripted
+from multilift_marl.control.scripted import SCRIPTED, make_scripted
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError, nearest
 from multilift_marl.evaluation.report import format_table, make_report, write_report
@@ -48,7 +48,7 @@ _DEFAULTS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate; return the exit status."""
-    return run_command(_evaluate, _USAGE, arguments)
+    return run_command(_evaluate, _USAGE, _DEFAULTS, arguments)
 
 
 def _evaluate(values: dict[str, Any]) -> int:
@@ -58,10 +58,13 @@ def _evaluate(values: dict[str, Any]) -> int:
     flown = _find_script(own) if own["policy"] is not None else _find_policy(str(own["run"]), str(own["checkpoint"]))
     config = build_config(flown.config.model_dump(), {"env.num_threads": 0} | values)
     _ = config.system
-    _check_interfaces(flown, config, own["baseline"])
     makers = {flown.name: flown.make}
     if own["baseline"] != "none":
         makers |= {name: _script(name) for name in SCRIPTED if name != flown.name}
+    announce_compiling()
+    probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
+    for make in makers.values():  # refuses what does not fit, before there is a folder
+        make(probe)
     out = Path(own["out"]) if own["out"] else flown.folder / "eval" / time.strftime("%Y%m%d-%H%M%S")
     out.mkdir(parents=True, exist_ok=True)
 
@@ -135,19 +138,6 @@ def _check(own: dict[str, Any]) -> None:
         raise ConfigError(f"trail must be a number of seconds from 0 to 1000, but is {own['trail']!r}")
 
 
-def _check_interfaces(flown: _Flown, config: Config, baseline: str) -> None:
-    trained, asked = flown.config.control.action, config.control.action
-    if flown.name in SCRIPTED:
-        check_interface(flown.name, asked)
-    elif trained != asked:
-        raise ConfigError(
-            f"{flown.source} was trained with control.action={trained} and cannot fly control.action={asked}; "
-            "leave control.action as it was"
-        )
-    if baseline != "none":
-        check_interface(baseline, asked)
-
-
 def _find_policy(run: str, checkpoint: str) -> _Flown:
     import torch
 
@@ -163,7 +153,7 @@ def _find_policy(run: str, checkpoint: str) -> _Flown:
         folder = find_run(run)
         file = folder / "checkpoints" / f"{checkpoint}.pt" if checkpoint in ("best", "last") else Path(checkpoint)
         policy = load_policy(folder if checkpoint == "best" else file)
-    return _Flown("policy", policy.source, policy.config, lambda vec: policy, folder)
+    return _Flown("policy", policy.source, policy.config, policy.bind, folder)
 
 
 def _fly(config: Config, maker: Any, name: str, own: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from multilift_marl.cli.common import run_command
+from multilift_marl.cli.common import announce_compiling, run_command
 from multilift_marl.config.load import load_config
 from multilift_marl.errors import ConfigError
 
@@ -25,13 +25,13 @@ _RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.epis
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train; return the exit status."""
-    return run_command(_train, _USAGE, arguments)
+    return run_command(_train, _USAGE, ("config", "resume"), arguments)
 
 
 def _train(values: dict[str, Any]) -> int:
     warnings.filterwarnings("ignore", module=r"torchrl|tensordict")
     from multilift_marl.agents.checkpoint import find_run
-    from multilift_marl.agents.trainer import Trainer, new_run, resume_run
+    from multilift_marl.agents.trainer import new_run, resume_run
 
     if "resume" in values:
         folder = find_run(values.pop("resume"))
@@ -41,14 +41,20 @@ def _train(values: dict[str, Any]) -> int:
                     f"'{key}' cannot change when a run is resumed: start a new run, or give one of "
                     f"{', '.join(_RESUMABLE)}"
                 )
+        announce_compiling()
         trainer = resume_run(folder, values)
+        if trainer.finished:
+            more = f"python train.py resume={folder} train.frames={2 * trainer.frames}"
+            print(f"{folder} is finished, with {trainer.frames:,} steps; for more, say how many in all: {more}")
+            return 0
         print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
     else:
         name = str(values.pop("config", "hover"))
         config = load_config(name, values)
-        _ = config.system  # refuse an impossible system before a folder is made
-        folder = new_run(config, Path(name).stem)
-        trainer = Trainer(config, folder)
+        _ = config.system  # refuse an impossible system before the long wait
+        announce_compiling()
+        trainer = new_run(config, Path(name).stem)
+        folder = trainer.folder
         print(f"training {config.train.frames:,} steps in {folder}")
     finished = trainer.run()
     minutes = trainer.seconds / 60

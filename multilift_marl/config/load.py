@@ -73,11 +73,38 @@ def resolve_config(
     """Return the configuration that every door builds from; None means the configured value.
 
     Raises:
-        ConfigError: see `load_config`.
+        ConfigError: see `load_config`; or one value was given twice, differently.
     """
     named = {"env.num_envs": num_envs, "env.num_threads": num_threads, "env.num_drones": num_drones, "seed": seed}
-    overrides |= {key: value for key, value in named.items() if value is not None}
+    check_names(overrides, [key.rpartition(".")[2] for key in named])
+    for key, value in named.items():
+        if value is not None and overrides.setdefault(key, value) != value:
+            short = key.rpartition(".")[2]
+            raise ConfigError(f"{short}={value!r} and {key}={overrides[key]!r} were both given; leave out one of them")
     return build_config(task.model_dump(), overrides) if isinstance(task, Config) else load_config(task, overrides)
+
+
+def check_names(given: Iterable[str], own: Iterable[str]) -> None:
+    """Refuse a name without a dot that is neither a caller's own nor a section or value of a configuration.
+
+    The hint knows every key, too: frames is near train.frames.
+
+    Args:
+        given: the names; those with a dot are left to `build_config`.
+        own: of the caller's arguments.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+    top = {*Config.model_fields, *own}
+    keys: dict[str, list[str]] = {}
+    for key, _, _ in _leaves(Config, ""):
+        keys.setdefault(key.rpartition(".")[2], []).append(key)
+    keys |= {name: [name] for name in top}
+    for name in given:
+        if "." not in name and name not in top:
+            hint = nearest(name, keys, lambda near: "' or '".join(keys[near]))
+            raise ConfigError(f"unknown key '{name}'{hint if 'did you mean' in hint else nearest(name, top)}")
 
 
 def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:

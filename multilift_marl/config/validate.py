@@ -42,7 +42,8 @@ def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) 
     source = f" (in {where})" if where.endswith((".yaml", ".yml")) else ""
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
-        return f"unknown key '{key}'{source}{nearest(path[-1], section.model_fields)}"
+        home = key.removesuffix(path[-1])
+        return f"unknown key '{key}'{source}{nearest(path[-1], section.model_fields, lambda near: home + near)}"
     if kind in ("missing", "too_long"):
         count = error["ctx"]["max_length"] if kind == "too_long" else 1 + max(e["loc"][-1] for e in about)
         return f"{key}{source} must be a list of {count} numbers, but is {value!r}"

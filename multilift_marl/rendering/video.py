@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from multilift_marl.errors import RenderingError
+from multilift_marl.errors import RenderingError, pip_install
 
 
 class VideoWriter:
@@ -27,7 +27,7 @@ class VideoWriter:
             import av  # noqa: F401  (imageio's plugin needs it and says so less clearly)
             import imageio.v3 as iio
         except ImportError as error:
-            raise RenderingError(f"writing {path} needs {error.name}: pip install 'multilift_marl[train]'") from error
+            raise RenderingError(f"writing {path} needs {error.name}: {pip_install('train')}") from error
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         self._file = iio.imopen(path, "w", plugin="pyav")
         self._file.init_video_stream("libx264", fps=float(fps), pixel_format="yuv420p")

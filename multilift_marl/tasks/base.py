@@ -273,5 +273,6 @@ class Task:
     def _weights(self, values: dict[str, float]) -> np.ndarray:
         for term in values:
             if term not in self.REWARD:
-                raise ConfigError(f"unknown key 'reward.{term}' of task {self.name}{nearest(term, self.REWARD)}")
+                hint = nearest(term, self.REWARD, lambda near: f"reward.{near}")
+                raise ConfigError(f"unknown key 'reward.{term}' of task {self.name}{hint}")
         return np.array(list((self.REWARD | values).values()), float)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from multilift_marl.errors import nearest
+from multilift_marl.errors import nearest, pip_install
 from multilift_marl.validation import air, bodies, cables, flight, momentum, symmetry, teams
 from multilift_marl.validation.document import describe, format_table, write_document
 from multilift_marl.validation.draw import draw
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         from tqdm import tqdm
     except ModuleNotFoundError:
-        print("error: tqdm is missing; pip install 'multilift_marl[train]'", file=sys.stderr)
+        print(f"error: tqdm is missing; {pip_install('train')}", file=sys.stderr)
         return 2
     results: dict[str, Result] = {}
     interrupted = False

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from multilift_marl.errors import pip_install
 from multilift_marl.validation.experiment import Plot
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def draw(plots: list[Plot], out: Path) -> list[Path]:
         from matplotlib.figure import Figure
         from PIL import Image
     except ModuleNotFoundError:
-        print("no plots: matplotlib is missing; pip install 'multilift_marl[train]'", file=sys.stderr)
+        print(f"no plots: matplotlib is missing; {pip_install('train')}", file=sys.stderr)
         return []
     files = []
     for plot in plots:

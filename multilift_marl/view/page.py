@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from multilift_marl.errors import RenderingError
+from multilift_marl.errors import RenderingError, pip_install
 from multilift_marl.rendering import Stage
 from multilift_marl.view.session import Session
 
@@ -45,8 +45,7 @@ class Page:
             import trimesh
             import viser
         except ImportError as error:
-            cure = "pip install 'multilift_marl[view]'"
-            raise RenderingError(f"the browser viewer needs {error.name}: {cure}") from error
+            raise RenderingError(f"the browser viewer needs {error.name}: {pip_install('view')}") from error
         self._session, self._shapes = session, trimesh.creation
         self._stage = Stage(session.vec, trail=_TRAIL)
         _check_port(port)

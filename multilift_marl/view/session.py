@@ -149,7 +149,7 @@ class Session:
 
     def _checked(self, policy: str, learned: dict[str, Any]) -> str:
         if policy in learned and policy not in self._makers:
-            raise ConfigError(f"the policy {policy} {_misfit(self.vec, learned[policy])}")
+            raise ConfigError(f"the policy {policy} {learned[policy].misfit(self.vec)}")
         if policy not in self._makers:
             raise ConfigError(f"unknown policy '{policy}'{nearest(policy, self._makers)}")
         return policy
@@ -159,22 +159,8 @@ def _fitting(vec: MultiliftVec, learned: dict[str, Any]) -> dict[str, Callable[[
     """Return the makers of all policies that fit, learned ones first."""
     makers: dict[str, Callable[[MultiliftVec], Policy]] = {}
     for name, policy in learned.items():
-        if not _misfit(vec, policy):
-            makers[name] = _keep(policy)
+        if not policy.misfit(vec):
+            makers[name] = policy.bind
     if vec.config.control.action == "reference":
         makers |= {name: functools.partial(make_scripted, name) for name in SCRIPTED}
     return makers
-
-
-def _keep(policy: Policy) -> Callable[[MultiliftVec], Policy]:
-    return lambda vec: policy
-
-
-def _misfit(vec: MultiliftVec, policy: Any) -> str:
-    """Return why a learned policy does not fit, "" if it does."""
-    trained, asked = policy.config.control.action, vec.config.control.action
-    if policy.action_names != vec.action_names:
-        return f"acts by control.action={trained}, not {asked}; set control.action={trained}"
-    if policy.observation_names != vec.observation_names:
-        return f"was trained in task {policy.config.task}, whose observations differ; fly that, or another policy"
-    return ""
