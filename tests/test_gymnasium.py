@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import multilift_marl as ml
+from multilift_marl.config import list_configs
 from multilift_marl.envs import faces, gymnasium_env
 from multilift_marl.envs.gymnasium_env import MultiliftGymnasiumEnv, MultiliftVectorEnv
 
@@ -65,18 +66,22 @@ def test_any_team_passes_the_official_checker(task, num_drones):
     check_env(MultiliftGymnasiumEnv(task, num_drones=num_drones), skip_render_check=True)
 
 
-def test_every_task_is_registered_once():
+def test_every_configuration_is_registered_once():
     before = dict(gymnasium.registry)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         gymnasium_env.register()
     assert gymnasium.registry == before
     mine = {name for name in before if name.startswith("multilift_marl/")}
-    assert mine == {name_of(task) for task in ml.list_tasks()}
+    assert mine > {name_of(task) for task in ml.list_tasks()} and len(mine) == len(list_configs())
+    assert {"multilift_marl/PoseEasy-v0", "multilift_marl/RigsFalcon3-v0"} < mine
+    assert gymnasium.make("multilift_marl/PoseEasy-v0").unwrapped.vec.config == ml.load_config(
+        "pose_easy", {"env.num_envs": 1, "env.num_threads": 1}
+    )
 
 
-def test_a_task_of_two_words_has_a_name_in_camel_case(monkeypatch):
-    monkeypatch.setattr(gymnasium_env, "list_tasks", lambda: ["hover", "two_words"])
+def test_a_configuration_of_two_words_has_a_name_in_camel_case(monkeypatch):
+    monkeypatch.setattr(gymnasium_env, "list_configs", lambda: ["hover", "two_words"])
     gymnasium_env.register()
     assert gymnasium.registry.pop("multilift_marl/TwoWords-v0").kwargs == {"task": "two_words"}
 
@@ -271,7 +276,7 @@ def test_a_wrong_action_is_refused(action, message):
 
 
 def test_wrong_settings_are_refused():
-    assert "did you mean 'mass'" in refusal(gymnasium.make, "multilift_marl/Hover-v0", **{"payload.mas": 1.0})
+    assert "did you mean 'payload.mass'" in refusal(gymnasium.make, "multilift_marl/Hover-v0", **{"payload.mas": 1.0})
     assert "no configuration named 'hove'" in refusal(MultiliftVectorEnv, "hove")
     for face, known in ((MultiliftGymnasiumEnv, "human, rgb_array"), (MultiliftVectorEnv, "rgb_array")):
         with pytest.raises(ValueError, match=f"unknown render_mode 'ascii'; known: {known}"):

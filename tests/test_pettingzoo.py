@@ -204,7 +204,7 @@ def test_names_and_overrides_reach_the_core():
     assert (env.vec.num_envs, env.num_agents, env.max_num_agents) == (1, 0, 3)
     assert env.metadata["render_fps"] == 25
     assert env.metadata["name"] == "multilift_v0" and env.metadata["is_parallelizable"]
-    with pytest.raises(ml.errors.ConfigError, match=r"did you mean 'mass'"):
+    with pytest.raises(ml.errors.ConfigError, match=r"did you mean 'payload.mass'"):
         parallel_env("hover", **{"payload.mas": 1.0})
 
 
@@ -224,6 +224,13 @@ def test_registered_with_pettingzoo(task):
         multilift_v0.register()
         env = pettingzoo.make("parallel", f"multilift_marl/{task}-v0", num_drones=3, seed=2)
     assert same(fly(env, None), fly(parallel_env(task, num_drones=3), 2))
+
+
+@pytest.mark.skipif(not hasattr(pettingzoo, "parallel_registry"), reason="PettingZoo before 1.27 has no registry")
+@pytest.mark.parametrize("config, name", [("pose_easy", "pose_easy-v0"), ("rigs/falcon3", "rigs_falcon3-v0")])
+def test_configurations_that_are_no_tasks_are_registered_too(config, name):
+    env = pettingzoo.make("parallel", f"multilift_marl/{name}")
+    assert env.vec.config == parallel_env(config).vec.config
 
 
 def test_pettingzoo_without_a_registry_is_left_alone(monkeypatch):

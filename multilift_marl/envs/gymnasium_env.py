@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import gymnasium
@@ -10,10 +11,10 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from multilift_marl.config.load import list_configs
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec, make_vec
 from multilift_marl.envs.faces import BATCH_RENDER_MODES, RENDER_MODES, Pictures, solo_info
-from multilift_marl.tasks import list_tasks
 
 
 class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -263,16 +264,16 @@ def _mean(reward: np.ndarray) -> np.ndarray:
 
 
 def register() -> None:
-    """Enter every task in Gymnasium's registry, `gymnasium.make("multilift_marl/Hover-v0")`; twice does nothing more.
+    """Enter every shipped configuration in Gymnasium's registry, `multilift_marl/Hover-v0`; twice does nothing more.
 
-    A task `two_words` is entered as `multilift_marl/TwoWords-v0`.
+    `pose_easy` is entered as `multilift_marl/PoseEasy-v0`, `rigs/falcon3` as `multilift_marl/RigsFalcon3-v0`.
     """
-    for task in list_tasks():
-        name = f"multilift_marl/{''.join(word.capitalize() for word in task.split('_'))}-v0"
+    for config in list_configs():
+        name = f"multilift_marl/{''.join(word.capitalize() for word in re.split('[_/]', config))}-v0"
         if name not in gymnasium.registry:
             gymnasium.register(
                 name,
                 entry_point=f"{__name__}:{MultiliftGymnasiumEnv.__name__}",
                 vector_entry_point=f"{__name__}:{MultiliftVectorEnv.__name__}",
-                kwargs={"task": task},
+                kwargs={"task": config},
             )

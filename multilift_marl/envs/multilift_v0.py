@@ -9,12 +9,11 @@ import pettingzoo
 from gymnasium.spaces import Box
 from pettingzoo import ParallelEnv
 
-from multilift_marl.config.load import resolve_config
+from multilift_marl.config.load import list_configs, resolve_config
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.faces import RENDER_MODES, Pictures, solo_info
 from multilift_marl.errors import nearest
-from multilift_marl.tasks import list_tasks
 
 
 class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
@@ -190,13 +189,14 @@ def parallel_env(
 
 
 def register() -> None:
-    """Enter every task in PettingZoo's registry, `pettingzoo.make("parallel", "multilift_marl/hover-v0")`.
+    """Enter every shipped configuration in PettingZoo's registry, `multilift_marl/hover-v0`.
 
-    Does nothing where PettingZoo has no registry (before 1.27), and nothing the second time.
+    `rigs/falcon3` is entered as `multilift_marl/rigs_falcon3-v0`. Does nothing where PettingZoo has no registry (before
+    1.27), and nothing the second time.
     """
     if not hasattr(pettingzoo, "parallel_registry"):
         return
-    for task in list_tasks():
-        name = f"multilift_marl/{task}-v0"
+    for config in list_configs():
+        name = f"multilift_marl/{config.replace('/', '_')}-v0"
         if name not in pettingzoo.parallel_registry:
-            pettingzoo.register("parallel", name, f"{__name__}:parallel_env", kwargs={"task": task})
+            pettingzoo.register("parallel", name, f"{__name__}:parallel_env", kwargs={"task": config})
