@@ -24,17 +24,47 @@ def refuse_values(**overrides) -> str:
     [
         ("sed", "seed"),
         ("randomisation", "randomization"),
-        ("env.num_dronez", "num_drones"),
-        ("sim.time_step", "timestep"),
-        ("payload.mas", "mass"),
-        ("cable.stifness", "stiffness"),
-        ("train.learningrate", "learning_rate"),
-        ("eval.episode", "episodes"),
+        ("env.num_dronez", "env.num_drones"),
+        ("sim.time_step", "sim.timestep"),
+        ("payload.mas", "payload.mass"),
+        ("cable.stifness", "cable.stiffness"),
+        ("train.learningrate", "train.learning_rate"),
+        ("eval.episode", "eval.episodes"),
     ],
 )
 def test_unknown_key_names_the_nearest(key, nearest):
     message = refuse_values(**{key: 1})
     assert re.fullmatch(rf"unknown key '{re.escape(key)}'.*did you mean '{nearest}'\?", message)
+
+
+@pytest.mark.parametrize(
+    "name, hint",
+    [
+        ("num_dron", "did you mean 'num_drones'?"),  # an argument of the call itself
+        ("frames", "did you mean 'train.frames'?"),  # a key of a section
+        ("mas", "did you mean 'vehicle.mass' or 'payload.mass'?"),
+        ("randomisation", "did you mean 'randomization'?"),
+    ],
+)
+def test_unknown_name_without_a_section_is_looked_for_everywhere(name, hint):
+    assert refusal(ml.make_vec, "hover", **{name: 1}) == f"unknown key '{name}'; {hint}"
+
+
+def test_unknown_name_like_no_other_lists_sections_and_arguments():
+    message = refusal(ml.make_vec, "hover", zzzzz=1)
+    assert message.startswith("unknown key 'zzzzz'; known: cable, control, env, ") and "num_drones" in message
+
+
+def test_two_values_of_one_key_are_refused_and_the_same_twice_is_not():
+    message = refusal(ml.make_vec, "hover", num_drones=6, **{"env.num_drones": 4})
+    assert message == "num_drones=6 and env.num_drones=4 were both given; leave out one of them"
+    assert ml.make_vec("hover", num_envs=1, num_drones=3, **{"env.num_drones": 3}).num_drones == 3
+
+
+def test_turbulence_needs_a_horizontal_mean_wind():
+    windless = {"wind__turbulence": True, "wind__velocity": [0.0, 0.0, 2.0]}
+    assert "set wind.velocity or randomization.wind" in refuse_system(**windless)
+    ml.load_config("hover", {"wind.turbulence": True, "randomization.wind": 2.0}).system  # noqa: B018 (not refused)
 
 
 def test_unknown_key_like_no_other_lists_the_known_ones():
@@ -43,7 +73,7 @@ def test_unknown_key_like_no_other_lists_the_known_ones():
 
 def test_unknown_key_in_a_file_names_the_file(write):
     message = refusal(load_config, write("env:\n  num_dronez: 3\n"))
-    assert re.match(r"unknown key 'env\.num_dronez' .*mine\.yaml.*did you mean 'num_drones'\?", message)
+    assert re.match(r"unknown key 'env\.num_dronez' .*mine\.yaml.*did you mean 'env\.num_drones'\?", message)
 
 
 def test_unknown_configuration_names_the_nearest():
@@ -62,12 +92,12 @@ def test_unknown_vehicle_names_the_nearest():
 
 def test_unknown_reward_term_names_the_nearest():
     message = refuse_task(reward__postion=1.0)
-    assert re.match(r"unknown key 'reward\.postion' of task hover; did you mean 'position'\?", message)
+    assert re.match(r"unknown key 'reward\.postion' of task hover; did you mean 'reward\.position'\?", message)
 
 
 def test_unknown_task_option_names_the_nearest():
     message = refuse_task(task_options__target_xx=1.0)
-    assert re.match(r"unknown key 'task_options\.target_xx'; did you mean 'target_xy'\?", message)
+    assert re.match(r"unknown key 'task_options\.target_xx'; did you mean 'task_options\.target_xy'\?", message)
 
 
 def test_a_key_below_a_value_is_refused():

@@ -131,6 +131,11 @@ ODD = np.diag([1.0, 1.0, -1.0])
         ({"randomization": {"payload_mass": np.nan}}, "NaN or infinite"),
         ({"randomization": {"payload_mass": [1.0, 2.0, 3.0]}}, "has shape (3,), expected"),
         ({"randomization": {"payload_mass": "heavy"}}, "must hold numbers"),
+        (
+            {"randomization": {"payload_mass": 100.0}},
+            "payload_mass that reset is to fix, 2 × falcon lift 40.0 N",
+        ),
+        ({"randomization": {"vehicle_mass": [0.7, 5.0]}}, "with the vehicle_mass that reset is to fix"),
         ({"randomization": {"payload_drag": 2.0}}, "set randomization.payload_drag above 0"),
         ({"randomization": {"action_delay": 3}}, "must be from 0 to 2"),
         ({"randomization": {"action_delay": 0.5}}, "whole numbers"),
@@ -150,6 +155,13 @@ def test_options_that_cannot_be_are_refused(options, words):
     vec = make(num_drones=2, **{**DRAWN, "task_options.target_height": [1.9, 2.0]})
     vec.reset(seed=5)
     assert words in refused(vec, options)
+
+
+def test_what_may_be_drawn_may_be_fixed_and_no_more():
+    vec = make(num_drones=2, **{"payload.mass": 2.1, "randomization.payload_mass": 0.2})  # lifts 2.2 kg with a reserve
+    assert (fix(vec, payload_mass=2.52)["payload_mass"] == 2.52).all()
+    assert "less than 1.09 ×" in refused(vec, {"randomization": {"payload_mass": [1.0, 1.0, 1.0, 2.6]}})
+    refused(vec, {"randomization": {"payload_mass": [1.0, 2.6]}}, TWO)
 
 
 def test_a_state_that_has_failed_is_refused_and_the_episode_must_be_reset():

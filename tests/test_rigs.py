@@ -256,7 +256,7 @@ def test_mesh_stands_where_its_file_says_and_flies(wedge):
 @pytest.mark.parametrize(
     "text, name, complaint",
     [
-        (None, "none.obj", r"payload\.mesh=.* is no \.obj or \.stl file; give the path of one"),
+        (None, "none.obj", r"payload\.mesh=.* is missing, there is no /.*none\.obj; correct the path"),
         (WEDGE, "wedge.txt", r"payload\.mesh=.* is no \.obj or \.stl file"),
         (FLAT, "flat.obj", r"payload\.mesh=.* cannot be a body \(.*\); give a closed surface"),
         ("nonsense", "bad.stl", r"payload\.mesh=.* cannot be a body \(.*\); give a closed surface"),

@@ -102,7 +102,7 @@ def test_turbulence_starts_stationary_and_stays_so_in_flight():
 
 
 def test_without_wind_there_is_no_turbulence():
-    world = World(make_system(1, **{"wind.turbulence": True}), 2, 1)
+    world = World(make_system(1, **{"wind.turbulence": True, "randomization.wind": 1.0}), 2, 1)
     world.step(hover_thrust(world), 10)
     assert not world.air.gust.any()
 

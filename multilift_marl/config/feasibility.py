@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,11 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
     if system.air.wash or system.air.ground_effect:
         for vehicle in vehicles:
             check_rotors(vehicle)
+    if system.air.turbulence and not system.wind[:2].any() and not ranges.wind:
+        raise ConfigError(
+            "wind.turbulence is as strong as the horizontal mean wind, and there is none; set wind.velocity or "
+            "randomization.wind, or switch wind.turbulence off"
+        )
     thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in vehicles])
     if thrust.sum() < MIN_THRUST_TO_WEIGHT * system.weight:
         lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"
@@ -65,6 +71,49 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
                 f"limit of {system.min_separation[i, j]:.2f} m; spread payload.anchors or raise cable.length or "
                 "cable.angle"
             )
+
+
+def check_fixed(system: System, ranges: RandomizationConfig, fixed: Mapping[str, np.ndarray]) -> None:
+    """Refuse masses and rotors fixed for episodes with which a team could not lift what it carries.
+
+    The limit is the configuration's, or the worst that it draws anyway where that is less.
+
+    Args:
+        system, ranges: the configured ones.
+        fixed: `payload_mass` (K,) [kg], `vehicle_mass` (K, N) [kg] and `vehicle_thrust_coefficient` (K, N) [-] of K
+            episodes, or some of them; other names do not count.
+
+    Raises:
+        ConfigError: naming what is fixed.
+    """
+    culprits = [name for name in ("payload_mass", "vehicle_mass", "vehicle_thrust_coefficient") if name in fixed]
+    if not culprits:
+        return
+    worst = _lift(
+        system, (1 + ranges.payload_mass) * system.payload_mass, (1 + ranges.vehicle_mass) * system.drone_mass,
+        1 - ranges.vehicle_thrust_coefficient,
+    )  # fmt: skip
+    thrust, weight = np.broadcast_arrays(*_lift(system, **{name: fixed[name] for name in culprits}))
+    limit = min(MIN_THRUST_TO_WEIGHT, worst[0] / worst[1])
+    short = np.flatnonzero(thrust < limit * weight * (1 - 1e-9))
+    if len(short):
+        least = short[0]
+        raise ConfigError(
+            f"with the {' and '.join(culprits)} that reset is to fix, {describe_team(system.vehicles)} lift "
+            f"{thrust[least]:.1f} N, less than {limit:.3g} × their weight with the payload, {weight[least]:.1f} N; "
+            "fix lighter bodies or stronger rotors"
+        )
+
+
+def _lift(
+    system: System, payload_mass: np.ndarray | float | None = None, vehicle_mass: np.ndarray | None = None,
+    vehicle_thrust_coefficient: np.ndarray | float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the thrust and the weight [N] of a team, nominal where nothing else is given."""
+    payload = system.payload_mass if payload_mass is None else payload_mass
+    drones = system.drone_mass if vehicle_mass is None else vehicle_mass
+    thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles]) * vehicle_thrust_coefficient
+    return thrust.sum(axis=-1), GRAVITY * (payload + drones.sum(axis=-1) + system.cable_mass.sum())
 
 
 def _check_hooks(system: System, ranges: RandomizationConfig) -> None:

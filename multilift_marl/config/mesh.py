@@ -46,8 +46,10 @@ def read_mesh(path: str, size: Sequence[float] | None = None) -> Mesh:
     Raises:
         ConfigError: there is no such file, or it holds no closed surface.
     """
-    if Path(path).suffix.lower() not in (".obj", ".stl") or not Path(path).is_file():
+    if Path(path).suffix.lower() not in (".obj", ".stl"):
         raise ConfigError(f"payload.mesh={path!r} is no .obj or .stl file; give the path of one")
+    if not Path(path).is_file():
+        raise ConfigError(f"payload.mesh={path!r} is missing, there is no {Path(path).resolve()}; correct the path")
     mesh = _measure(path, np.ones(3))
     return mesh if size is None else _measure(path, np.asarray(size) / mesh.edges)
 

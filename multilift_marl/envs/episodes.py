@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from multilift_marl.config.feasibility import check_fixed
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.options import Rows, check_delays, check_stretch, read_options
 from multilift_marl.errors import ConfigError
@@ -55,6 +56,7 @@ class Episodes:
                 value = self._draw.values[name].copy()
                 value[mask] = rows
                 check_parameters(self._world.system, self._draw.parameters, mask, {name: value})
+        check_fixed(self._world.system, self._draw.ranges, fixed["randomization"])
         return fixed
 
     def draw(self, e: int, seed: int, key: tuple[int, int, int], fixed: dict[str, Rows], row: int) -> None:
