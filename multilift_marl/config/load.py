@@ -100,7 +100,7 @@ def check_names(given: Iterable[str], own: Iterable[str]) -> None:
     keys: dict[str, list[str]] = {}
     for key, _, _ in _leaves(Config, ""):
         keys.setdefault(key.rpartition(".")[2], []).append(key)
-    keys |= {name: [name] for name in top}
+    keys = {name: homes for name, homes in keys.items() if name != "<name>"} | {name: [name] for name in top}
     for name in given:
         if "." not in name and name not in top:
             hint = nearest(name, keys, lambda near: "' or '".join(keys[near]))
