@@ -8,10 +8,11 @@ import pytest
 from conftest import GRAVITY, hover_thrust, load, make_system, steady, without_drag
 
 from multilift_marl.sim import World
-from multilift_marl.sim.hanging import hang
+from multilift_marl.sim.hanging import SLACK, hang
 from multilift_marl.validation.chains import exponential
 
 CHAIN = {"cable.model": "chain"}
+OPENING = (0.3, -0.7, 0.4)  # [m/s] rate of a chord
 FORMATION = ("payload_position", "payload_rotation", "drone_position", "drone_rotation", "cable_tension")
 
 
@@ -83,19 +84,20 @@ def test_a_changed_payload_stretches_the_cable_by_its_weight_and_the_ropes(times
 
 @pytest.mark.parametrize("chord", [(0.3, 0.1, 0.9495), (0.9, 0, 0.4364), (0, 0, 1.00004), (1, 0, 0.001), (1, 0, -0.1)])
 def test_a_hanging_chain_spans_its_chord_in_balance(chord):
-    chord, links = np.array(chord) * 1.00003, np.zeros((10, 4))
-    hang(tuple(chord), 0.1, 1e6, 0.01, links)
+    chord, links = np.array(chord) * 1.00003, np.zeros((10, 7))
+    hang(tuple(chord), OPENING, 0.1, 1e6, 0.01, links)
     directions, stretch = links[:, :3], links[:, 3]
     np.testing.assert_allclose(directions.T @ (0.1 + stretch), chord, atol=1e-9)
     pulls = 1e6 * stretch[:, None] * directions
     np.testing.assert_allclose(np.diff(pulls, axis=0), np.tile([0, 0, 0.01], (9, 1)), atol=1e-6)
+    np.testing.assert_allclose(links[:, 4:], np.tile(np.divide(OPENING, 10), (10, 1)))
 
 
 @pytest.mark.parametrize("chord", [(0.5, 0, 0.865), (0.1, -0.3, 0.944), (0.98, 0, 0.05)])
 def test_a_sagging_chain_may_span_less_than_its_length(chord):
-    chord, links = np.array(chord), np.zeros((10, 4))
+    chord, links = np.array(chord), np.zeros((10, 7))
     assert np.linalg.norm(chord) < 1
-    hang(tuple(chord), 0.1, 1e6, 0.05, links)
+    hang(tuple(chord), OPENING, 0.1, 1e6, 0.05, links)
     directions, stretch = links[:, :3], links[:, 3]
     np.testing.assert_allclose(directions.T @ (0.1 + stretch), chord, atol=1e-9)
     assert (stretch > 0).all()
@@ -106,11 +108,14 @@ def test_a_sagging_chain_may_span_less_than_its_length(chord):
 
 @pytest.mark.parametrize("chord", [(0, 0, 0.9999), (0.1, 0.2, 0.3), (0, 0, 0.0), (-0.8, 0, -0.2), (0, 0, -0.5)])
 def test_a_slack_chain_spans_its_chord_unstretched(chord):
-    links = np.zeros((10, 4))
-    hang(chord, 0.1, 1e6, 0.01, links)
+    links = np.zeros((10, 7))
+    hang(chord, OPENING, 0.1, 1e6, 0.01, links)
     np.testing.assert_allclose(links[:, :3].sum(axis=0) * 0.1, chord, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(links[:, :3], axis=1), 1, atol=1e-12)
     assert (links[:, 3] == 0).all()
+    np.testing.assert_allclose(links[:, 4:].sum(axis=0), OPENING, atol=1e-9)
+    stretching = (links[:, :3] * links[:, 4:]).sum(axis=1)
+    assert np.linalg.norm(chord) > SLACK or np.abs(stretching).max() < 1e-9
 
 
 # In motion

@@ -171,9 +171,9 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
     """Write the state of the environments in `mask` into `batch.state`, as `rows.write_rows` does.
 
     A cable hangs between payload and drone as it would at rest, a slack one in an arc; its nodes move as if it were
-    stretched evenly.
+    stretched evenly, those of an arc without stretch: its dampers would pull.
     """
-    links = np.zeros((chain.segments.max(), 4))
+    links = np.zeros((chain.segments.max(), 7))
     for e in range(lo, hi):
         if not mask[e]:
             continue
@@ -191,16 +191,16 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain):
             drone = mat(state.drone_rotation, e, i)
             arm = mul(drone, row(c.hooks, i))
             chord = sub(add(vec(state.drone_position, e, i), arm), add(row(state.payload_position, e), anchor))
-            hang(chord, chain.length[e, i], chain.stiffness[e, i], chain.weight[e, i], links[:n])
             turning = mul(drone, vec(state.drone_body_rates, e, i))
             end = add(vec(state.drone_velocity, e, i), cross(turning, arm))
             opening = sub(end, add(row(state.payload_velocity, e), cross(spin, anchor)))
+            hang(chord, opening, chain.length[e, i], chain.stiffness[e, i], chain.weight[e, i], links[:n])
             frame, rate = matmul(attitude, matrow(chain.frames, i)), spin
             for j in range(n):
                 direction, stretch = row(links, j), links[j, 3]
                 frame, rate = _put_link(
                     line, at + 5 * j, v + 4 * j, frame, rate, direction, chain.length[e, i], stretch,
-                    scale(1.0 / n, opening),
+                    row(links[:, 4:], j),
                 )  # fmt: skip
             at, v = at + 5 * n, v + 4 * n
             q = mat_to_quat(matmul(transpose(frame), drone))

@@ -7,20 +7,22 @@ from math import cos, sin
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.math3d import add, cross, dot, norm, put, scale, sub, unit
+from multilift_marl.math3d import add, cross, dot, norm, put, row, scale, sub, unit
 
 SLACK = 0.98  # of its length: a cable whose ends are closer is laid in an arc, one that sags less hangs by its weight
 
 
 @kernel
-def hang(chord, length, stiffness, weight, links):
-    """Write direction and stretch [m] of each link (n, 4) of a chain at rest between two points.
+def hang(chord, opening, length, stiffness, weight, links):
+    """Write direction, stretch [m] and velocity [m/s] of each link (n, 7) of a chain that hangs between two points.
 
     Segment j pulls with F_j = F_0 + j w e_z. The F_0 whose links reach to the other end minimises the complementary
     energy, Σ (l |F_j| + |F_j|²/2k) - F_0 · chord, which is convex: Newton's method with halved steps finds it.
+    Velocities, of a link's upper end relative to its lower one, are all alike; those of an arc do not stretch it.
 
     Args:
         chord: from the first point to the other [m].
+        opening: its rate [m/s].
         length, stiffness: of a segment, l [m] and k [N/m].
         weight: of a node, w [N].
         links: written.
@@ -28,6 +30,7 @@ def hang(chord, length, stiffness, weight, links):
     n, distance = links.shape[0], norm(chord)
     if distance < SLACK * n * length:
         _hang_slack(chord, distance, length, links)
+        _turn_links(opening, links)
         return
     middle = max(stiffness * (distance / n - length), n * weight)
     force = sub(scale(middle / distance, chord), (0.0, 0.0, 0.5 * n * weight))
@@ -45,6 +48,8 @@ def hang(chord, length, stiffness, weight, links):
         force = trial
         energy, gap, step = found
     straight = not norm(gap) < 1e-9 * distance
+    for j in range(n):
+        put(links[j, 4:], scale(1.0 / n, opening))
     if straight and distance < n * length:
         _hang_slack(chord, distance, length, links)
         return
@@ -71,10 +76,7 @@ def _complementary(chord, force, length, stiffness, weight, n):
         xy -= bend * pull[0] * pull[1]
         xz -= bend * pull[0] * pull[2]
         yz -= bend * pull[1] * pull[2]
-    first = cross((xy, yy, yz), (xz, yz, zz))
-    volume = dot((xx, xy, xz), first)
-    second, third = cross((xz, yz, zz), (xx, xy, xz)), cross((xx, xy, xz), (xy, yy, yz))
-    return energy, gap, scale(1.0 / volume, (dot(first, gap), dot(second, gap), dot(third, gap)))
+    return energy, gap, _solve(xx, yy, zz, xy, xz, yz, gap)
 
 
 @kernel
@@ -97,3 +99,30 @@ def _hang_slack(chord, distance, length, links):
         angle = (0.5 * (n - 1) - j) * bend
         put(links[j], add(scale(cos(angle), along), scale(sin(angle), below)))
         links[j, 3] = 0.0
+
+
+@kernel
+def _turn_links(opening, links):
+    """Write the velocities of links that do not stretch and turn as little as their ends' motion allows.
+
+    They are what is left of one vector λ across each link d, λ - d (d · λ), and add up to `opening`.
+    """
+    n = links.shape[0]
+    xx, yy, zz, xy, xz, yz = float(n), float(n), float(n), 0.0, 0.0, 0.0
+    for j in range(n):
+        x, y, z = row(links, j)
+        xx, yy, zz = xx - x * x, yy - y * y, zz - z * z
+        xy, xz, yz = xy - x * y, xz - x * z, yz - y * z
+    common = _solve(xx, yy, zz, xy, xz, yz, opening)
+    for j in range(n):
+        link = row(links, j)
+        put(links[j, 4:], sub(common, scale(dot(link, common), link)))
+
+
+@kernel
+def _solve(xx, yy, zz, xy, xz, yz, right):
+    """Return the solution of three linear equations with a symmetric matrix."""
+    first, second, third = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+    minor = cross(second, third)
+    volume = dot(first, minor)
+    return scale(1.0 / volume, (dot(minor, right), dot(cross(third, first), right), dot(cross(first, second), right)))

@@ -30,6 +30,7 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
+from multilift_marl.sim.hanging import SLACK
 from multilift_marl.sim.standing import hold_hook, hook_place
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
@@ -74,6 +75,8 @@ class Recover(Task):
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
         check_heights(self.options)
+        taut = SLACK if world.system.cable_model == "chain" else 1.0  # chains that hang straighter pull at once
+        self._slack = min(self.options.start_slack, taut), taut
         self._early = forgive(TILT, CABLE)
         if self.options.start == "crazymarl":  # a quarter of its teams start on the ground
             self._early = forgive(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
@@ -86,7 +89,7 @@ class Recover(Task):
         putmat(goal.rotation[env], rot_z(radians(rng.uniform(-option.target_yaw, option.target_yaw))))
         place_formation(env, goal, self.rig)
         self.watch.forgiven[env] = self._early
-        throw = Throw(option.start_radius, radians(option.start_tilt), option.start_speed, option.start_slack)
+        throw = Throw(option.start_radius, radians(option.start_tilt), option.start_speed, *self._slack)
         if option.start == "slack":
             _throw(env, rng, state, goal, self.rig, self.hanging, throw)
         else:
@@ -127,6 +130,7 @@ class Throw(NamedTuple):
     tilt: float
     speed: float
     slack: float
+    taut: float
 
 
 @kernel
@@ -149,7 +153,7 @@ def _throw(e, rng, state, goal, rig, hanging, throw):
         at_rest = add(row(goal.position, e), mul(matrow(goal.rotation, e), row(rig.anchors, n)))
         towards = unit(sub(vec(goal.slots, e, n), at_rest))
         towards = unit(add(towards, in_ball(rng, 0.5)))  # within 30° of the slot's
-        span = hanging.length[n] * rng.uniform(throw.slack, 1.0)
+        span = hanging.length[n] * rng.uniform(throw.slack, throw.taut)
         put(state.drone_velocity[e, n], in_ball(rng, throw.speed))
         putmat(state.drone_rotation[e, n], _tilted(rng, throw.tilt, goal.drone_yaw[e]))
         hold_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.drones.hooks)
