@@ -1,4 +1,8 @@
-"""What the tests share. A test that takes `task` runs for every task, one that takes `num_drones` for every N."""
+"""What the tests share.
+
+A test that takes `task` runs for every task, one that takes `num_drones` for every N, and one that takes `cables`, the
+configuration of a cable model, for both models.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,7 @@ from multilift_marl.validation.cables import hover_thrust  # noqa: F401 (for the
 
 TASKS = ml.list_tasks()
 NUM_DRONES = (1, 2, 3, 6)
+CABLES = {"massless": {"cable.model": "massless"}, "chain": {"cable.model": "chain", "cable.segments": 3}}  # few: fast
 GRAVITY = 9.81
 TIMESTEPS = (5e-4, 1e-3, 2e-3, 4e-3)
 OFF_CENTRE = [[0.25, 0.2, 0.08], [-0.3, 0.2, 0.08], [-0.3, -0.2, 0.08], [0.25, -0.2, 0.08]]
@@ -32,9 +37,13 @@ SMALL = {
 
 def pytest_generate_tests(metafunc):
     own = {name for mark in metafunc.definition.iter_markers("parametrize") for name in _names(mark.args[0])}
-    for name, values in (("task", TASKS), ("num_drones", NUM_DRONES)):
+    for name, values, ids in (
+        ("task", TASKS, None),
+        ("num_drones", NUM_DRONES, None),
+        ("cables", CABLES.values(), CABLES),
+    ):
         if name in metafunc.fixturenames and name not in own:
-            metafunc.parametrize(name, values)
+            metafunc.parametrize(name, values, ids=ids)
 
 
 @pytest.fixture(autouse=True)

@@ -11,8 +11,8 @@ from multilift_marl.math3d import axis_angle
 # Steps and ends
 
 
-def test_time_limit_is_exact_and_a_truncation(task):
-    vec = make(task, **{"env.episode_seconds": 0.5})
+def test_time_limit_is_exact_and_a_truncation(task, cables):
+    vec = make(task, **{"env.episode_seconds": 0.5}, **cables)
     vec.reset()
     assert vec.max_steps == 25
     for step in range(1, 26):
@@ -21,8 +21,8 @@ def test_time_limit_is_exact_and_a_truncation(task):
         assert truncated.all() == truncated.any() == (step == 25)
 
 
-def test_a_reset_starts_the_clock_of_its_environments_only(task):
-    vec = make(task, num_envs=3, **{"env.episode_seconds": 0.5})
+def test_a_reset_starts_the_clock_of_its_environments_only(task, cables):
+    vec = make(task, num_envs=3, **{"env.episode_seconds": 0.5}, **cables)
     vec.reset()
     for _ in range(10):
         vec.step(zeros(vec))
@@ -32,9 +32,9 @@ def test_a_reset_starts_the_clock_of_its_environments_only(task):
     assert truncated.tolist() == [True, False, True]
 
 
-def test_ends_have_one_cause(task, num_drones):
+def test_ends_have_one_cause(task, num_drones, cables):
     harsh = {"task_options.grace": 0.0} if task == "recover" else {}
-    vec = make(task, num_envs=16, num_drones=num_drones, **{"env.episode_seconds": 1.5, **harsh})
+    vec = make(task, num_envs=12, num_drones=num_drones, **{"env.episode_seconds": 1.5, **harsh}, **cables)
     vec.reset(seed=0)
     terminations = truncations = 0
     for step in range(300):
@@ -51,14 +51,14 @@ def test_ends_have_one_cause(task, num_drones):
     assert terminations > 0 and truncations > 0
 
 
-def test_an_environment_that_was_never_reset_cannot_be_stepped(task):
-    vec = make(task)
+def test_an_environment_that_was_never_reset_cannot_be_stepped(task, cables):
+    vec = make(task, **cables)
     with pytest.raises(RuntimeError, match=r"environment 0 has ended or was never reset: call reset\(mask=\.\.\.\)"):
         vec.step(zeros(vec))
 
 
-def test_an_ended_environment_cannot_be_stepped(task):
-    vec = make(task, num_envs=3, **{"env.episode_seconds": 0.1})
+def test_an_ended_environment_cannot_be_stepped(task, cables):
+    vec = make(task, num_envs=3, **{"env.episode_seconds": 0.1}, **cables)
     vec.reset()
     for _ in range(2):
         vec.step(zeros(vec))
@@ -76,8 +76,8 @@ def test_an_ended_environment_cannot_be_stepped(task):
 
 
 @pytest.mark.parametrize("num_threads", [1, 2])
-def test_a_diverged_environment_ends_alone_and_soundly(task, num_threads):
-    broken, sound = (make(task, num_envs=6, num_threads=num_threads, seed=3) for _ in range(2))
+def test_a_diverged_environment_ends_alone_and_soundly(task, cables, num_threads):
+    broken, sound = (make(task, num_envs=6, num_threads=num_threads, seed=3, **cables) for _ in range(2))
     for vec in (broken, sound):
         vec.reset()
     others = [0, 1, 3, 4, 5]

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
-from conftest import bold_actions, make, mixed_actions
-
-import multilift_marl as ml
+from conftest import CABLES, TASKS, bold_actions, make, mixed_actions
 
 
-@pytest.fixture(scope="module", params=ml.list_tasks())
+@pytest.fixture(scope="module", params=product(TASKS, CABLES), ids="-".join)
 def ensemble(request):
     """Return observations (K, D) and states (K, S) of many moments of many episodes of four drones, and the names."""
-    varied = {"task_options.path": "random"} if request.param == "track" else {}  # others stay at one height
-    vec = make(request.param, num_envs=64, num_drones=4, **varied)
+    task, model = request.param
+    varied = {"task_options.path": "random"} if task == "track" else {}  # others stay at one height
+    vec = make(task, num_envs=64 if model == "massless" else 16, num_drones=4, **varied, **CABLES[model])
     observation, _ = vec.reset(seed=0)
     seen, states = [observation], [vec.state()]
     for step in range(max(150, vec.max_steps)):  # all phases of an episode
@@ -39,8 +40,8 @@ def test_no_number_of_an_observation_repeats_another(ensemble):
     assert twins == []
 
 
-def test_the_state_tells_what_is_hidden_from_the_drones(task):
-    vec = make(task, num_envs=64, **{"randomization.payload_mass": 0.2, "randomization.payload_force": 1.5})
+def test_the_state_tells_what_is_hidden_from_the_drones(task, cables):
+    vec = make(task, num_envs=64, **{"randomization.payload_mass": 0.2, "randomization.payload_force": 1.5}, **cables)
     observation, _ = vec.reset(seed=0)
     state, plant = vec.state(), vec.world.plant
     excess = (plant.payload_mass / vec.world.system.payload_mass - 1)[:, None]
@@ -50,8 +51,8 @@ def test_the_state_tells_what_is_hidden_from_the_drones(task):
     assert np.abs(observation - excess[..., None]).max(axis=(0, 1)).min() > 0.1
 
 
-def test_reward_is_the_sum_of_its_named_terms_for_every_drone(task, num_drones):
-    vec, paid = make(task, num_drones=num_drones), set()
+def test_reward_is_the_sum_of_its_named_terms_for_every_drone(task, num_drones, cables):
+    vec, paid = make(task, num_drones=num_drones, **cables), set()
     vec.reset(seed=0)
     for step in range(vec.max_steps):
         _, reward, terminated, truncated, info = vec.step(0.2 * bold_actions(vec, step, hold=3))
@@ -65,16 +66,16 @@ def test_reward_is_the_sum_of_its_named_terms_for_every_drone(task, num_drones):
     assert paid == set(vec.reward_terms)
 
 
-def test_a_weight_scales_its_term_and_no_other(task):
+def test_a_weight_scales_its_term_and_no_other(task, cables):
     def terms(**weights):
-        vec = make(task, **weights)
+        vec = make(task, **weights, **cables)
         vec.reset(seed=0)
         for step in range(3):
             *_, info = vec.step(0.3 * bold_actions(vec, step, hold=1))
         return info["reward_terms"]
 
     plain = terms()
-    weights = make(task, num_envs=1).task.REWARD
+    weights = make(task, num_envs=1, **cables).task.REWARD
     for name, weight in weights.items():
         heavier = terms(**{f"reward.{name}": 3 * weight})
         for other in plain:

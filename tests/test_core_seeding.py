@@ -26,21 +26,21 @@ def play(vec: MultiliftVec, steps: int, row: int, first_step: int = 0) -> tuple[
     return shown, ends
 
 
-def test_same_seed_same_episodes(task, num_drones):
-    first, second = (make(task, num_drones=num_drones, seed=7) for _ in range(2))
+def test_same_seed_same_episodes(task, num_drones, cables):
+    first, second = (make(task, num_drones=num_drones, seed=7, **cables) for _ in range(2))
     assert same(first.reset()[0], second.reset()[0])
     assert same(play(first, 120, row=2), play(second, 120, row=2))
 
 
-def test_reset_with_a_seed_starts_over(task, num_drones):
-    vec = make(task, num_drones=num_drones)
+def test_reset_with_a_seed_starts_over(task, num_drones, cables):
+    vec = make(task, num_drones=num_drones, **cables)
     first = vec.reset(seed=3), play(vec, 60, row=1)
     again = vec.reset(seed=3), play(vec, 60, row=1)
     assert same(first, again)
 
 
-def test_different_seeds_environments_episodes_and_purposes_differ(task):
-    vec = make(task)
+def test_different_seeds_environments_episodes_and_purposes_differ(task, cables):
+    vec = make(task, **cables)
     start, _ = vec.reset(seed=3)
     following, _ = vec.reset()
     other, _ = vec.reset(seed=4)
@@ -51,10 +51,10 @@ def test_different_seeds_environments_episodes_and_purposes_differ(task):
 
 
 @pytest.mark.parametrize("num_threads", [1, 2])
-def test_an_environment_of_a_batch_is_replayed_alone(task, num_drones, num_threads):
+def test_an_environment_of_a_batch_is_replayed_alone(task, num_drones, cables, num_threads):
     short = {"env.episode_seconds": 4.0}
-    batch = make(task, num_envs=8, num_drones=num_drones, num_threads=num_threads, seed=5, **short)
-    alone = make(task, num_envs=1, num_drones=num_drones, first_env=5, seed=5, **short)
+    batch = make(task, num_envs=6, num_drones=num_drones, num_threads=num_threads, seed=5, **short, **cables)
+    alone = make(task, num_envs=1, num_drones=num_drones, first_env=5, seed=5, **short, **cables)
     assert same(batch.reset()[0][5], alone.reset()[0][0])
     crowded, ends = play(batch, 300, row=5)
     single, own_ends = play(alone, 300, row=0)
@@ -62,8 +62,8 @@ def test_an_environment_of_a_batch_is_replayed_alone(task, num_drones, num_threa
     assert same(crowded, single)
 
 
-def test_an_episode_depends_on_seed_environment_and_number_alone(task):
-    busy, alone = make(task, num_envs=3, seed=5), make(task, num_envs=1, first_env=1, seed=5)
+def test_an_episode_depends_on_seed_environment_and_number_alone(task, cables):
+    busy, alone = make(task, num_envs=3, seed=5, **cables), make(task, num_envs=1, first_env=1, seed=5, **cables)
     for _ in range(3):
         wanted, _ = busy.reset()
     alone.reset()
@@ -74,8 +74,8 @@ def test_an_episode_depends_on_seed_environment_and_number_alone(task):
     assert same(reached[0], wanted[1])
 
 
-def test_a_seed_rewinds_the_masked_environments_only(task):
-    vec = make(task, num_envs=3)
+def test_a_seed_rewinds_the_masked_environments_only(task, cables):
+    vec = make(task, num_envs=3, **cables)
     first, _ = vec.reset(seed=8)
     second, _ = vec.reset()
     mixed, _ = vec.reset(seed=8, mask=mask(3, 1))
@@ -85,8 +85,8 @@ def test_a_seed_rewinds_the_masked_environments_only(task):
     assert vec.episodes.tolist() == [2, 1, 2]
 
 
-def test_rows_outside_the_mask_are_unchanged(task):
-    vec = make(task, num_envs=4, num_threads=2)
+def test_rows_outside_the_mask_are_unchanged(task, cables):
+    vec = make(task, num_envs=4, num_threads=2, **cables)
     vec.reset(seed=1)
     for step in range(5):
         observation, *_ = vec.step(bold_actions(vec, step))
@@ -99,8 +99,8 @@ def test_rows_outside_the_mask_are_unchanged(task):
 
 
 @pytest.mark.parametrize("threads", [(1, 1), (1, 2), (2, 1)], ids=str)
-def test_a_saved_batch_continues_bit_for_bit(task, threads):
-    first, second = (make(task, num_envs=5, num_threads=count, seed=5) for count in threads)
+def test_a_saved_batch_continues_bit_for_bit(task, cables, threads):
+    first, second = (make(task, num_envs=5, num_threads=count, seed=5, **cables) for count in threads)
     first.reset()
     play(first, 90, row=0)
     saved = first.state_dict()

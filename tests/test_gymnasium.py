@@ -52,18 +52,18 @@ def fly(env, seed, steps):
 
 
 @pytest.mark.parametrize("drawn", [False, True], ids=["", "drawn"])
-def test_official_checker_finds_nothing(task, drawn, monkeypatch):
+def test_official_checker_finds_nothing(task, cables, drawn, monkeypatch):
     monkeypatch.setattr(faces, "Window", MagicMock())  # the checker tries render_mode="human", too: see test_window.py
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*Box observation space (min|max)imum value is")  # as they are
-        env = gymnasium.make(name_of(task), render_mode="rgb_array" if drawn else None)
+        env = gymnasium.make(name_of(task), render_mode="rgb_array" if drawn else None, **cables)
         check_env(env.unwrapped, skip_render_check=not drawn)
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space")
-def test_any_team_passes_the_official_checker(task, num_drones):
-    check_env(MultiliftGymnasiumEnv(task, num_drones=num_drones), skip_render_check=True)
+def test_any_team_passes_the_official_checker(task, num_drones, cables):
+    check_env(MultiliftGymnasiumEnv(task, num_drones=num_drones, **cables), skip_render_check=True)
 
 
 def test_every_configuration_is_registered_once():
@@ -97,10 +97,10 @@ def test_registering_imports_no_torch_and_no_name_needs_the_package_imported():
     assert done.stdout.strip() == str(MultiliftGymnasiumEnv().observation_space.shape), done.stderr
 
 
-def test_make_passes_drones_seed_and_overrides_on(task):
+def test_make_passes_drones_seed_and_overrides_on(task, cables):
     keywords = {"num_drones": 3, "seed": 4, "payload.mass": 0.9}
-    env = gymnasium.make(name_of(task), **keywords)
-    envs = gymnasium.make_vec(name_of(task), num_envs=5, num_threads=1, **keywords)
+    env = gymnasium.make(name_of(task), **keywords, **cables)
+    envs = gymnasium.make_vec(name_of(task), num_envs=5, num_threads=1, **keywords, **cables)
     for face, count in ((env.unwrapped, 1), (envs.unwrapped, 5)):
         assert (face.vec.num_envs, face.vec.num_drones, face.vec.config.seed) == (count, 3, 4)
         assert face.vec.world.system.payload_mass == 0.9
@@ -108,10 +108,10 @@ def test_make_passes_drones_seed_and_overrides_on(task):
     assert same(env.reset()[0], envs.reset()[0][0])
 
 
-def test_spaces_are_the_same_objects_and_hold_what_comes(task, num_drones):
+def test_spaces_are_the_same_objects_and_hold_what_comes(task, num_drones, cables):
     env, envs = (
-        MultiliftGymnasiumEnv(task, num_drones=num_drones),
-        MultiliftVectorEnv(task, num_envs=2, num_threads=1, num_drones=num_drones),
+        MultiliftGymnasiumEnv(task, num_drones=num_drones, **cables),
+        MultiliftVectorEnv(task, num_envs=2, num_threads=1, num_drones=num_drones, **cables),
     )
     observed, acted = num_drones * env.vec.observation_size, num_drones * env.vec.action_size
     for name in ("observation_space", "action_space"):
@@ -126,8 +126,11 @@ def test_spaces_are_the_same_objects_and_hold_what_comes(task, num_drones):
     assert envs.observation_space.contains(envs.step(envs.action_space.sample())[0])
 
 
-def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones):
-    env, zoo = MultiliftGymnasiumEnv(task, num_drones=num_drones), ml.parallel_env(task, num_drones=num_drones)
+def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones, cables):
+    env, zoo = (
+        MultiliftGymnasiumEnv(task, num_drones=num_drones, **cables),
+        ml.parallel_env(task, num_drones=num_drones, **cables),
+    )
     agents = zoo.possible_agents
     for episode in range(2):  # seed 3's first episode, then the second
         seed = 3 if episode == 0 else None
@@ -145,11 +148,11 @@ def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones):
         assert terminated or truncated
 
 
-def test_vector_environments_tell_exactly_what_gymnasiums_own_do(task):
+def test_vector_environments_tell_exactly_what_gymnasiums_own_do(task, cables):
     """Ours against SyncVectorEnv of single environments numbered as the batch's, over failures and time-outs."""
     count, seed, keywords = 3, 7, {"env.episode_seconds": 4.0}
-    envs = MultiliftVectorEnv(task, num_envs=count, num_threads=1, **keywords)
-    singles = [MultiliftGymnasiumEnv(task, **keywords) for _ in range(count)]
+    envs = MultiliftVectorEnv(task, num_envs=count, num_threads=1, **keywords, **cables)
+    singles = [MultiliftGymnasiumEnv(task, **keywords, **cables) for _ in range(count)]
     for number, single in enumerate(singles):
         single.vec.first_env = number
     official = SyncVectorEnv([lambda e=e: e for e in singles], autoreset_mode=AutoresetMode.SAME_STEP)

@@ -79,9 +79,9 @@ def test_bias_is_constant_in_an_episode_and_new_in_the_next():
     np.testing.assert_allclose(told.std(axis=(0, 1, 3)), STANDARD, rtol=0.15)
 
 
-def test_reward_errors_and_critic_are_true(task):
+def test_reward_errors_and_critic_are_true(task, cables):
     settings = {**NOISE, **BIAS, "randomization.observation_delay": 2}
-    blurred, clear = make(task, **settings), make(task)
+    blurred, clear = make(task, **settings, **cables), make(task, **cables)
     assert not same(blurred.reset()[0], clear.reset()[0])
     for step in range(20):
         action = bold_actions(clear, step)
@@ -93,8 +93,8 @@ def test_reward_errors_and_critic_are_true(task):
 
 
 @pytest.mark.parametrize("delay", [1, 3])
-def test_observations_come_exactly_so_many_steps_late(task, delay):
-    late, prompt = make(task, **{"randomization.observation_delay": delay}), make(task)
+def test_observations_come_exactly_so_many_steps_late(task, cables, delay):
+    late, prompt = make(task, **{"randomization.observation_delay": delay}, **cables), make(task, **cables)
     for _ in range(2):
         seen, true = [late.reset()[0]], [prompt.reset()[0]]
         for step in range(8):

@@ -242,8 +242,8 @@ def test_an_impossible_team_is_refused_by_name(overrides, complaint):
     assert re.match(complaint, message), message
 
 
-def test_a_mixed_team_opens_every_task(task):
-    vec = make(task, num_envs=1, **{"vehicle.preset": MIX})
+def test_a_mixed_team_opens_every_task(task, cables):
+    vec = make(task, num_envs=1, **{"vehicle.preset": MIX}, **cables)
     vec.reset(seed=0)
     vec.step(zeros(vec))
     assert floats(vec.task.rig.drones.mass) == floats([PRESETS[name].mass for name in MIX])

@@ -36,18 +36,18 @@ def fly(env, seed, act=gentle):
     return told
 
 
-def test_official_api_test_passes(task, num_drones):
+def test_official_api_test_passes(task, num_drones, cables):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        parallel_api_test(parallel_env(task, num_drones=num_drones), num_cycles=60)
+        parallel_api_test(parallel_env(task, num_drones=num_drones, **cables), num_cycles=60)
 
 
-def test_official_seed_test_passes(task):
-    parallel_seed_test(lambda: parallel_env(task))
+def test_official_seed_test_passes(task, cables):
+    parallel_seed_test(lambda: parallel_env(task, **cables))
 
 
-def test_every_episode_is_its_seeds_alone(task):
-    first, second = parallel_env(task), parallel_env(task, seed=8)
+def test_every_episode_is_its_seeds_alone(task, cables):
+    first, second = parallel_env(task, **cables), parallel_env(task, seed=8, **cables)
     expected = fly(first, 7)
     fly(second, None)
     fly(second, 9)
@@ -66,9 +66,9 @@ def test_seed_starts_at_its_first_episode_and_none_goes_on():
 
 
 @pytest.mark.parametrize("act", [gentle, lambda env, step: bold_actions(env.vec, step)])
-def test_same_numbers_as_the_core(task, num_drones, act):
-    env = parallel_env(task, num_drones=num_drones, seed=3)
-    vec = ml.make_vec(task, num_envs=1, num_drones=num_drones, seed=3)
+def test_same_numbers_as_the_core(task, num_drones, cables, act):
+    env = parallel_env(task, num_drones=num_drones, seed=3, **cables)
+    vec = ml.make_vec(task, num_envs=1, num_drones=num_drones, seed=3, **cables)
     for got, expected in zip(env.reset()[0].values(), vec.reset()[0][0], strict=True):
         assert same(got, expected)
     step = 0
@@ -118,8 +118,8 @@ def test_stepping_before_the_first_reset_is_refused():
         env.step(split(env, gentle(env, 0)))
 
 
-def test_spaces_are_the_same_objects_and_hold_what_comes(task, num_drones):
-    env = parallel_env(task, num_drones=num_drones)
+def test_spaces_are_the_same_objects_and_hold_what_comes(task, num_drones, cables):
+    env = parallel_env(task, num_drones=num_drones, **cables)
     observations, _ = env.reset(seed=0)
     for name in env.possible_agents:
         seen, acted = env.observation_space(name), env.action_space(name)
@@ -217,13 +217,13 @@ def test_a_pickled_copy_is_a_new_environment_of_the_same_configuration():
 
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "parallel_registry"), reason="PettingZoo before 1.27 has no registry")
-def test_registered_with_pettingzoo(task):
+def test_registered_with_pettingzoo(task, cables):
     multilift_v0.register()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         multilift_v0.register()
-        env = pettingzoo.make("parallel", f"multilift_marl/{task}-v0", num_drones=3, seed=2)
-    assert same(fly(env, None), fly(parallel_env(task, num_drones=3), 2))
+        env = pettingzoo.make("parallel", f"multilift_marl/{task}-v0", num_drones=3, seed=2, **cables)
+    assert same(fly(env, None), fly(parallel_env(task, num_drones=3, **cables), 2))
 
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "parallel_registry"), reason="PettingZoo before 1.27 has no registry")

@@ -85,8 +85,8 @@ def test_other_draws_stay_what_they_are_without(draws):
     assert (narrow["cable_length"] == 1.0).all() and not narrow["wind"].any()
 
 
-def test_info_tells_the_draw_at_reset_and_at_every_step(task):
-    vec = make(task, **{"randomization.vehicle_mass": 0.1})
+def test_info_tells_the_draw_at_reset_and_at_every_step(task, cables):
+    vec = make(task, **{"randomization.vehicle_mass": 0.1}, **cables)
     told = vec.reset()[1]["randomization"]
     info = vec.step(zeros(vec))[4]
     assert same(told, info["randomization"])
@@ -99,9 +99,9 @@ def test_info_tells_the_draw_at_reset_and_at_every_step(task):
     assert (told["vehicle_mass"][1] != again["vehicle_mass"][1]).all()
 
 
-def test_nothing_of_the_parameters_is_shown_to_the_drones(task):
+def test_nothing_of_the_parameters_is_shown_to_the_drones(task, cables):
     settings = {key: value for key, value in ALL.items() if "second" not in key}
-    vec = make(task, num_drones=3, **settings)
+    vec = make(task, num_drones=3, **settings, **cables)
     observation, _ = vec.reset(seed=1)
     for array in vec.world.parameters:
         array[:] = 2.0 * array + 0.1
@@ -109,9 +109,9 @@ def test_nothing_of_the_parameters_is_shown_to_the_drones(task):
     assert same(observation, vec._observation)
 
 
-def test_every_task_flies_with_everything_drawn_and_alike_alone(task):
-    batch = make(task, num_envs=4, num_drones=3, num_threads=2, **ALL)
-    alone = make(task, num_envs=1, num_drones=3, first_env=2, **ALL)
+def test_every_task_flies_with_everything_drawn_and_alike_alone(task, cables):
+    batch = make(task, num_envs=4, num_drones=3, num_threads=2, **ALL, **cables)
+    alone = make(task, num_envs=1, num_drones=3, first_env=2, **ALL, **cables)
     assert same(batch.reset(seed=5)[0][2], alone.reset(seed=5)[0][0])
     for step in range(40):
         action = 0.1 * bold_actions(batch, step)

@@ -60,9 +60,9 @@ def test_the_physics_has_the_fixed_values():
     assert (vec.world.plant.wind == [1.0, 0.0, 0.0]).all()
 
 
-def test_an_episode_with_its_own_draw_fixed_is_the_same_episode(task):
+def test_an_episode_with_its_own_draw_fixed_is_the_same_episode(task, cables):
     ranges = {f"randomization.{key}": 0.1 for key in ("vehicle_mass", "cable_length", "vehicle_thrust_coefficient")}
-    first, second = make(task, **ranges), make(task, **ranges)
+    first, second = make(task, **ranges, **cables), make(task, **ranges, **cables)
     observation, info = first.reset(seed=3)
     drawn = {name: values.copy() for name, values in info["randomization"].items()}
     again = second.reset(seed=3, options={"randomization": drawn})

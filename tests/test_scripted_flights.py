@@ -50,8 +50,8 @@ def test_in_return_motors_off_lose_to_holding_the_start_to_the_formation_to_its_
 
 @pytest.mark.parametrize("shape", ["box", "point"])
 @pytest.mark.parametrize("num_drones", [1, 2, 3, 6, 16])
-def test_the_formation_flies_any_number_of_drones(num_drones, shape):
-    vec = make("hover", num_envs=8, num_drones=num_drones, **{"payload.shape": shape})
+def test_the_formation_flies_any_number_of_drones(num_drones, cables, shape):
+    vec = make("hover", num_envs=8, num_drones=num_drones, **{"payload.shape": shape}, **cables)
     _, _, failure = fly_once(vec, make_scripted("formation", vec).act)
     assert not failure.any()
 
@@ -61,8 +61,8 @@ def test_the_formation_flies_any_number_of_drones(num_drones, shape):
     [(4, {}), (3, {"payload.shape": "point"}), (4, {"payload.shape": "point"}), (4, {"payload.anchors": OFF_CENTRE})],
     ids=["box", "point 3", "point 4", "off-centre anchors"],
 )
-def test_the_integral_formation_succeeds_with_any_payload(num_drones, overrides):
-    vec = make("hover", num_envs=32, num_drones=num_drones, **overrides)
+def test_the_integral_formation_succeeds_with_any_payload(num_drones, cables, overrides):
+    vec = make("hover", num_envs=32, num_drones=num_drones, **overrides, **cables)
     _, success, failure = fly_once(vec, make_scripted("formation_integral", vec).act)
     assert not failure.any()
     assert success.mean() >= 0.9
