@@ -98,9 +98,9 @@ def test_registering_imports_no_torch_and_no_name_needs_the_package_imported():
 
 
 def test_make_passes_drones_seed_and_overrides_on(task, cables):
-    keywords = {"num_drones": 3, "seed": 4, "payload.mass": 0.9}
-    env = gymnasium.make(name_of(task), **keywords, **cables)
-    envs = gymnasium.make_vec(name_of(task), num_envs=5, num_threads=1, **keywords, **cables)
+    keywords = {"num_drones": 3, "seed": 4, "payload.mass": 0.9, **cables}
+    env = gymnasium.make(name_of(task), **keywords)
+    envs = gymnasium.make_vec(name_of(task), num_envs=5, num_threads=1, **keywords)
     for face, count in ((env.unwrapped, 1), (envs.unwrapped, 5)):
         assert (face.vec.num_envs, face.vec.num_drones, face.vec.config.seed) == (count, 3, 4)
         assert face.vec.world.system.payload_mass == 0.9
@@ -109,10 +109,8 @@ def test_make_passes_drones_seed_and_overrides_on(task, cables):
 
 
 def test_spaces_are_the_same_objects_and_hold_what_comes(task, num_drones, cables):
-    env, envs = (
-        MultiliftGymnasiumEnv(task, num_drones=num_drones, **cables),
-        MultiliftVectorEnv(task, num_envs=2, num_threads=1, num_drones=num_drones, **cables),
-    )
+    team = {"num_drones": num_drones, **cables}
+    env, envs = MultiliftGymnasiumEnv(task, **team), MultiliftVectorEnv(task, num_envs=2, num_threads=1, **team)
     observed, acted = num_drones * env.vec.observation_size, num_drones * env.vec.action_size
     for name in ("observation_space", "action_space"):
         assert getattr(env, name) is getattr(env, name)
@@ -127,10 +125,8 @@ def test_spaces_are_the_same_objects_and_hold_what_comes(task, num_drones, cable
 
 
 def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones, cables):
-    env, zoo = (
-        MultiliftGymnasiumEnv(task, num_drones=num_drones, **cables),
-        ml.parallel_env(task, num_drones=num_drones, **cables),
-    )
+    team = {"num_drones": num_drones, **cables}
+    env, zoo = MultiliftGymnasiumEnv(task, **team), ml.parallel_env(task, **team)
     agents = zoo.possible_agents
     for episode in range(2):  # seed 3's first episode, then the second
         seed = 3 if episode == 0 else None
@@ -150,9 +146,9 @@ def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones, cabl
 
 def test_vector_environments_tell_exactly_what_gymnasiums_own_do(task, cables):
     """Ours against SyncVectorEnv of single environments numbered as the batch's, over failures and time-outs."""
-    count, seed, keywords = 3, 7, {"env.episode_seconds": 4.0}
-    envs = MultiliftVectorEnv(task, num_envs=count, num_threads=1, **keywords, **cables)
-    singles = [MultiliftGymnasiumEnv(task, **keywords, **cables) for _ in range(count)]
+    count, seed, keywords = 3, 7, {"env.episode_seconds": 4.0, **cables}
+    envs = MultiliftVectorEnv(task, num_envs=count, num_threads=1, **keywords)
+    singles = [MultiliftGymnasiumEnv(task, **keywords) for _ in range(count)]
     for number, single in enumerate(singles):
         single.vec.first_env = number
     official = SyncVectorEnv([lambda e=e: e for e in singles], autoreset_mode=AutoresetMode.SAME_STEP)
