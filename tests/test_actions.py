@@ -202,11 +202,11 @@ def test_an_unknown_interface_is_refused():
 @pytest.mark.parametrize("action", ["acc_rates", "ctbr"])
 def test_a_team_trains_with_the_interface(tmp_path, action):
     trainer = make_trainer(tmp_path, **{"control.action": action, "train.frames": 256})
-    before = trainer.learner.actor.net[0].weight.detach().clone()
+    before = trainer.learner.actor.team.net[0].weight.detach().clone()
     assert trainer.run()
     assert trainer.iteration == 2
     assert not (trainer.learner.actor.base != 0).any()
-    after = trainer.learner.actor.net[0].weight
+    after = trainer.learner.actor.team.net[0].weight
     assert (after != before).any() and bool(after.isfinite().all())
 
 

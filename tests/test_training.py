@@ -46,7 +46,7 @@ def test_same_seed_same_weights_other_seed_others(tmp_path):
     for trainer in (one, two, other):
         torch.manual_seed(trainer.config.seed)
         trainer.step()
-        weights.append(trainer.learner.actor.net[0].weight.detach().clone())
+        weights.append(trainer.learner.actor.team.net[0].weight.detach().clone())
     assert torch.equal(weights[0], weights[1])
     assert not torch.equal(weights[0], weights[2])
 

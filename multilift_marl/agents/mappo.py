@@ -17,6 +17,7 @@ from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic
 from multilift_marl.config.schema import TrainConfig
 from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.torchrl_env import MultiliftEnv
+from multilift_marl.tasks.observations import drone_numbers
 
 
 @dataclass
@@ -37,7 +38,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     # 1. The policy: own observation to a Gaussian over the own action.
     vec = env.vec
     base = torch.from_numpy(residual_matrix(config.residual, vec))
-    actor = Actor(vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
+    actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
     agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
     policy = ProbabilisticActor(
         TensorDictModule(actor, in_keys=[agents["observation"]], out_keys=[agents["loc"], agents["scale"]]),
@@ -53,7 +54,8 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     critic: CentralCritic | LocalCritic
     source: str | tuple[str, str]
     if config.algorithm == "mappo":
-        critic, source = CentralCritic(vec.state_size, vec.num_drones, config.hidden, value_norm), "state"
+        drones = drone_numbers(vec.num_drones, vec.action_size)
+        critic, source = CentralCritic(config.critic, vec.state_size, drones, config.hidden, value_norm), "state"
     else:
         critic, source = LocalCritic(vec.observation_size, config.hidden, value_norm), agents["observation"]
     value = TensorDictModule(critic, in_keys=[source], out_keys=[agents["state_value"]])

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
+from multilift_marl.tasks.observations import DroneNumbers
+
 if TYPE_CHECKING:  # policies need torch only
     from torchrl.modules import ValueNorm
 
@@ -62,27 +64,71 @@ def _orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
     return layer
 
 
+class TeamNet(nn.Module):
+    """Perceptron of N rows (..., N, inputs) to (..., N, outputs), the same for each row and for any number of them.
+
+    Args:
+        kind: what a row learns of the others before the last layer: nothing ("local"), the mean of what all hold
+            ("set"; Zaheer et al. 2017), or what it attends to ("attention", four heads; Vaswani et al. 2017).
+        inputs, hidden, outputs, gain: see `mlp`.
+    """
+
+    HEADS = 4
+
+    def __init__(self, kind: str, inputs: int, hidden: Sequence[int], outputs: int, gain: float):
+        super().__init__()
+        *inner, last = hidden
+        self.kind = kind
+        if kind == "local":
+            self.net = mlp(inputs, hidden, outputs, gain)
+            return
+        self.embed = mlp(inputs, inner, last, gain=math.sqrt(2))
+        if kind == "attention":
+            self.attention = nn.MultiheadAttention(last, self.HEADS, batch_first=True)
+        self.net = mlp(2 * last, [last], outputs, gain)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return (..., N, outputs)."""
+        if self.kind == "local":
+            return self.net(rows)
+        held = torch.tanh(self.embed(rows))
+        if self.kind == "set":
+            others = held.mean(-2, keepdim=True).expand_as(held)
+        else:
+            teams = held.reshape(-1, *held.shape[-2:])
+            others = self.attention(teams, teams, teams, need_weights=False)[0].reshape(held.shape)
+        return self.net(torch.cat([held, others], -1))
+
+
 class Actor(nn.Module):
-    """Gaussian policy of one drone, the same for all: observation (..., N, D) to mean and deviation (..., N, A).
+    """Gaussian policy of a drone, the same for all: observations (..., N, D) to mean and deviation (..., N, A).
 
     Its mean is that of a linear script, `base` (A, D), plus a network whose last layer starts near zero: an untrained
     team flies the script.
+
+    Args:
+        kind: what drones are told of each other; see `TeamNet`. With "local" each acts on its own observation alone.
+        observation_size, action_size: D, A.
+        hidden: widths of the hidden layers.
+        initial_std: deviation at the start.
+        base: of the script.
     """
 
     base: torch.Tensor
 
     def __init__(
-        self, observation_size: int, action_size: int, hidden: Sequence[int], initial_std: float, base: torch.Tensor
-    ):
+        self, kind: str, observation_size: int, action_size: int, hidden: Sequence[int], initial_std: float,
+        base: torch.Tensor,
+    ):  # fmt: skip
         super().__init__()
         self.normalizer = Normalizer(observation_size)
-        self.net = mlp(observation_size, hidden, action_size, gain=0.01)
+        self.team = TeamNet(kind, observation_size, hidden, action_size, gain=0.01)
         self.register_buffer("base", base)
         self.log_std = nn.Parameter(torch.full((action_size,), math.log(initial_std)))
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return mean and standard deviation of the action."""
-        mean = self.net(self.normalizer(observation)) + observation @ self.base.T
+        mean = self.team(self.normalizer(observation)) + observation @ self.base.T
         return mean, self.log_std.exp().expand_as(mean)
 
 
@@ -90,18 +136,35 @@ class CentralCritic(nn.Module):
     """Value of the team from the global state: (..., S) to (..., N, 1), the same for every drone (MAPPO).
 
     The network's output is in units of the value normaliser, which the loss keeps up to date.
+
+    Args:
+        kind: "flat" takes the state as it is; "set" and "attention" (see `TeamNet`) give the same value in whatever
+            order the drones stand in it.
+        state_size: S.
+        drones: where the numbers of the drones stand in the state.
+        hidden: widths of the hidden layers.
+        value_norm: running statistics of the returns.
     """
 
-    def __init__(self, state_size: int, num_drones: int, hidden: Sequence[int], value_norm: ValueNorm):
+    def __init__(
+        self, kind: str, state_size: int, drones: DroneNumbers, hidden: Sequence[int], value_norm: ValueNorm
+    ):  # fmt: skip
         super().__init__()
         self.normalizer, self.value_norm = Normalizer(state_size), value_norm
-        self.net = mlp(state_size, hidden, 1, gain=0.1)
-        self.num_drones = num_drones
+        self.kind, self.drones = kind, drones
+        inputs = state_size if kind == "flat" else state_size - (drones.count - 1) * drones.size
+        self.team = TeamNet("local" if kind == "flat" else kind, inputs, hidden, 1, gain=0.1)
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
         """Return the value for each drone."""
-        value = self.value_norm.denormalize(self.net(self.normalizer(state)))
-        return value.unsqueeze(-2).expand(*value.shape[:-1], self.num_drones, 1)
+        first, count, size = self.drones
+        rows = self.normalizer(state).unsqueeze(-2)
+        if self.kind != "flat":
+            shared, own, rest = rows.split([first, count * size, rows.shape[-1] - first - count * size], -1)
+            own = own.reshape(*own.shape[:-2], count, size)
+            rows = torch.cat([own, torch.cat([shared, rest], -1).expand(*own.shape[:-1], -1)], -1)
+        value = self.value_norm.denormalize(self.team(rows).mean(-2, keepdim=True))
+        return value.expand(*value.shape[:-2], count, 1)
 
 
 class LocalCritic(nn.Module):

@@ -46,7 +46,7 @@ class LearnedPolicy:
         weights, size = content["actor"], (len(self.observation_names), len(self.action_names))
         train = self.config.train
         with torch.random.fork_rng(devices=[]):  # initial weights, overwritten at once, must not cost random numbers
-            self.actor = Actor(*size, train.hidden, train.initial_std, torch.zeros(size[1], size[0]))
+            self.actor = Actor(train.actor, *size, train.hidden, train.initial_std, torch.zeros(size[1], size[0]))
         try:
             self.actor.load_state_dict(weights)
         except RuntimeError as error:

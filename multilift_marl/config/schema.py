@@ -243,6 +243,12 @@ class TrainConfig(Section):
     """PPO for a team with shared parameters."""
 
     algorithm: Literal["mappo", "ippo"] = Field("mappo", description="mappo: central critic; ippo: local critic")
+    actor: Literal["local", "set", "attention"] = Field(
+        "local", description="local: own observation; set, attention: what the other drones' networks hold, too"
+    )
+    critic: Literal["flat", "set", "attention"] = Field(
+        "flat", description="of mappo; set, attention: the same value in whatever order the drones stand"
+    )
     residual: Literal["formation", "formation_integral"] = Field(
         "formation", description="script that an untrained policy flies and the learned one corrects"
     )

@@ -45,7 +45,20 @@ OBSERVATION = (
     Component("previous_action", 4, "-", "-", "own last action"),  # as many as the action interface has
 )
 _STATE_SHARED = 26  # numbers of the global state that belong to no drone; see observe_team
-_STATE_DRONE = 16  # numbers for each drone, beside its action
+_STATE_DRONE = 18  # numbers for each drone, beside its action
+
+
+class DroneNumbers(NamedTuple):
+    """Where the numbers of the drones stand in the global state: `count` rows of `size` from `first` on."""
+
+    first: int
+    count: int
+    size: int
+
+
+def drone_numbers(num_drones: int, action_size: int) -> DroneNumbers:
+    """Return where the drones' numbers stand in the global state."""
+    return DroneNumbers(_STATE_SHARED, num_drones, _STATE_DRONE + action_size)
 
 
 def observation_names(action_size: int, extra: tuple[Component, ...] = ()) -> tuple[str, ...]:
@@ -61,7 +74,8 @@ def observation_names(action_size: int, extra: tuple[Component, ...] = ()) -> tu
 
 def state_size(num_drones: int, action_size: int) -> int:
     """Return how many numbers the global state holds."""
-    return _STATE_SHARED + num_drones * (_STATE_DRONE + action_size)
+    first, count, size = drone_numbers(num_drones, action_size)
+    return first + count * size
 
 
 @kernel
@@ -77,7 +91,8 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
 
     The global state holds, in the target's heading frame, the payload's errors, velocities and integrals, then what
     is hidden from the drones (payload mass over nominal minus 1, force, wind), then for each drone its slot error,
-    velocity, thrust axis, body rates, tracking error, cable tension over nominal, and previous action.
+    velocity, thrust axis, body rates, tracking error, cable tension over nominal, cosine and sine of its azimuth, and
+    previous action.
 
     Args:
         lo, hi: the environments.
@@ -142,7 +157,8 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
             at = _write(out, at, rates)
             at = _write(out, at, turn(c, s, tracking_error))
             out[at] = state.cable_tension[e, n] / nominal[n, 1] - 1.0
-            at += 1
+            out[at + 1], out[at + 2] = own[i - 2], own[i - 1]
+            at += 3
             for k in range(action.shape[2]):
                 own[i + k] = action[e, n, k]
                 out[at + k] = action[e, n, k]

@@ -1,0 +1,63 @@
+"""Networks over drones: what they must not depend on, the order and the number of drones, holds exactly."""
+
+import pytest
+import torch
+from torchrl.modules import PopArtValueNorm
+
+from multilift_marl.agents.networks import Actor, CentralCritic
+from multilift_marl.tasks.observations import DroneNumbers
+
+KINDS = ("local", "set", "attention")
+SHARED, SIZE, REST = 5, 7, 3
+
+
+def make_actor(kind: str) -> Actor:
+    torch.manual_seed(0)
+    actor = Actor(kind, 11, 4, (16, 16), 0.3, torch.zeros(4, 11))
+    actor.normalizer.update(torch.randn(100, 11))
+    with torch.no_grad():
+        actor.team.net[-1].weight *= 100.0  # as after training
+    return actor
+
+
+def make_critic(kind: str, num_drones: int) -> CentralCritic:
+    torch.manual_seed(0)
+    drones = DroneNumbers(SHARED, num_drones, SIZE)
+    return CentralCritic(kind, SHARED + num_drones * SIZE + REST, drones, (16, 16), PopArtValueNorm(shape=1))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_actors_give_each_drone_its_action_in_any_order(kind):
+    actor, observation = make_actor(kind), torch.randn(6, 5, 11)
+    order = torch.randperm(5)
+    torch.testing.assert_close(actor(observation[:, order])[0], actor(observation)[0][:, order])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("num_drones", [1, 3, 8])
+def test_actors_fly_any_number_of_drones(kind, num_drones):
+    mean, deviation = make_actor(kind)(torch.randn(2, num_drones, 11))
+    assert mean.shape == deviation.shape == (2, num_drones, 4)
+
+
+@pytest.mark.parametrize(("kind", "told"), [("local", False), ("set", True), ("attention", True)])
+def test_what_others_observe_matters_to_team_networks_alone(kind, told):
+    actor, observation = make_actor(kind), torch.randn(3, 4, 11)
+    changed = observation.clone()
+    changed[:, 1:] += 1.0
+    assert torch.equal(actor(observation)[0][:, 0], actor(changed)[0][:, 0]) != told
+
+
+@pytest.mark.parametrize("kind", ["set", "attention"])
+def test_critics_of_sets_value_a_team_in_any_order(kind):
+    critic, state = make_critic(kind, 4), torch.randn(6, SHARED + 4 * SIZE + REST)
+    rows = state[:, SHARED : SHARED + 4 * SIZE].reshape(6, 4, SIZE)[:, torch.randperm(4)]
+    permuted = torch.cat([state[:, :SHARED], rows.reshape(6, -1), state[:, -REST:]], -1)
+    torch.testing.assert_close(critic(permuted), critic(state))
+    assert critic(state).shape == (6, 4, 1)
+
+
+@pytest.mark.parametrize("kind", ["set", "attention"])
+def test_weights_of_such_critics_fit_any_team(kind):
+    shapes = [{name: p.shape for name, p in make_critic(kind, n).team.named_parameters()} for n in (2, 6)]
+    assert shapes[0] == shapes[1]
