@@ -84,6 +84,7 @@ class EnvConfig(Section):
     num_threads: Int = Field(0, ge=0, description="threads that step them; 0: one for each CPU")
     episode_seconds: Float = Field(8.0, gt=0, description="[s] time limit of an episode")
     policy_hz: Float = Field(50.0, gt=0, description="[Hz] rate of actions and observations")
+    history: Int = Field(1, ge=1, le=50, description="steps that an observation holds, the newest first")
 
 
 class SimConfig(Section):

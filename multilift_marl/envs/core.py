@@ -19,7 +19,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.failures import CAUSES, DIVERGED
-from multilift_marl.tasks.observations import observation_names, state_size
+from multilift_marl.tasks.observations import observation_names, remember, state_size
 
 TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
 
@@ -67,16 +67,18 @@ class MultiliftVec:
         self.task = task(config, self.world, self.reference)
         self.action_names = self.pilot.action_names
         self.action_size = len(self.action_names)
-        self.observation_names = observation_names(self.action_size, task.EXTRA)
+        history = config.env.history
+        self.observation_names = observation_names(self.action_size, task.EXTRA, history)
         self.observation_size = len(self.observation_names)
         self.state_size = state_size(n, self.action_size) + task.EXTRA_STATE
         self.reward_terms, self.failure_causes = tuple(task.REWARD), CAUSES
         self._action = np.zeros((e, n, self.action_size))
         self._previous = np.zeros_like(self._action)
-        self._observation = np.zeros((e, n, self.observation_size), np.float32)
+        self._observation = np.zeros((e, n, self.observation_size // history), np.float32)
+        self._told = self._observation if history == 1 else np.zeros((e, n, self.observation_size), np.float32)
         self._state = np.zeros((e, self.state_size), np.float32)
         self._starts = Episodes(
-            config, self.world, self.task, (self.action_size, self.observation_size, self.state_size)
+            config, self.world, self.task, (self.action_size, self._observation.shape[2], self.state_size)
         )
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
@@ -143,12 +145,12 @@ class MultiliftVec:
         self._ended = terminated | truncated
         reward = np.repeat(self.task.terms.sum(axis=1, dtype=np.float64)[:, None], self.num_drones, axis=1)
         info = self._info(terminated, truncated)
-        return self._observation.copy(), reward.astype(np.float32), terminated, truncated, info
+        return self._told.copy(), reward.astype(np.float32), terminated, truncated, info
 
     def current(self) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observation (E, N, D) and info of the episodes in progress, as `reset` does, and change nothing."""
         none = np.zeros(self.num_envs, bool)
-        return self._observation.copy(), self._info(none, none)
+        return self._told.copy(), self._info(none, none)
 
     @property
     def ended(self) -> np.ndarray:
@@ -172,7 +174,7 @@ class MultiliftVec:
         saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
         saved |= self.pilot.state_dict()
         saved |= {f"imperfections.{key}": array.copy() for key, array in self._starts.imperfections.arrays().items()}
-        for name in ("_action", "_observation", "_state", "seeds", "episodes", "steps", "_ended"):
+        for name in ("_action", "_observation", "_told", "_state", "seeds", "episodes", "steps", "_ended"):
             saved[name] = getattr(self, name).copy()
         return saved
 
@@ -213,6 +215,7 @@ class MultiliftVec:
         for e in chosen:
             self.pilot.start(e)
             self.task.observe(e, e + 1, self._action, self._observation, self._state)
+            self._told[e] = np.tile(self._observation[e], self.config.env.history)
 
     def _bind(self) -> None:
         """Bind what is called in every step to its arrays, for each shard."""
@@ -223,6 +226,8 @@ class MultiliftVec:
             span = (shard.lo, shard.hi)
             act, follow = self.pilot.bind(*span, flown, self.task.way, self.task.planner(*span))
             after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
+            if self._told is not self._observation:
+                after.append(bind(remember, *span, self._observation, self._told))
             before: tuple[Call, ...] = (act,)
             if through.slow:
                 send, arguments = through.send(*span, self._action)

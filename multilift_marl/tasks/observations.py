@@ -61,15 +61,29 @@ def drone_numbers(num_drones: int, action_size: int) -> DroneNumbers:
     return DroneNumbers(_STATE_SHARED, num_drones, _STATE_DRONE + action_size)
 
 
-def observation_names(action_size: int, extra: tuple[Component, ...] = ()) -> tuple[str, ...]:
-    """Return the name of every number in an observation, such as "velocity_1".
+def observation_names(action_size: int, extra: tuple[Component, ...] = (), history: int = 1) -> tuple[str, ...]:
+    """Return the name of every number in an observation, such as "velocity_1", or "velocity_1@-2" of two steps ago.
 
     Args:
         action_size: numbers of an action.
         extra: what a task adds.
+        history: how many steps it holds, the newest first.
     """
     components = (*OBSERVATION[:-1], OBSERVATION[-1]._replace(size=action_size), *extra)
-    return tuple(f"{part.name}_{i}" for part in components for i in range(part.size))
+    names = [f"{part.name}_{i}" for part in components for i in range(part.size)]
+    return tuple(name + (f"@-{step}" if step else "") for step in range(history) for name in names)
+
+
+@kernel
+def remember(lo, hi, observation, told):
+    """Put the newest observations (E, N, D) before what the drones were told earlier (E, N, H D) and drop the oldest."""
+    size = observation.shape[2]
+    for e in range(lo, hi):
+        for n in range(observation.shape[1]):
+            for k in range(told.shape[2] - 1, size - 1, -1):
+                told[e, n, k] = told[e, n, k - size]
+            for k in range(size):
+                told[e, n, k] = observation[e, n, k]
 
 
 def state_size(num_drones: int, action_size: int) -> int:
