@@ -76,7 +76,7 @@ def observation_names(action_size: int, extra: tuple[Component, ...] = (), histo
 
 @kernel
 def remember(lo, hi, observation, told):
-    """Put the newest observations (E, N, D) before what the drones were told earlier (E, N, H D) and drop the oldest."""
+    """Put the newest observations (E, N, D) before those told earlier (E, N, H D) and drop the oldest."""
     size = observation.shape[2]
     for e in range(lo, hi):
         for n in range(observation.shape[1]):
