@@ -152,7 +152,7 @@ class CentralCritic(nn.Module):
         super().__init__()
         self.normalizer, self.value_norm = Normalizer(state_size), value_norm
         self.kind, self.drones = kind, drones
-        inputs = state_size if kind == "flat" else state_size - (drones.count - 1) * drones.size
+        inputs = state_size if kind == "flat" else state_size - (drones.rows - 1) * drones.size
         self.team = TeamNet("local" if kind == "flat" else kind, inputs, hidden, 1, gain=0.1)
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:

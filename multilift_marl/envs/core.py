@@ -54,28 +54,27 @@ class MultiliftVec:
             raise ConfigError(f"first_env must not be negative, but is {first_env}")
         task = find_task(config.task)
         self.config, self.purpose, self.first_env = config, purpose, first_env
-        system = config.system
-        self.num_envs, self.num_drones = config.env.num_envs, system.num_drones
+        self.num_envs, self.num_drones = e, n = config.env.num_envs, config.system.num_drones
         self.control_ticks = whole_ratio(config.sim.control_hz, config.env.policy_hz, "env.policy_hz", "sim.control_hz")
         self.max_steps = round(config.env.episode_seconds * config.env.policy_hz)
         if self.max_steps < 1:
             raise ConfigError(f"env.episode_seconds={config.env.episode_seconds} is shorter than one step; raise it")
-        e, n = self.num_envs, self.num_drones
-        self.world = World(system, e, config.env.num_threads)
+        self.world = World(config.system, e, config.env.num_threads)
         self.pilot = Pilot(config, self.world)
         self.reference = self.pilot.reference
         self.task = task(config, self.world, self.reference)
         self.action_names = self.pilot.action_names
         self.action_size = len(self.action_names)
-        history = config.env.history
-        self.observation_names = observation_names(self.action_size, task.EXTRA, history)
+        self.observation_names = observation_names(self.action_size, task.EXTRA, config.env.history)
         self.observation_size = len(self.observation_names)
         self.state_size = state_size(n, self.action_size) + task.EXTRA_STATE
         self.reward_terms, self.failure_causes = tuple(task.REWARD), CAUSES
         self._action = np.zeros((e, n, self.action_size))
         self._previous = np.zeros_like(self._action)
-        self._observation = np.zeros((e, n, self.observation_size // history), np.float32)
-        self._told = self._observation if history == 1 else np.zeros((e, n, self.observation_size), np.float32)
+        self._observation = np.zeros((e, n, self.observation_size // config.env.history), np.float32)
+        self._told = (
+            self._observation if config.env.history == 1 else np.zeros((e, n, self.observation_size), np.float32)
+        )
         self._state = np.zeros((e, self.state_size), np.float32)
         self._starts = Episodes(
             config, self.world, self.task, (self.action_size, self._observation.shape[2], self.state_size)

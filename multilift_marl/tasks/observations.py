@@ -49,10 +49,10 @@ _STATE_DRONE = 18  # numbers for each drone, beside its action
 
 
 class DroneNumbers(NamedTuple):
-    """Where the numbers of the drones stand in the global state: `count` rows of `size` from `first` on."""
+    """Where the numbers of the drones stand in the global state: `rows` rows of `size` from `first` on."""
 
     first: int
-    count: int
+    rows: int
     size: int
 
 
@@ -88,8 +88,8 @@ def remember(lo, hi, observation, told):
 
 def state_size(num_drones: int, action_size: int) -> int:
     """Return how many numbers the global state holds."""
-    first, count, size = drone_numbers(num_drones, action_size)
-    return first + count * size
+    first, rows, size = drone_numbers(num_drones, action_size)
+    return first + rows * size
 
 
 @kernel
