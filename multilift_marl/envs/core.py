@@ -72,9 +72,7 @@ class MultiliftVec:
         self._action = np.zeros((e, n, self.action_size))
         self._previous = np.zeros_like(self._action)
         self._observation = np.zeros((e, n, self.observation_size // config.env.history), np.float32)
-        self._told = (
-            self._observation if config.env.history == 1 else np.zeros((e, n, self.observation_size), np.float32)
-        )
+        self._told = self._observation if config.env.history == 1 else np.tile(self._observation, config.env.history)
         self._state = np.zeros((e, self.state_size), np.float32)
         self._starts = Episodes(
             config, self.world, self.task, (self.action_size, self._observation.shape[2], self.state_size)
