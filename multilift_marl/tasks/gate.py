@@ -93,7 +93,7 @@ class Gate(Task):
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("target_velocity", 2, "slot", "m/s", "horizontal velocity of the target"),
         Component("gap", 2, "slot", "m", "own position minus the middle of the next gap, from above"),
-        Component("clearance", 1, "-", "m", "least room between the team and the next wall's edges, within ± 0.5"),
+        Component("clearance", 1, "-", "m", "own room to the next wall's edges, within ± 0.5"),
     )
     EXTRA_STATE: ClassVar[int] = 6
     KEPT: ClassVar[tuple[str, ...]] = ("gap_y",)
@@ -245,13 +245,10 @@ def _least_room(e, state, gates, bodies):
 
 
 @kernel
-def _spread(e, g, state, gates, bodies):
-    """Return the room [m] that the team would have in gap g if it flew straight on: what it must gain to pass."""
-    room = 1.0
-    for n in range(bodies.anchors.shape[0]):
-        across = abs(state.drone_position[e, n, 1] - gates.y[e, g])
-        room = min(room, gates.half_width - across - _reach(mat(state.drone_rotation, e, n), bodies.drone[n], 1))
-    return room
+def _clearance(e, n, g, state, gates, bodies):
+    """Return the room [m] that a drone would have in gap g if it flew straight on; below 0 it would hit the wall."""
+    across = abs(state.drone_position[e, n, 1] - gates.y[e, g])
+    return gates.half_width - across - _reach(mat(state.drone_rotation, e, n), bodies.drone[n], 1)
 
 
 @kernel
@@ -262,13 +259,12 @@ def _tell(lo, hi, state, seen, goal, gates, bodies, observation, critic):
         told = critic[e, critic.shape[1] - 6 :]
         put(told[0:3], row(goal.velocity, e))
         put(told[3:6], sub(row(state.payload_position, e), middle))
-        room = min(max(_spread(e, g, seen, gates, bodies), -0.5), 0.5)
         for n in range(observation.shape[1]):
             c, s = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
             own = observation[e, n, observation.shape[2] - 5 :]
             own[0], own[1] = turn(c, s, row(goal.velocity, e))[:2]
             own[2], own[3] = turn(c, s, sub(vec(seen.drone_position, e, n), middle))[:2]
-            own[4] = room
+            own[4] = min(max(_clearance(e, n, g, seen, gates, bodies), -0.5), 0.5)
 
 
 @kernel
@@ -280,10 +276,13 @@ def _score(
         slip = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
         g = _next(e, state.payload_position[e, 0], gates)
         near = abs(state.payload_position[e, 0] - gates.x[g]) < 1.0
-        lacking = max(0.05 - _spread(e, g, state, gates, bodies), 0.0) if near else 0.0
+        passing, count = 0.0, action.shape[1]
+        for n in range(count):
+            lacking = max(0.05 - _clearance(e, n, g, state, gates, bodies), 0.0) if near else 0.0
+            passing += tolerance(lacking, 0.1) / count
         terms[e, 0] = weights[0] * tolerance(distance, 0.25)
         terms[e, 1] = weights[1] * tolerance(distance, 0.05)
-        terms[e, 2] = weights[2] * tolerance(lacking, 0.1)
+        terms[e, 2] = weights[2] * passing
         terms[e, 3] = weights[3] * tolerance(slip, 0.2)
         terms[e, 4] = weights[4] * mean_change(e, action, previous)
         arrived = time[e] >= success[1] and distance <= success[0]
