@@ -275,10 +275,10 @@ def _score(
         distance = errors.distance[e]
         slip = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
         g = _next(e, state.payload_position[e, 0], gates)
-        near = abs(state.payload_position[e, 0] - gates.x[g]) < 1.0
+        before = state.payload_position[e, 0] < gates.x[g] + 0.5
         passing, count = 0.0, action.shape[1]
         for n in range(count):
-            lacking = max(0.05 - _clearance(e, n, g, state, gates, bodies), 0.0) if near else 0.0
+            lacking = max(0.05 - _clearance(e, n, g, state, gates, bodies), 0.0) if before else 0.0
             passing += tolerance(lacking, 0.1) / count
         terms[e, 0] = weights[0] * tolerance(distance, 0.25)
         terms[e, 1] = weights[1] * tolerance(distance, 0.05)
