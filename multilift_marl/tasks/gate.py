@@ -279,7 +279,7 @@ def _score(
         passing, count = 0.0, action.shape[1]
         for n in range(count):
             lacking = max(0.05 - _clearance(e, n, g, state, gates, bodies), 0.0) if before else 0.0
-            passing += tolerance(lacking, 0.1) / count
+            passing += tolerance(lacking, 0.25) / count
         terms[e, 0] = weights[0] * tolerance(distance, 0.25)
         terms[e, 1] = weights[1] * tolerance(distance, 0.05)
         terms[e, 2] = weights[2] * passing
