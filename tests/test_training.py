@@ -13,11 +13,18 @@ from multilift_marl.agents.trainer import resume_run
 from multilift_marl.config import load_config
 
 
-@pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
-def test_ten_iterations_equal_five_a_stop_and_five_more(tmp_path, algorithm):
-    whole = make_trainer(tmp_path, **{"train.algorithm": algorithm})
+@pytest.mark.parametrize(
+    "kind",
+    [
+        {"train.algorithm": "mappo", "train.noise_time": 0.2},
+        {"train.algorithm": "ippo", "env.history": 2},
+        {"train.actor": "attention", "train.critic": "set"},
+    ],
+)
+def test_ten_iterations_equal_five_a_stop_and_five_more(tmp_path, kind):
+    whole = make_trainer(tmp_path, **kind)
     assert whole.run()
-    half = make_trainer(tmp_path, **{"train.algorithm": algorithm})
+    half = make_trainer(tmp_path, **kind)
     step = half.step
 
     def stop_after_five():

@@ -23,7 +23,7 @@ from multilift_marl.errors import CheckpointError, ConfigError
 from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
-_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best")
+_NEEDED = ("noise", "loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best")
 
 
 class Trainer:
@@ -165,6 +165,7 @@ class Trainer:
     def _training_state(self) -> dict[str, Any]:
         """Return what else training depends on."""
         return {
+            "noise": self.learner.explorer.noise,
             "loss": self.learner.loss.state_dict(),  # actor and critic with normalisers, value normaliser
             "optimizer": self.learner.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
@@ -189,6 +190,7 @@ class Trainer:
     def _load(self, content: dict[str, Any]) -> None:
         self.learner.loss.load_state_dict(content["loss"])
         self.learner.optimizer.load_state_dict(content["optimizer"])
+        self.learner.explorer.noise = content["noise"]
         self.env.set_state(content["env"])
         self._returns[:] = content["returns"].numpy()
         self.iteration, self.seconds, self.best = content["iteration"], content["seconds"], tuple(content["best"])
