@@ -66,7 +66,8 @@ class Trainer:
         if checkpoint is None:
             self.env.vec.stagger()
         else:
-            torch.set_rng_state(checkpoint["rng"])
+            torch.set_rng_state(checkpoint["rng"])  # after the collector's trial of the policy
+            self.learner.explorer.noise = checkpoint["noise"]
 
     def run(self) -> bool:
         """Train to the end; return False if the user stopped it. Ctrl-C saves and stops, a second one stops at once."""
@@ -190,7 +191,6 @@ class Trainer:
     def _load(self, content: dict[str, Any]) -> None:
         self.learner.loss.load_state_dict(content["loss"])
         self.learner.optimizer.load_state_dict(content["optimizer"])
-        self.learner.explorer.noise = content["noise"]
         self.env.set_state(content["env"])
         self._returns[:] = content["returns"].numpy()
         self.iteration, self.seconds, self.best = content["iteration"], content["seconds"], tuple(content["best"])
