@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.modules import PopArtValueNorm
 
-from multilift_marl.agents.networks import Actor, CentralCritic, Explorer
+from multilift_marl.agents.networks import Actor, CentralCritic
 from multilift_marl.tasks.observations import DroneNumbers
 
 KINDS = ("local", "set", "attention")
@@ -61,17 +61,3 @@ def test_critics_of_sets_value_a_team_in_any_order(kind):
 def test_weights_of_such_critics_fit_any_team(kind):
     shapes = [{name: p.shape for name, p in make_critic(kind, n).team.named_parameters()} for n in (2, 6)]
     assert shapes[0] == shapes[1]
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.9])
-def test_exploration_keeps_the_distribution_of_the_policy_and_is_correlated_as_asked(correlation):
-    torch.manual_seed(0)
-    explorer = Explorer((500, 2, 3), correlation)
-    mean, deviation = torch.full((500, 2, 3), 2.0), torch.full((500, 2, 3), 0.5)
-    drawn = torch.stack([explorer(mean, deviation)[0] for _ in range(40)])
-    assert drawn.mean() == pytest.approx(2.0, abs=0.02)
-    assert drawn.std() == pytest.approx(0.5, rel=0.02)
-    noise = (drawn - 2.0) / 0.5
-    assert (noise[1:] * noise[:-1]).mean() == pytest.approx(correlation, abs=0.02)
-    action, log_prob = explorer(mean, deviation)
-    torch.testing.assert_close(log_prob, torch.distributions.Normal(mean, deviation).log_prob(action).sum(-1))

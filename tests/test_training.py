@@ -16,7 +16,7 @@ from multilift_marl.config import load_config
 @pytest.mark.parametrize(
     "kind",
     [
-        {"train.algorithm": "mappo", "train.noise_time": 0.2},
+        {"train.algorithm": "mappo"},
         {"train.algorithm": "ippo", "env.history": 2},
         {"train.actor": "attention", "train.critic": "set"},
     ],

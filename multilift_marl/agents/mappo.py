@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, PopArtValueNorm, ProbabilisticActor
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.value import MultiAgentGAE
 
-from multilift_marl.agents.networks import Actor, CentralCritic, Explorer, LocalCritic
+from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic
 from multilift_marl.config.schema import TrainConfig
 from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.torchrl_env import MultiliftEnv
@@ -28,8 +27,7 @@ class Learner:
     config: TrainConfig
     actor: Actor
     critic: CentralCritic | LocalCritic
-    explorer: Explorer
-    policy: TensorDictSequential
+    policy: ProbabilisticActor
     loss: MAPPOLoss
     advantage: MultiAgentGAE
     optimizer: torch.optim.Adam
@@ -42,19 +40,14 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     base = torch.from_numpy(residual_matrix(config.residual, vec))
     actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
     agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
-    mean = TensorDictModule(actor, in_keys=[agents["observation"]], out_keys=[agents["loc"], agents["scale"]])
-    chance = ProbabilisticActor(
-        mean,
+    policy = ProbabilisticActor(
+        TensorDictModule(actor, in_keys=[agents["observation"]], out_keys=[agents["loc"], agents["scale"]]),
         in_keys=[agents["loc"], agents["scale"]],
         out_keys=[agents["action"]],
         distribution_class=IndependentNormal,
         return_log_prob=True,
         log_prob_key=("agents", "action_log_prob"),
     )
-    correlation = math.exp(-vec.task.dt / config.noise_time) if config.noise_time > 0 else 0.0
-    explorer = Explorer((vec.num_envs, vec.num_drones, vec.action_size), correlation)
-    drawn = [agents["action"], ("agents", "action_log_prob")]
-    policy = TensorDictSequential(mean, TensorDictModule(explorer, [agents["loc"], agents["scale"]], drawn))
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
@@ -70,7 +63,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     # 3. The loss and the advantage estimator. Time-outs are bootstrapped: only `terminated` ends a return.
     keys = {"value": agents["state_value"], "reward": agents["reward"], "done": "done", "terminated": "terminated"}
     loss = (MAPPOLoss if config.algorithm == "mappo" else IPPOLoss)(
-        chance, value, value_norm=value_norm, clip_epsilon=config.clip,
+        policy, value, value_norm=value_norm, clip_epsilon=config.clip,
         entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.value_weight,
         loss_critic_type="l2", normalize_advantage=False,
     )  # fmt: skip
@@ -78,7 +71,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     advantage = MultiAgentGAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=value)
     advantage.set_keys(**keys)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate, eps=1e-5)
-    return Learner(config, actor, critic, explorer, policy, loss, advantage, optimizer)
+    return Learner(config, actor, critic, policy, loss, advantage, optimizer)
 
 
 def update(learner: Learner, batch: TensorDict) -> dict[str, float]:

@@ -132,33 +132,6 @@ class Actor(nn.Module):
         return mean, self.log_std.exp().expand_as(mean)
 
 
-class Explorer(nn.Module):
-    """Draws actions about the mean, each from the policy's Gaussian but close to the last one's draw.
-
-    The references that actions set are smoothed: noise that is new at every step would hardly move a drone. Correlated
-    noise does, and PPO takes it as it is (Eberhard et al. 2023, Hollenstein et al. 2024).
-
-    Args:
-        shape: of the noise (E, N, A).
-        correlation: of two successive steps; 0 for independent draws.
-    """
-
-    noise: torch.Tensor
-
-    def __init__(self, shape: Sequence[int], correlation: float):
-        super().__init__()
-        self.correlation = correlation
-        self.register_buffer("noise", torch.randn(*shape))
-
-    @torch.no_grad()
-    def forward(self, mean: torch.Tensor, deviation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return actions (E, N, A) and their log-probabilities (E, N)."""
-        fresh = math.sqrt(1 - self.correlation**2)
-        self.noise = self.correlation * self.noise + fresh * torch.randn_like(self.noise)
-        log_prob = -0.5 * self.noise**2 - deviation.log() - 0.5 * math.log(2 * math.pi)
-        return mean + deviation * self.noise, log_prob.sum(-1)
-
-
 class CentralCritic(nn.Module):
     """Value of the team from the global state: (..., S) to (..., N, 1), the same for every drone (MAPPO).
 

@@ -23,7 +23,7 @@ from multilift_marl.errors import CheckpointError, ConfigError
 from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
-_NEEDED = ("noise", "loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best")
+_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best")
 
 
 class Trainer:
@@ -66,8 +66,7 @@ class Trainer:
         if checkpoint is None:
             self.env.vec.stagger()
         else:
-            torch.set_rng_state(checkpoint["rng"])  # after the collector's trial of the policy
-            self.learner.explorer.noise = checkpoint["noise"]
+            torch.set_rng_state(checkpoint["rng"])
 
     def run(self) -> bool:
         """Train to the end; return False if the user stopped it. Ctrl-C saves and stops, a second one stops at once."""
@@ -166,7 +165,6 @@ class Trainer:
     def _training_state(self) -> dict[str, Any]:
         """Return what else training depends on."""
         return {
-            "noise": self.learner.explorer.noise,
             "loss": self.learner.loss.state_dict(),  # actor and critic with normalisers, value normaliser
             "optimizer": self.learner.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
