@@ -1,0 +1,177 @@
+"""Train the recipes, judge learned and scripted teams on the same episodes, and rebuild the tables from what they did.
+
+  python results/reproduce.py train gate [seed ...]     train configs/gate.yaml; keep curve and weights in results/gate/
+  python results/reproduce.py judge [flight ...]        1000 episodes of every team -> results/<flight>/<team>.json
+  python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
+  python results/reproduce.py table                     the tables of README.md and docs/tasks.md
+
+Every number in those tables comes from these files; `judge` skips files that are there already.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from multilift_marl.config.load import load_config
+from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.evaluation.metrics import summarize
+from multilift_marl.evaluation.rollout import fly_episodes
+
+HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
+EPISODES, SEED = 1000, 1000
+FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
+AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
+FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
+
+
+class Flight(NamedTuple):
+    """A row of the table."""
+
+    config: str
+    overrides: dict[str, Any]
+    recipe: str
+    """Whose policies fly it."""
+    title: str
+    published: str = ""
+
+
+FLIGHTS: dict[str, Flight] = {
+    "hover": Flight("hover", {}, "hover", "hover"),
+    "pose_easy": Flight("pose_easy", {}, "pose_easy", "pose, tilts to 20°"),
+    "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
+    "circle_slow": Flight("track_circle", {}, "track_circle", "circle, 0.2 rad/s"),
+    "circle_fast": Flight("track_circle", {"task_options.rate": 0.4}, "track_circle", "circle, 0.4 rad/s"),
+    "track": Flight("track", {}, "track", "figure-eight, 1 m/s, 0.5 m/s²", "3.2"),
+    "track_2_2": Flight("track", FASTER, "track_agile", "figure-eight, 2 m/s, 2 m/s²", "9.3"),
+    "track_2_4": Flight("track", AGILE, "track_agile", "figure-eight, 2 m/s, 4 m/s²", "11.7"),
+    "track_5_8": Flight("track", FASTEST, "track_agile", "figure-eight, 5 m/s, 8 m/s²", "19.7"),
+    "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),
+    "land": Flight("land", {}, "land", "land"),
+    "gate": Flight("gate", {}, "gate", "gate"),
+    "gate_two": Flight("gate_two", {}, "gate", "two gates"),
+    "recover": Flight("recover", {}, "recover", "recover"),
+    "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts"),
+    "loss": Flight("loss", {}, "loss", "loss, 4 drones"),
+    "loss_6": Flight("loss", {"env.num_drones": 6}, "loss_6", "loss, 6 drones"),
+    "loss_snap": Flight("loss_snap", {}, "loss", "loss with its cable"),
+}
+RECIPES: dict[str, tuple[str, dict[str, Any]]] = {  # what is trained: configuration, overrides
+    "loss_6": ("loss", {"env.num_drones": 6}),
+}
+
+
+def train(recipe: str, seeds: list[int]) -> None:
+    """Train a recipe on some seeds and keep curve and best weights of each."""
+    from multilift_marl.agents.logging import read_metrics
+    from multilift_marl.agents.policy import strip_checkpoint
+    from multilift_marl.agents.trainer import new_run
+    from multilift_marl.evaluation.plots import plot_training
+
+    name, overrides = RECIPES.get(recipe, (recipe, {}))
+    for seed in seeds:
+        trainer = new_run(load_config(name, {**overrides, "seed": seed}), recipe)
+        if not trainer.run():
+            sys.exit(f"stopped; go on with: python train.py resume={trainer.folder}")
+        folder = HERE / recipe / f"seed{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        rows = read_metrics(trainer.folder)
+        told = [row for row in rows if row["eval/success_rate"] != ""]
+        names = ("frames", "return", *(name for name in rows[0] if name.startswith("eval/")))
+        with open(folder / "curve.csv", "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, names, extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(told)
+        (folder / "training.json").write_text(
+            json.dumps({"frames": trainer.frames, "minutes": round(trainer.seconds / 60, 1)}) + "\n", encoding="utf-8"
+        )
+        plot_training(folder / "training.png", rows)
+        strip_checkpoint(trainer.folder / "checkpoints" / "best.pt", folder / "policy.pt")
+
+
+def judge(flights: list[str]) -> None:
+    """Fly what has not been flown yet."""
+    from multilift_marl.agents.policy import load_policy
+
+    for name in flights:
+        flight, folder = FLIGHTS[name], HERE / name
+        teams = {script: (lambda vec, script=script: make_scripted(script, vec)) for script in SCRIPTED}
+        for weights in sorted((HERE / flight.recipe).glob("seed*/policy.pt")):
+            policy = load_policy(weights)
+            teams[weights.parent.name] = lambda vec, policy=policy: policy
+        for team, maker in teams.items():
+            path = folder / f"{team}.json"
+            if path.is_file():
+                continue
+            config = load_config(flight.config, flight.overrides)
+            told = summarize(fly_episodes(config, maker, EPISODES, SEED))
+            folder.mkdir(parents=True, exist_ok=True)
+            content = {"episodes": EPISODES, "seed": SEED, "config": flight.config, "overrides": flight.overrides}
+            path.write_text(json.dumps(content | {"metrics": told}, indent=1) + "\n", encoding="utf-8")
+            print(f"{name}, {team}: success {told['success_rate']['mean']:.1%}", flush=True)
+
+
+def ship(recipes: list[str]) -> None:
+    """Copy the weights of seed 0 to where `ml.load_policy` finds them."""
+    for recipe in recipes:
+        shipped = ROOT / "multilift_marl" / "policies" / f"{recipe}.pt"
+        shipped.write_bytes((HERE / recipe / "seed0" / "policy.pt").read_bytes())
+
+
+def table() -> str:
+    """Return all flights as a Markdown table: success and error of each team, of learned ones the mean of all seeds."""
+    columns = ("learned", *SCRIPTED)
+    lines = [
+        f"| | {' | '.join(columns)} | published |",
+        f"|---|{'---|' * (len(columns) + 1)}",
+    ]
+    for name, flight in FLIGHTS.items():
+        error = "payload_rmse_m" if flight.config.startswith("track") else "payload_position_error_m"
+        cells = [_cell([HERE / name / f"{script}.json"], error) for script in SCRIPTED]
+        learned = _cell(sorted((HERE / name).glob("seed*.json")), error)
+        lines.append(f"| {flight.title} | {learned} | {' | '.join(cells)} | {flight.published} |")
+    return "\n".join(lines)
+
+
+def _cell(paths: list[Path], error: str) -> str:
+    """Return "success %, error cm", means of these results, each with its smallest and largest if there are more."""
+    told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in paths if path.is_file()]
+    if not told:
+        return "-"
+    parts = []
+    for metric, unit, digits in (("success_rate", "%", 1), (error, "cm", 2)):
+        values = [100 * one[metric]["mean"] for one in told]
+        mean, spread = sum(values) / len(values), f" ({min(values):.{digits}f} - {max(values):.{digits}f})"
+        parts.append(f"{mean:.{digits}f}{spread if len(values) > 1 else ''} {unit}")
+    return ", ".join(parts)
+
+
+def write_tables() -> None:
+    """Replace what stands between the markers in the documents."""
+    for path in (ROOT / "README.md", ROOT / "docs" / "tasks.md"):
+        text = path.read_text(encoding="utf-8")
+        marked = re.compile(r"(<!-- results -->\n).*?(\n<!-- end of results -->)", re.DOTALL)
+        path.write_text(marked.sub(lambda found: found[1] + table() + found[2], text), encoding="utf-8")
+
+
+def main(arguments: list[str]) -> None:
+    """Do what is asked."""
+    what, *rest = arguments or ["help"]
+    if what == "train" and rest:
+        train(rest[0], [int(seed) for seed in rest[1:]] or [0])
+    elif what == "judge":
+        judge(rest or list(FLIGHTS))
+    elif what == "ship" and rest:
+        ship(rest)
+    elif what == "table":
+        write_tables()
+    else:
+        sys.exit(__doc__)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
