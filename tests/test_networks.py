@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.modules import PopArtValueNorm
 
-from multilift_marl.agents.networks import Actor, CentralCritic
+from multilift_marl.agents.networks import Actor, CentralCritic, draw_action
 from multilift_marl.tasks.observations import DroneNumbers
 
 KINDS = ("local", "set", "attention")
@@ -61,3 +61,12 @@ def test_critics_of_sets_value_a_team_in_any_order(kind):
 def test_weights_of_such_critics_fit_any_team(kind):
     shapes = [{name: p.shape for name, p in make_critic(kind, n).team.named_parameters()} for n in (2, 6)]
     assert shapes[0] == shapes[1]
+
+
+def test_actions_are_drawn_from_the_gaussian_that_their_probability_says():
+    torch.manual_seed(0)
+    mean, deviation = torch.full((20000, 2, 3), 2.0), torch.tensor([0.5, 1.0, 0.1]).expand(20000, 2, 3)
+    action, log_prob = draw_action(mean, deviation)
+    torch.testing.assert_close(log_prob, torch.distributions.Normal(mean, deviation).log_prob(action).sum(-1))
+    torch.testing.assert_close(action.std((0, 1)), deviation[0, 0], rtol=0.02, atol=0)
+    torch.testing.assert_close(action.mean((0, 1)), mean[0, 0], rtol=0.01, atol=0)

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.modules import IndependentNormal, PopArtValueNorm, ProbabilisticActor
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.value import MultiAgentGAE
 
-from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic
+from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, draw_action
 from multilift_marl.config.schema import TrainConfig
 from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.torchrl_env import MultiliftEnv
@@ -27,7 +27,7 @@ class Learner:
     config: TrainConfig
     actor: Actor
     critic: CentralCritic | LocalCritic
-    policy: ProbabilisticActor
+    policy: TensorDictSequential
     loss: MAPPOLoss
     advantage: MultiAgentGAE
     optimizer: torch.optim.Adam
@@ -40,14 +40,13 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     base = torch.from_numpy(residual_matrix(config.residual, vec))
     actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
     agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
-    policy = ProbabilisticActor(
-        TensorDictModule(actor, in_keys=[agents["observation"]], out_keys=[agents["loc"], agents["scale"]]),
-        in_keys=[agents["loc"], agents["scale"]],
-        out_keys=[agents["action"]],
-        distribution_class=IndependentNormal,
-        return_log_prob=True,
-        log_prob_key=("agents", "action_log_prob"),
-    )
+    drawn, gaussian = [agents["action"], ("agents", "action_log_prob")], [agents["loc"], agents["scale"]]
+    mean = TensorDictModule(actor, in_keys=[agents["observation"]], out_keys=gaussian)
+    policy = TensorDictSequential(mean, TensorDictModule(draw_action, in_keys=gaussian, out_keys=drawn))
+    judged = ProbabilisticActor(
+        mean, in_keys=gaussian, out_keys=drawn[:1], distribution_class=IndependentNormal, return_log_prob=True,
+        log_prob_key=drawn[1],
+    )  # fmt: skip
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
@@ -63,7 +62,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     # 3. The loss and the advantage estimator. Time-outs are bootstrapped: only `terminated` ends a return.
     keys = {"value": agents["state_value"], "reward": agents["reward"], "done": "done", "terminated": "terminated"}
     loss = (MAPPOLoss if config.algorithm == "mappo" else IPPOLoss)(
-        policy, value, value_norm=value_norm, clip_epsilon=config.clip,
+        judged, value, value_norm=value_norm, clip_epsilon=config.clip,
         entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.value_weight,
         loss_critic_type="l2", normalize_advantage=False,
     )  # fmt: skip

@@ -132,6 +132,14 @@ class Actor(nn.Module):
         return mean, self.log_std.exp().expand_as(mean)
 
 
+@torch.no_grad()
+def draw_action(mean: torch.Tensor, deviation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return actions (..., N, A) drawn from a Gaussian and their log-probabilities (..., N)."""
+    noise = torch.randn_like(mean)
+    log_prob = -0.5 * noise**2 - deviation.log() - 0.5 * math.log(2 * math.pi)
+    return mean + deviation * noise, log_prob.sum(-1)
+
+
 class CentralCritic(nn.Module):
     """Value of the team from the global state: (..., S) to (..., N, 1), the same for every drone (MAPPO).
 

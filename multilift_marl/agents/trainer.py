@@ -39,7 +39,8 @@ class Trainer:
         torch.set_num_threads(1)
         torch.manual_seed(config.seed)
         self.config, self.folder = config, folder
-        self.env = MultiliftEnv(config)
+        eased = {f"task_options.{key}": value for key, value in config.train.task_options.items()}
+        self.env = MultiliftEnv(build_config(config.model_dump(), eased))
         self.learner = make_learner(config.train, self.env)
         self.frames_per_batch = config.env.num_envs * config.train.horizon
         if config.train.minibatches > self.frames_per_batch:
