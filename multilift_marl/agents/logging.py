@@ -6,13 +6,12 @@ import csv
 import json
 import platform
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-_PACKAGES = ("multilift_marl", "numpy", "mujoco", "numba", "torch", "torchrl", "tensordict", "gymnasium", "pettingzoo")
+from multilift_marl.agents.versions import package_versions
 
 
 class RunLog:
@@ -74,20 +73,13 @@ def write_versions(folder: Path) -> None:
                 "python": platform.python_version(),
                 "platform": platform.platform(),
                 "cpu": _cpu(),
-                "packages": {name: _version(name) for name in _PACKAGES},
+                "packages": package_versions(),
             },
             indent=2,
         )
         + "\n",
         encoding="utf-8",
     )
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def _git_commit() -> str | None:

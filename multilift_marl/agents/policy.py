@@ -31,6 +31,7 @@ class LearnedPolicy:
     Attributes:
         config: the configuration it was trained with.
         observation_names, action_names: what its inputs and outputs mean.
+        frames: environment steps that it was trained for.
         source: as given.
         actor: the network.
 
@@ -42,7 +43,7 @@ class LearnedPolicy:
     def __init__(self, content: dict[str, Any], source: str):
         self.config = build_config(content["config"])
         self.observation_names, self.action_names = tuple(content["observation_names"]), tuple(content["action_names"])
-        self.source = source
+        self.source, self.frames = source, int(content["frames"])
         weights, size = content["actor"], (len(self.observation_names), len(self.action_names))
         train = self.config.train
         with torch.random.fork_rng(devices=[]):  # initial weights, overwritten at once, must not cost random numbers

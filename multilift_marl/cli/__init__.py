@@ -1,1 +1,1 @@
-"""The command line: train and evaluate."""
+"""The command line: train, evaluate, export."""

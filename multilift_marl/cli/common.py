@@ -1,4 +1,4 @@
-"""What both commands share: key=value arguments, errors in one sentence, help."""
+"""What the commands share: key=value arguments, errors in one sentence, help."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from multilift_marl.config.load import check_names, explain, parse_overrides
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install
 from multilift_marl.tasks import TASKS
 
+_EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  # of all other packages: train
+
 
 def run_command(
-    main: Callable[[dict[str, Any]], int], usage: str, own: Iterable[str], arguments: Sequence[str] | None
-) -> int:
+    main: Callable[[dict[str, Any]], int], usage: str, own: Iterable[str], arguments: Sequence[str] | None,
+    configurable: bool = True,
+) -> int:  # fmt: skip
     """Run a command on key=value arguments and return its exit status; a user's error is one sentence on stderr.
 
     Args:
@@ -23,11 +26,14 @@ def run_command(
         usage: the head of its help.
         own: its keys beside those of a configuration.
         arguments: None for those of this process.
+        configurable: whether its help lists the keys of a configuration.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         if any(argument in ("-h", "--help") for argument in arguments):
-            _explain(usage)
+            print(usage)
+            if configurable:
+                _explain_configuration()
             status = 0
         else:
             values = parse_overrides(arguments)
@@ -39,9 +45,10 @@ def run_command(
         print(f"error: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] == "multilift_marl":
+        package = (error.name or "").split(".")[0]
+        if package == "multilift_marl":
             raise
-        print(f"error: {error.name} is missing; {pip_install('train')}", file=sys.stderr)
+        print(f"error: {error.name} is missing; {pip_install(_EXTRAS.get(package, 'train'))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
@@ -57,8 +64,8 @@ def announce_compiling() -> None:
         print("compiling the simulation, which takes about a minute the first time", flush=True)
 
 
-def _explain(usage: str) -> None:
-    print(f"{usage}\n\nConfiguration keys (default, meaning; - stands for none):\n{explain()}")
+def _explain_configuration() -> None:
+    print(f"\nConfiguration keys (default, meaning; - stands for none):\n{explain()}")
     for name, task in TASKS.items():
         print(f"\nTask {name}:\n{explain(task.Options, 'task_options.')}")
         print("\n".join(f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in task.REWARD.items()))

@@ -19,6 +19,7 @@ from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import Goal, Reference, leave_goal, smooth, smooth_moving
 from multilift_marl.control.gains import Gains, drone_gains
 from multilift_marl.control.geometric import control, fly, hook_moment
+from multilift_marl.control.scales import THRUST, YAW_RATE, Number, along, turning
 from multilift_marl.control.setpoints import (
     STILL,
     Setpoint,
@@ -54,11 +55,11 @@ class Interface:
     """An action interface.
 
     Class attributes:
-        names: of the numbers of an action.
+        numbers: of an action, each with its frame, unit and full scale.
         rejects: values of `control.disturbance` that go with it, beside "none".
     """
 
-    names: ClassVar[tuple[str, ...]]
+    numbers: ClassVar[tuple[Number, ...]]
     rejects: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: ControlConfig, dt: float):
@@ -76,15 +77,18 @@ class Interface:
         """Return the same as `follow` for goals that move, by calling `plan`, at every control step."""
         return plan, *self.follow(lo, hi, team)
 
+    def thrusts(self, team: Team) -> np.ndarray:
+        """Return the thrusts (E, N, K) [N] that the last action set itself, K of its numbers."""
+        return team.thrust[..., :0]
+
 
 class ReferenceAction(Interface):
-    """Offset of the drone's slot in the formation about the target payload pose; zero is the scripted formation.
+    """Offset of the drone's slot in the formation about the target payload pose; zero is the scripted formation."""
 
-    Outward, sideways and upward offset, each ± control.max_offset [m], and yaw relative to the target's, ±
-    control.max_yaw [rad].
-    """
-
-    names = ("outward", "sideways", "up", "yaw")
+    numbers = (
+        *along("m", "max_offset", "offset of the own slot"),
+        Number("yaw", "target", "rad", "max_yaw", "own heading relative to the target's"),
+    )
     rejects = ("integral", "indi")
 
     def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
@@ -110,12 +114,9 @@ class ReferenceAction(Interface):
 
 
 class VelocityAction(Interface):
-    """Velocity outward, sideways and upward, and yaw rate; the velocity is smoothed at control.reference_frequency.
+    """Velocity outward, sideways and upward, and yaw rate; the velocity is smoothed at control.reference_frequency."""
 
-    Each ± control.max_velocity [m/s], ± control.max_yaw_rate [rad/s].
-    """
-
-    names = ("outward", "sideways", "up", "yaw_rate")
+    numbers = (*along("m/s", "max_velocity", "own velocity"), YAW_RATE)
     rejects = ("indi",)
 
     def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
@@ -132,12 +133,9 @@ class VelocityAction(Interface):
 
 
 class AccelerationAction(Interface):
-    """Acceleration outward, sideways and upward, and yaw rate.
+    """Acceleration outward, sideways and upward, and yaw rate."""
 
-    Each ± control.max_acceleration [m/s²], ± control.max_yaw_rate [rad/s].
-    """
-
-    names = ("outward", "sideways", "up", "yaw_rate")
+    numbers = (*along("m/s²", "max_acceleration", "own acceleration"), YAW_RATE)
     rejects = ("indi",)
 
     def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
@@ -155,11 +153,13 @@ class AccelerationAction(Interface):
 class AccRatesAction(Interface):
     """Acceleration outward, sideways and upward, and roll and pitch rates; the yaw is the target's.
 
-    Each ± control.max_acceleration [m/s²], ± control.max_tilt_rate [rad/s]. The rates are those of the attitude that
-    the acceleration asks for (Zeng et al., arXiv 2508.01522).
+    The rates are those of the attitude that the acceleration asks for (Zeng et al., arXiv 2508.01522).
     """
 
-    names = ("outward", "sideways", "up", "roll_rate", "pitch_rate")
+    numbers = (
+        *along("m/s²", "max_acceleration", "own acceleration"),
+        *turning("roll", "pitch", meaning="angular velocity of the attitude that this asks for,"),
+    )
     rejects = ("indi",)
 
     def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
@@ -177,19 +177,23 @@ class AccRatesAction(Interface):
 
 
 class CtbrAction(Interface):
-    """Collective thrust and body rates.
+    """Collective thrust and body rates; a thrust of zero is that of hovering, ± 1 the limits."""
 
-    Thrust: 0 for the hover thrust, ± 1 for the limits; roll and pitch rate ± control.max_tilt_rate, yaw rate ±
-    control.max_yaw_rate [rad/s].
-    """
-
-    names = ("thrust", "roll_rate", "pitch_rate", "yaw_rate")
+    numbers = (
+        Number("thrust", "body", "N", THRUST, "thrust of the four rotors together"),
+        *turning("roll", "pitch"),
+        *turning("yaw", limit="max_yaw_rate"),
+    )
 
     def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
         """See `Interface.act`."""
         ranges = (self.settings.max_tilt_rate, self.settings.max_yaw_rate)
         where = (team.state, team.reference, team.setpoint, team.pull)
         return bind(_command_rates, lo, hi, action, *where, team.gains, *ranges)
+
+    def thrusts(self, team: Team) -> np.ndarray:
+        """See `Interface.thrusts`."""
+        return team.setpoint.thrust[..., None]
 
     def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
         """See `Interface.follow`."""
@@ -200,11 +204,15 @@ class CtbrAction(Interface):
 class RotorAction(Interface):
     """Thrust of each rotor, zero: its own at hover, ± 1: its limits. Nothing else holds the attitude."""
 
-    names = ("rotor_0", "rotor_1", "rotor_2", "rotor_3")
+    numbers = tuple(Number(f"rotor_{k}", "body", "N", THRUST, f"thrust of rotor {k}") for k in range(4))
 
     def act(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
         """See `Interface.act`."""
         return bind(_command_rotors, lo, hi, action, team.state, team.reference, team.pull, team.thrust, team.gains)
+
+    def thrusts(self, team: Team) -> np.ndarray:
+        """See `Interface.thrusts`."""
+        return team.thrust
 
     def follow(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
         """See `Interface.follow`."""

@@ -37,7 +37,7 @@ class Pilot:
         e, n = world.num_envs, world.num_drones
         self.world = world
         self.interface = ACTIONS[settings.action](settings, dt)
-        self.action_names = self.interface.names
+        self.action_names = tuple(number.name for number in self.interface.numbers)
         self.reference, self.disturbance = Reference.zeros(e, n), None
         self._setpoint = Setpoint.zeros(e, n)
         self.gains = make_gains(settings, world.system)

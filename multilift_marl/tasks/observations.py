@@ -44,6 +44,12 @@ OBSERVATION = (
     Component("slot_direction", 2, "target", "-", "cosine and sine of the own slot's azimuth"),
     Component("previous_action", 4, "-", "-", "own last action"),  # as many as the action interface has
 )
+FRAMES = {
+    "world": "z up",
+    "target": "the world, turned about z to the heading atan2(-R01, R11) of the payload's target attitude R",
+    "slot": "x horizontal, outward from the target payload position through the drone's slot, y to the left, z up",
+    "body": "of the drone itself: x forward, y left, z along the thrust",
+}
 _STATE_SHARED = 26  # numbers of the global state that belong to no drone; see observe_team
 _STATE_DRONE = 18  # numbers for each drone, beside its action
 
@@ -61,6 +67,11 @@ def drone_numbers(num_drones: int, action_size: int) -> DroneNumbers:
     return DroneNumbers(_STATE_SHARED, num_drones, _STATE_DRONE + action_size)
 
 
+def list_components(action_size: int, extra: tuple[Component, ...] = ()) -> tuple[Component, ...]:
+    """Return what an observation holds of one step, in order; see `observation_names`."""
+    return (*OBSERVATION[:-1], OBSERVATION[-1]._replace(size=action_size), *extra)
+
+
 def observation_names(action_size: int, extra: tuple[Component, ...] = (), history: int = 1) -> tuple[str, ...]:
     """Return the name of every number in an observation, such as "velocity_1", or "velocity_1@-2" of two steps ago.
 
@@ -69,8 +80,7 @@ def observation_names(action_size: int, extra: tuple[Component, ...] = (), histo
         extra: what a task adds.
         history: how many steps it holds, the newest first.
     """
-    components = (*OBSERVATION[:-1], OBSERVATION[-1]._replace(size=action_size), *extra)
-    names = [f"{part.name}_{i}" for part in components for i in range(part.size)]
+    names = [f"{part.name}_{i}" for part in list_components(action_size, extra) for i in range(part.size)]
     return tuple(name + (f"@-{step}" if step else "") for step in range(history) for name in names)
 
 

@@ -1,0 +1,68 @@
+"""Flies an exported policy by NumPy and onnxruntime alone, without torch, and says how well.
+
+First: python -m multilift_marl.export run=hover
+Run:   python examples/fly_exported.py runs/shipped-hover/export      (a number behind it: how many episodes)
+
+The episodes are those of `python evaluate.py`. On a robot, what fills `observation` from its sensors and carries out
+the actions takes the place of the simulation; `check` and `Team` stay.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from multilift_marl.config import build_config
+from multilift_marl.evaluation.metrics import summarize
+from multilift_marl.evaluation.rollout import fly_episodes
+
+
+class Team:
+    """The policy of a folder that `python -m multilift_marl.export` wrote; the network serves any number of drones."""
+
+    def __init__(self, folder):
+        self.contract = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1  # for networks this small, more of them only wait for each other
+        path = folder / self.contract["network"]["file"]
+        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+    def act(self, observation):
+        """Return actions (batch, drones, A) in [-1, 1] for observations (batch, drones, D)."""
+        return self._session.run(["action"], {"observation": np.asarray(observation, np.float32)})[0]
+
+    def reset(self, mask=None):
+        """Forget nothing: what a policy remembers is in its observation."""
+
+
+def check(contract, vec):
+    """Refuse environments whose observations or actions are not what the contract says, number by number."""
+    for what, agreed, found in (
+        ("observation", contract["observation"]["names"], vec.observation_names),
+        ("action", [number["name"] for number in contract["action"]["numbers"]], vec.action_names),
+    ):
+        if agreed != list(found):
+            wrong = next((i for i, (a, b) in enumerate(zip(agreed, found, strict=False)) if a != b), len(agreed))
+            raise SystemExit(f"error: number {wrong} of the {what} is another one than in the contract; export it anew")
+
+
+def main(folder, episodes=20):
+    """Fly, and print success and error."""
+    team = Team(Path(folder))
+    config = build_config(team.contract["config"])
+
+    def make_policy(vec):
+        check(team.contract, vec)
+        return team
+
+    told = summarize(fly_episodes(config, make_policy, int(episodes), seed=1000))
+    success, error = told["success_rate"]["mean"], told["payload_position_error_m"]["mean"]
+    print(f"{team.contract['task']}: {episodes} episodes, success {success:.0%}, position error {100 * error:.2f} cm")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit("error: give the folder of an exported policy, such as runs/shipped-hover/export")
+    main(*sys.argv[1:])
