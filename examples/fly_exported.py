@@ -9,6 +9,7 @@ the actions takes the place of the simulation; `check` and `Team` stay.
 
 import json
 import sys
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -43,9 +44,11 @@ def check(contract, vec):
         ("observation", contract["observation"]["names"], vec.observation_names),
         ("action", [number["name"] for number in contract["action"]["numbers"]], vec.action_names),
     ):
-        if agreed != list(found):
-            wrong = next((i for i, (a, b) in enumerate(zip(agreed, found, strict=False)) if a != b), len(agreed))
-            raise SystemExit(f"error: number {wrong} of the {what} is another one than in the contract; export it anew")
+        for i, (asked, given) in enumerate(zip_longest(agreed, found, fillvalue="nothing")):
+            if asked != given:
+                raise SystemExit(
+                    f"error: number {i} of the {what} is {given}, but {asked} in the contract; export anew"
+                )
 
 
 def main(folder, episodes=20):
