@@ -46,9 +46,7 @@ def check(contract, vec):
     ):
         for i, (asked, given) in enumerate(zip_longest(agreed, found, fillvalue="nothing")):
             if asked != given:
-                raise SystemExit(
-                    f"error: number {i} of the {what} is {given}, but {asked} in the contract; export anew"
-                )
+                raise SystemExit(f"error: {what} {i} is {given}, but {asked} in the contract; export anew")
 
 
 def main(folder, episodes=20):

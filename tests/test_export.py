@@ -185,7 +185,7 @@ def test_the_example_refuses_another_order_of_observations(exported, tmp_path):
     names[0], names[1] = names[1], names[0]
     (tmp_path / "policy.json").write_text(json.dumps(contract))
     (tmp_path / "policy.onnx").write_bytes((exported / "policy.onnx").read_bytes())
-    expected = "error: number 0 of the observation is slot_error_0, but slot_error_1 in the contract; export anew\n"
+    expected = "error: observation 0 is slot_error_0, but slot_error_1 in the contract; export anew\n"
     assert fly(tmp_path).stderr == expected
 
 
