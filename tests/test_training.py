@@ -70,8 +70,8 @@ def test_a_few_iterations_improve_the_return(tmp_path):
     for _ in range(40):
         values = trainer.step()
         rewards.append(values["reward/total"])
-    print(rewards)
-    assert np.mean(rewards[-10:]) > 1.1 * np.mean(rewards[:10])
+    settled = np.mean(rewards[4:14])  # before, the episodes that were all begun at once differ
+    assert np.mean(rewards[-10:]) > 1.025 * settled, rewards  # five times what a mean of ten varies by
     assert values["explained_variance"] > 0.2
 
 
