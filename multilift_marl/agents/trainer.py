@@ -39,8 +39,7 @@ class Trainer:
         torch.set_num_threads(1)
         torch.manual_seed(config.seed)
         self.config, self.folder = config, folder
-        eased = {f"task_options.{key}": value for key, value in config.train.task_options.items()}
-        self.env = MultiliftEnv(build_config(config.model_dump(), eased))
+        self.env = MultiliftEnv(build_config(config.model_dump(), config.train.overrides))
         self.learner = make_learner(config.train, self.env)
         self.frames_per_batch = config.env.num_envs * config.train.horizon
         if config.train.minibatches > self.frames_per_batch:
