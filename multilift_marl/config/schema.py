@@ -268,7 +268,7 @@ class TrainConfig(Section):
     target_kl: Float = Field(0.03, gt=0, description="[-] approximate KL that ends an update early")
     hidden: tuple[Annotated[Int, Field(ge=1)], ...] = Field((128, 128), description="[-] widths of the hidden layers")
     initial_std: Float = Field(0.3, gt=0, description="[-] of the action distribution at the start")
-    overrides: dict[str, Any] = Field({}, description="configuration of the environment in training alone, by dotted name")
+    overrides: dict[str, Any] = Field({}, description="of the environment that it trains in, by dotted name")
     threads: Int = Field(1, ge=1, description="threads of the update; weights are bit-equal for the same number")
     checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
 
