@@ -11,6 +11,7 @@ from multilift_marl.agents.logging import RunLog, read_metrics
 from multilift_marl.agents.networks import Normalizer
 from multilift_marl.agents.trainer import resume_run
 from multilift_marl.config import load_config
+from multilift_marl.errors import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -134,3 +135,13 @@ def test_log_drops_rows_after_the_checkpoint(tmp_path):
     assert [row["iteration"] for row in rows] == ["1", "2", "3", "4"]
     assert [row["b"] for row in rows] == ["", "", "2.0", ""]
     assert rows[-1]["a"] == "9.0"
+
+
+def test_overrides_change_the_environment_of_training_alone(tmp_path):
+    trainer = make_trainer(tmp_path, **{"train.overrides": {"env.episode_seconds": 1.0, "env.num_drones": 3}})
+    assert (trainer.env.vec.max_steps, trainer.env.vec.num_drones) == (50, 3)
+    assert trainer.config.env.episode_seconds != 1.0
+    trainer.step()
+    assert trainer.evaluate()["eval/success_rate"] >= 0.0  # flown with four, for the whole time
+    with pytest.raises(ConfigError, match=r"unknown key 'env\.episode_second'; did you mean"):
+        make_trainer(tmp_path, **{"train.overrides": {"env.episode_second": 1.0}})

@@ -41,7 +41,7 @@ class Trainer:
         self.config, self.folder = config, folder
         self.env = MultiliftEnv(build_config(config.model_dump(), config.train.overrides))
         self.learner = make_learner(config.train, self.env)
-        self.frames_per_batch = config.env.num_envs * config.train.horizon
+        self.frames_per_batch = self.env.vec.num_envs * config.train.horizon
         if config.train.minibatches > self.frames_per_batch:
             raise ConfigError(
                 f"train.minibatches={config.train.minibatches} exceeds the {self.frames_per_batch} steps of a batch; "
@@ -50,7 +50,7 @@ class Trainer:
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
         self.best = (-1.0, -float("inf"))  # success, negative error
-        self._returns = np.zeros(config.env.num_envs)  # of the episodes in flight
+        self._returns = np.zeros(self.env.vec.num_envs)  # of the episodes in flight
         self._stop = False
         if checkpoint is not None:
             self._restore(checkpoint)
