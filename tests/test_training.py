@@ -9,7 +9,7 @@ from conftest import make_trainer
 
 from multilift_marl.agents.logging import RunLog, read_metrics
 from multilift_marl.agents.networks import Normalizer
-from multilift_marl.agents.trainer import resume_run
+from multilift_marl.agents.trainer import adapted_rate, resume_run
 from multilift_marl.config import load_config
 from multilift_marl.errors import ConfigError
 
@@ -17,7 +17,7 @@ from multilift_marl.errors import ConfigError
 @pytest.mark.parametrize(
     "kind",
     [
-        {"train.algorithm": "mappo"},
+        {"train.algorithm": "mappo", "train.desired_kl": 0.01},
         {"train.algorithm": "ippo", "env.history": 2},
         {"train.actor": "attention", "train.critic": "set"},
     ],
@@ -145,3 +145,13 @@ def test_overrides_change_the_environment_of_training_alone(tmp_path):
     assert trainer.evaluate()["eval/success_rate"] >= 0.0  # flown with four, for the whole time
     with pytest.raises(ConfigError, match=r"unknown key 'env\.episode_second'; did you mean"):
         make_trainer(tmp_path, **{"train.overrides": {"env.episode_second": 1.0}})
+
+
+@pytest.mark.parametrize(("kl", "factor"), [(0.03, 1 / 1.5), (0.015, 1.0), (0.01, 1.0), (0.004, 1.5)])
+def test_the_learning_rate_follows_the_desired_kl(kl, factor):
+    assert adapted_rate(1e-3, kl, 0.01) == pytest.approx(factor * 1e-3)
+
+
+def test_the_adapted_learning_rate_stays_within_bounds():
+    assert adapted_rate(1e-5, 1.0, 0.01) == 1e-5
+    assert adapted_rate(1e-2, 0.0, 0.01) == 1e-2

@@ -105,16 +105,18 @@ class Trainer:
 
     def step(self) -> dict[str, float]:
         """Collect one batch, learn from it, and return the iteration's numbers."""
-        start = time.perf_counter()
-        progress = self.iteration / self.iterations
-        rate = self.config.train.learning_rate * (1 - (1 - self.config.train.final_learning_rate) * progress)
-        for group in self.learner.optimizer.param_groups:
-            group["lr"] = rate
+        start, train, optimizer = time.perf_counter(), self.config.train, self.learner.optimizer
+        if not train.desired_kl:
+            progress = self.iteration / self.iterations
+            optimizer.param_groups[0]["lr"] = train.learning_rate * (1 - (1 - train.final_learning_rate) * progress)
+        rate = optimizer.param_groups[0]["lr"]
         batch = next(self._batches)
         sampling = time.perf_counter() - start
-        torch.set_num_threads(self.config.train.threads)
+        torch.set_num_threads(train.threads)
         values = update(self.learner, batch)
         torch.set_num_threads(1)
+        if train.desired_kl:
+            optimizer.param_groups[0]["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
         learning = values.pop("learning_seconds")
         values |= self._episodes(batch)
         self.iteration += 1
@@ -218,6 +220,13 @@ class Trainer:
             raise KeyboardInterrupt
         self._stop = True
         tqdm.write("stopping after this iteration; press Ctrl-C again to stop at once")
+
+
+def adapted_rate(rate: float, kl: float, desired: float) -> float:
+    """Return a learning rate that brings the KL of the next update closer to what is desired (Rudin et al. 2022)."""
+    if kl > 2 * desired:
+        return max(rate / 1.5, 1e-5)
+    return min(rate * 1.5, 1e-2) if kl < desired / 2 else rate
 
 
 def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Trainer:
