@@ -1,6 +1,7 @@
 """Train the recipes, judge learned and scripted teams on the same episodes, and rebuild the tables from what they did.
 
   python results/reproduce.py train gate [seed ...]     train configs/gate.yaml; keep curve and weights in results/gate/
+  python results/reproduce.py keep gate runs/<run>      the same of a run that is there already
   python results/reproduce.py judge [flight ...]        1000 episodes of every team -> results/<flight>/<team>.json
   python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
   python results/reproduce.py table                     the tables of README.md and docs/tasks.md
@@ -66,31 +67,39 @@ RECIPES: dict[str, tuple[str, dict[str, Any]]] = {  # what is trained: configura
 
 
 def train(recipe: str, seeds: list[int]) -> None:
-    """Train a recipe on some seeds and keep curve and best weights of each."""
-    from multilift_marl.agents.logging import read_metrics
-    from multilift_marl.agents.policy import strip_checkpoint
+    """Train a recipe on some seeds and keep what came of each."""
     from multilift_marl.agents.trainer import new_run
-    from multilift_marl.evaluation.plots import plot_training
 
     name, overrides = RECIPES.get(recipe, (recipe, {}))
     for seed in seeds:
         trainer = new_run(load_config(name, {**overrides, "seed": seed}), recipe)
         if not trainer.run():
-            sys.exit(f"stopped; go on with: python train.py resume={trainer.folder}")
-        folder = HERE / recipe / f"seed{seed}"
-        folder.mkdir(parents=True, exist_ok=True)
-        rows = read_metrics(trainer.folder)
-        told = [row for row in rows if row["eval/success_rate"] != ""]
-        names = ("frames", "return", *(name for name in rows[0] if name.startswith("eval/")))
-        with open(folder / "curve.csv", "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, names, extrasaction="ignore")
-            writer.writeheader()
-            writer.writerows(told)
-        (folder / "training.json").write_text(
-            json.dumps({"frames": trainer.frames, "minutes": round(trainer.seconds / 60, 1)}) + "\n", encoding="utf-8"
-        )
-        plot_training(folder / "training.png", rows)
-        strip_checkpoint(trainer.folder / "checkpoints" / "best.pt", folder / "policy.pt")
+            sys.exit(
+                f"stopped; go on with: python train.py resume={trainer.folder}, then keep it with: "
+                f"python results/reproduce.py keep {recipe} {trainer.folder}"
+            )
+        keep(recipe, trainer.folder)
+
+
+def keep(recipe: str, run: Path) -> None:
+    """Keep curve, duration and best weights of a run in results/<recipe>/seed<seed>/."""
+    from multilift_marl.agents.checkpoint import load_checkpoint
+    from multilift_marl.agents.logging import read_metrics
+    from multilift_marl.agents.policy import strip_checkpoint
+    from multilift_marl.evaluation.plots import plot_training
+
+    rows, last = read_metrics(run), load_checkpoint(run / "checkpoints" / "last.pt")
+    folder = HERE / recipe / f"seed{last['config']['seed']}"
+    folder.mkdir(parents=True, exist_ok=True)
+    names = ("frames", "return", *(name for name in rows[0] if name.startswith("eval/")))
+    with open(folder / "curve.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(row for row in rows if row["eval/success_rate"] != "")
+    told = {"frames": last["frames"], "minutes": round(last["seconds"] / 60, 1)}
+    (folder / "training.json").write_text(json.dumps(told) + "\n", encoding="utf-8")
+    plot_training(folder / "training.png", rows)
+    strip_checkpoint(run / "checkpoints" / "best.pt", folder / "policy.pt")
 
 
 def judge(flights: list[str]) -> None:
@@ -163,6 +172,8 @@ def main(arguments: list[str]) -> None:
     what, *rest = arguments or ["help"]
     if what == "train" and rest:
         train(rest[0], [int(seed) for seed in rest[1:]] or [0])
+    elif what == "keep" and len(rest) == 2:
+        keep(rest[0], Path(rest[1]))
     elif what == "judge":
         judge(rest or list(FLIGHTS))
     elif what == "ship" and rest:
