@@ -2,7 +2,7 @@
 
   python results/reproduce.py train gate [seed ...]     train configs/gate.yaml; keep curve and weights in results/gate/
   python results/reproduce.py keep gate runs/<run>      the same of a run that is there already
-  python results/reproduce.py judge [flight ...]        1000 episodes of every team -> results/<flight>/<team>.json
+  python results/reproduce.py judge [flight ...]        200 episodes of every team -> results/<flight>/<team>.json
   python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
   python results/reproduce.py table                     the tables of README.md and docs/tasks.md
 
@@ -24,7 +24,7 @@ from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
-EPISODES, SEED = 1000, 1000
+EPISODES, SEED = 200, 1000
 FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
 AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
 FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
@@ -163,8 +163,8 @@ def write_tables() -> None:
     """Replace what stands between the markers in the documents."""
     for path in (ROOT / "README.md", ROOT / "docs" / "tasks.md"):
         text = path.read_text(encoding="utf-8")
-        marked = re.compile(r"(<!-- results -->\n).*?(\n<!-- end of results -->)", re.DOTALL)
-        path.write_text(marked.sub(lambda found: found[1] + table() + found[2], text), encoding="utf-8")
+        marked = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.DOTALL)
+        path.write_text(marked.sub(lambda found: f"{found[1]}{table()}\n{found[2]}", text), encoding="utf-8")
 
 
 def main(arguments: list[str]) -> None:

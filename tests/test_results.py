@@ -1,0 +1,32 @@
+"""What the documents say of teams is what the recorded results hold."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+import multilift_marl as ml
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "results"))
+import reproduce  # noqa: E402
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/tasks.md"])
+def test_tables_are_those_of_the_results(document):
+    assert reproduce.table() in (ROOT / document).read_text(encoding="utf-8")
+
+
+def test_every_task_and_preset_is_flown_by_every_script():
+    assert {flight.config for flight in reproduce.FLIGHTS.values()} >= set(ml.list_tasks())
+    for name in reproduce.FLIGHTS:
+        for script in reproduce.SCRIPTED:
+            told = json.loads((ROOT / "results" / name / f"{script}.json").read_text(encoding="utf-8"))
+            assert (told["episodes"], told["seed"]) == (reproduce.EPISODES, reproduce.SEED)
+
+
+@pytest.mark.parametrize("weights", sorted((ROOT / "results").glob("*/seed0/policy.pt")), ids=lambda p: p.parts[-3])
+def test_shipped_weights_are_those_of_the_results(weights):
+    shipped = ROOT / "multilift_marl" / "policies" / f"{weights.parts[-3]}.pt"
+    assert shipped.read_bytes() == weights.read_bytes()
