@@ -18,15 +18,16 @@ HERE = Path(__file__).resolve().parent
 NAMES = sorted(path.stem for path in (HERE / "requirements").glob("*.txt"))
 SIZES = {"iterations": 2, "horizon": 32}
 PACKAGES = (
-    "stable_baselines3", "supersuit", "ray", "skrl", "tianshou", "torchrl", "torch", "gymnasium",
-    "pettingzoo", "numpy",
+    "stable_baselines3", "supersuit", "ray", "skrl", "tianshou", "benchmarl", "torchrl", "tensordict", "torch",
+    "gymnasium", "pettingzoo", "numpy",
 )  # fmt: skip
 INSIDE = """
 import importlib, importlib.metadata as metadata, json, sys
 name, sizes, packages = json.loads(sys.argv[1])
 before, after = importlib.import_module(name).train(**sizes)
 installed = {part.metadata["Name"].lower().replace("-", "_"): part.version for part in metadata.distributions()}
-told = {"finite": bool(before.isfinite().all() and after.isfinite().all()), "moved": float((after - before).norm())}
+moved = float((after - before).norm(dim=-1).min())  # of several policies, one a row, that which moved least
+told = {"finite": bool(before.isfinite().all() and after.isfinite().all()), "moved": moved}
 told |= {"weights": before.numel(), "versions": {key: installed[key] for key in packages if key in installed}}
 print("\\n" + json.dumps(told))
 """
@@ -51,7 +52,8 @@ def try_out(python: str | Path, name: str, folder: Path, **sizes: int) -> dict[s
         **sizes: arguments of its `train` beside SIZES.
 
     Returns:
-        `weights` (how many), `moved` (the norm of their change) and `versions` {package: version}.
+        `weights` (how many), `moved` (the norm of their change, of several policies the least) and `versions`
+        {package: version}.
 
     Raises:
         RuntimeError: it failed, or its weights stayed as they were or are not finite.

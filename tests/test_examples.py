@@ -28,11 +28,17 @@ def test_example_trains(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "after, complaint", [("before", r"moved by 0\.0"), ("before * float('nan')", "moved by nan"), ("1 / 0", "Zero")]
+    "after, complaint",
+    [
+        ("before", r"moved by 0\.0"),
+        ("before + torch.tensor([[1.0], [0.0]])", r"moved by 0\.0"),  # one policy of two
+        ("before * float('nan')", "moved by nan"),
+        ("1 / 0", "Zero"),
+    ],
 )
 def test_a_training_that_does_nothing_or_breaks_is_noticed(after, complaint, tmp_path, monkeypatch):
     (tmp_path / "idle.py").write_text(
-        f"import torch\ndef train(**_):\n    before = torch.ones(3)\n    return before, {after}"
+        f"import torch\ndef train(**_):\n    before = torch.ones(2, 3)\n    return before, {after}"
     )
     monkeypatch.setattr(check, "HERE", tmp_path)
     with pytest.raises(RuntimeError, match=complaint):
@@ -41,7 +47,7 @@ def test_a_training_that_does_nothing_or_breaks_is_noticed(after, complaint, tmp
 
 def test_unknown_examples_are_named(capsys):
     assert check.main(["sb4"]) == 2
-    assert "no example 'sb4'; known: cleanrl_ppo, " in capsys.readouterr().err
+    assert "no example 'sb4'; known: benchmarl_task, " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", check.NAMES)
