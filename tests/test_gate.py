@@ -104,4 +104,8 @@ def test_drones_are_told_the_gap_and_their_room():
             away = state.drone_position[e, n] - [0.0, task.gap_y[e, 0], 1.3]
             expected = [c * away[0] + s * away[1], c * away[1] - s * away[0]]
             np.testing.assert_allclose(observation[e, n, at : at + 2], expected, atol=1e-5)
-    assert (observation[..., names.index("clearance_0")] < -0.1).all()
+    half = task.bodies.drone[0]
+    reach = np.abs(state.drone_rotation.reshape(4, 4, 3, 3)[:, :, 1]) @ half
+    room = 0.5 - np.abs(state.drone_position[..., 1] - task.gap_y) - reach
+    np.testing.assert_allclose(observation[..., names.index("clearance_0")], room.clip(-0.5, 0.5), atol=1e-5)
+    assert (room.min(axis=1) < -0.1).all()

@@ -25,6 +25,7 @@ from multilift_marl.tasks.starts import hang_team, in_ball
 from multilift_marl.tasks.terms import mean_change, tolerance
 
 THICKNESS = 0.1  # [m] of the walls
+PASSED = 0.8  # [m] that a payload is past a wall when its last drone is, too
 _WALL = (0.62, 0.52, 0.45, 1.0)  # colour
 
 
@@ -87,7 +88,7 @@ class Gate(Task):
     REWARD: ClassVar[dict[str, float]] = {
         "position": 0.4,
         "precision": 0.2,
-        "clearance": 0.2,
+        "clearance": 0.8,
         "velocity": 0.2,
         "action_rate": -0.05,
     }
@@ -198,7 +199,7 @@ def _plan(lo, hi, time, dt, gates, goal, rig):
 def _next(e, x, gates):
     """Return the gate that a payload at x has before it, the last one after all."""
     for g in range(gates.x.shape[0]):
-        if x < gates.x[g] + 0.5:
+        if x < gates.x[g] + PASSED:
             return g
     return gates.x.shape[0] - 1
 
@@ -278,7 +279,7 @@ def _score(
         distance = errors.distance[e]
         slip = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
         g = _next(e, state.payload_position[e, 0], gates)
-        before = state.payload_position[e, 0] < gates.x[g] + 0.5
+        before = state.payload_position[e, 0] < gates.x[g] + PASSED
         passing, count = 0.0, action.shape[1]
         for n in range(count):
             lacking = max(0.05 - _clearance(e, n, g, state, gates, bodies), 0.0) if before else 0.0
