@@ -24,9 +24,9 @@ STRIPS: dict[str, tuple[str, dict, str, int, tuple[float, ...]]] = {
     "pose": ("pose", {}, "payload_geometric", 1, (0.02, 1.6, 3.6)),
     "takeoff": ("takeoff", {}, "formation_integral", 0, (0.02, 3.5, 6.0, 9.0)),
     "land": ("land", {}, "formation_integral", 0, (1.0, 4.0, 7.0, 11.5)),
-    "gate": ("gate", {"task_options.gap_width": 1.8}, "formation", 2, (3.5, 6.0, 8.0)),
+    "gate": ("gate", {}, "gate", 2, (3.0, 5.6, 6.4, 8.0)),
     "recover": ("recover", {}, "formation", 0, (0.02, 0.4, 1.0, 4.0)),
-    "loss": ("loss", {}, "formation_integral", 0, (1.5, 4.4, 11.0)),
+    "loss": ("loss", {}, "loss", 0, (1.5, 4.4, 11.0)),
     "mixed_team": ("hover", MIXED, "formation_integral", 0, (0.02, 6.0)),
 }
 

@@ -168,7 +168,7 @@ def test_commands_of_documents_run_in_order(tmp_path):
             command = re.sub(r"episodes=\d+", "episodes=2", command) + " env.episode_seconds=0.4"
         if script.startswith("examples/"):
             command += " 1"  # iteration
-        if script in ("bench/bench.py", "bench/randomization.py"):
+        if script in ("bench/air.py", "bench/bench.py", "bench/randomization.py"):
             command += " repeats=1 seconds=0.05 env.num_envs=4"
         if script == "bench/disturbance.py":
             command = command.split(" rigs=")[0].replace("seconds=30", "") + " rigs=report4 seconds=0.05"

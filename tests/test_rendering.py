@@ -229,7 +229,7 @@ def test_a_video_that_cannot_be_written_says_why(tmp_path, monkeypatch):
     with pytest.raises(RenderingError, match="there are no frames"):
         write_video(tmp_path / "none.mp4", [], 25)
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(RenderingError, match=r"needs av: pip install 'multilift_marl\[train\]'"):
+    with pytest.raises(RenderingError, match=r'needs av: pip install "multilift_marl\[train\]"'):
         write_video(tmp_path / "none.mp4", [np.zeros((2, 2, 3), np.uint8)], 25)
 
 
