@@ -13,7 +13,7 @@ from pydantic import Field
 import multilift_marl as ml
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.load import build_config
-from multilift_marl.config.schema import Float, Section
+from multilift_marl.config.values import Float, Section
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.tasks import TASKS
 from multilift_marl.tasks.base import Task

@@ -9,7 +9,7 @@ import yaml
 from conftest import TASKS
 
 from multilift_marl.config import Config, build_config, dump_config, explain, list_configs, load_config, parse_overrides
-from multilift_marl.config.schema import Section
+from multilift_marl.config.values import Section
 
 
 def test_defaults_lose_to_the_file_and_the_file_to_overrides(write):

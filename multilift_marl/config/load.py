@@ -9,8 +9,9 @@ from typing import Any
 
 import yaml
 
-from multilift_marl.config.schema import Config, Section
+from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
+from multilift_marl.config.values import Section
 from multilift_marl.errors import ConfigError, nearest
 
 _PACKAGE = Path(__file__).resolve().parents[1]

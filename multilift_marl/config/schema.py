@@ -5,75 +5,29 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import Field
+
+from multilift_marl.config.values import (
+    Delays,
+    Drag,
+    Float,
+    FourPerDrone,
+    Int,
+    Level,
+    Links,
+    Moments,
+    NotNegative,
+    NotNegativePerDrone,
+    PerDrone,
+    Positive,
+    Section,
+    Share,
+    Vector,
+    VectorPerDrone,
+)
 
 if TYPE_CHECKING:
     from multilift_marl.config.system import System
-
-
-def _integer(value: Any) -> Any:
-    """Accept 2e6, which PyYAML reads as a string, where a whole number is meant; refuse true and false."""
-    if isinstance(value, bool):
-        raise ValueError("must be a whole number")
-    if isinstance(value, str | float):
-        try:
-            number = float(value)
-        except ValueError:
-            raise ValueError("must be a whole number") from None
-        if not number.is_integer():
-            raise ValueError("must be a whole number")
-        return int(number)
-    return value
-
-
-def _real(value: Any) -> Any:
-    """Accept 1e-3, which PyYAML reads as a string; refuse true and false."""
-    if isinstance(value, bool):
-        raise ValueError("must be a number")
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            raise ValueError("must be a number") from None
-    return value
-
-
-Int = Annotated[int, BeforeValidator(_integer)]
-Float = Annotated[float, BeforeValidator(_real)]
-Vector = tuple[Float, Float, Float]
-Positive = Annotated[Float, Field(gt=0)]
-NotNegative = Annotated[Float, Field(ge=0)]
-PerDrone = Positive | tuple[Positive, ...]
-NotNegativePerDrone = NotNegative | tuple[NotNegative, ...]
-VectorPerDrone = Vector | tuple[Vector, ...]
-Links = Annotated[Int, Field(ge=2, le=100)]
-Share = Annotated[Float, Field(ge=0, lt=1)]
-
-
-def _level(value: Any) -> Any:
-    """Accept the named levels of the observations' imperfections."""
-    if isinstance(value, str) and value in (levels := {"none": 0.0, "standard": 1.0}):
-        return levels[value]
-    try:
-        return _real(value)
-    except ValueError:
-        raise ValueError("must be none, standard, or a factor on standard") from None
-
-
-def _range(value: Any) -> Any:
-    """Accept one whole number for a range of one."""
-    return value if isinstance(value, list | tuple) else (value, value)
-
-
-Level = Annotated[Float, Field(ge=0), BeforeValidator(_level)]
-Delay = Annotated[Int, Field(ge=0, le=50)]
-Delays = Annotated[tuple[Delay, Delay], BeforeValidator(_range)]
-
-
-class Section(BaseModel):
-    """A frozen group of parameters that rejects unknown keys and values of the wrong type."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class EnvConfig(Section):
@@ -92,12 +46,6 @@ class SimConfig(Section):
 
     timestep: Float = Field(0.004, gt=0, le=0.02, description="[s] physics step")
     control_hz: Float = Field(250.0, gt=0, description="[Hz] rate of the drones' controllers")
-
-
-Four = tuple[Float, Float, Float, Float]
-FourPerDrone = Four | tuple[Four, ...]
-Moments = tuple[Positive, Positive, Positive]
-Drag = tuple[NotNegative, NotNegative, NotNegative]
 
 
 class VehicleConfig(Section):

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from multilift_marl.config.schema import Section
+from multilift_marl.config.values import Section
 from multilift_marl.errors import ConfigError, nearest
 
 S = TypeVar("S", bound=Section)

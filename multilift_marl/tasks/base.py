@@ -9,8 +9,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config, Section
+from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
+from multilift_marl.config.values import Section
 from multilift_marl.control.formation import Goal, Reference, make_rig
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.parameters import Parameters

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config, Float, Int, Section
+from multilift_marl.config.schema import Config
+from multilift_marl.config.values import Float, Int, Section
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import add, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, triple, turn, vec
 from multilift_marl.sim.scene import drone_half_size

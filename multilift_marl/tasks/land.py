@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config, Float, Section
+from multilift_marl.config.schema import Config
+from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import add, matrow, norm, put, putmat, rot_z, row, scale, sub, tmul, turn, vec
 from multilift_marl.sim.scene import drone_half_size

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config, Float, Section
+from multilift_marl.config.schema import Config
+from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import norm, row

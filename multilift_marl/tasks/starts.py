@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.schema import Float, Section
 from multilift_marl.config.system import System
+from multilift_marl.config.values import Float, Section
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import Goal, Rig, goal_hook, place_formation
 from multilift_marl.errors import ConfigError
