@@ -111,7 +111,7 @@ def judge(flights: list[str]) -> None:
         teams = {script: (lambda vec, script=script: make_scripted(script, vec)) for script in SCRIPTED}
         for weights in sorted((HERE / flight.recipe).glob("seed*/policy.pt")):
             policy = load_policy(weights)
-            teams[weights.parent.name] = lambda vec, policy=policy: policy
+            teams[weights.parent.name] = policy.bind
         for team, maker in teams.items():
             path = folder / f"{team}.json"
             if path.is_file():

@@ -18,6 +18,18 @@ def test_tables_are_those_of_the_results(document):
     assert reproduce.table() in (ROOT / document).read_text(encoding="utf-8")
 
 
+def test_tables_are_written_between_their_marks(tmp_path, monkeypatch):
+    (tmp_path / "docs").mkdir()
+    whole = {}
+    for document in ("README.md", "docs/tasks.md"):
+        whole[document] = (ROOT / document).read_text(encoding="utf-8")
+        (tmp_path / document).write_text(whole[document].replace(reproduce.table(), "old"), encoding="utf-8")
+    monkeypatch.setattr(reproduce, "ROOT", tmp_path)
+    reproduce.main(["table"])
+    for document, text in whole.items():
+        assert (tmp_path / document).read_text(encoding="utf-8") == text
+
+
 def test_every_task_and_preset_is_flown_by_every_script():
     assert {flight.config for flight in reproduce.FLIGHTS.values()} >= set(ml.list_tasks())
     for name in reproduce.FLIGHTS:

@@ -143,8 +143,20 @@ def test_overrides_change_the_environment_of_training_alone(tmp_path):
     assert trainer.config.env.episode_seconds != 1.0
     trainer.step()
     assert trainer.evaluate()["eval/success_rate"] >= 0.0  # flown with four, for the whole time
-    with pytest.raises(ConfigError, match=r"unknown key 'env\.episode_second'; did you mean"):
-        make_trainer(tmp_path, **{"train.overrides": {"env.episode_second": 1.0}})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"train.overrides": {"env.episode_second": 1.0}}, r"unknown key 'env\.episode_second'; did you mean"),
+        ({"train.overrides": {"train.frames": 5}}, r"cannot hold 'train\.frames'; set train\.frames itself"),
+        ({"train.algorithm": "ippo", "train.critic": "set"}, r"train\.critic=set is of mappo"),
+        ({"train.actor": "attention", "train.hidden": (16, 30)}, r"last of train\.hidden must be a multiple of 4"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_in_a_sentence(tmp_path, values, message):
+    with pytest.raises(ConfigError, match=message):
+        make_trainer(tmp_path, **values)
 
 
 @pytest.mark.parametrize(("kl", "factor"), [(0.03, 1 / 1.5), (0.015, 1.0), (0.01, 1.0), (0.004, 1.5)])

@@ -13,10 +13,11 @@ from torchrl.modules import IndependentNormal, PopArtValueNorm, ProbabilisticAct
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.value import MultiAgentGAE
 
-from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, draw_action
+from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, TeamNet, draw_action
 from multilift_marl.config.schema import TrainConfig
 from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.torchrl_env import MultiliftEnv
+from multilift_marl.errors import ConfigError
 from multilift_marl.tasks.observations import drone_numbers
 
 
@@ -34,7 +35,15 @@ class Learner:
 
 
 def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
-    """Return an untrained learner for `env`."""
+    """Return an untrained learner for `env`.
+
+    Raises:
+        ConfigError: networks that cannot be.
+    """
+    if config.algorithm == "ippo" and config.critic != "flat":
+        raise ConfigError(f"train.critic={config.critic} is of mappo; set train.algorithm=mappo or leave it out")
+    if "attention" in (config.actor, config.critic) and config.hidden[-1] % TeamNet.HEADS:
+        raise ConfigError(f"the last of train.hidden must be a multiple of {TeamNet.HEADS}, the heads of attention")
     # 1. The policy: own observation to a Gaussian over the own action.
     vec = env.vec
     base = torch.from_numpy(residual_matrix(config.residual, vec))

@@ -39,6 +39,9 @@ class Trainer:
         torch.set_num_threads(1)
         torch.manual_seed(config.seed)
         self.config, self.folder = config, folder
+        for key in config.train.overrides:
+            if key.partition(".")[0] in ("task", "seed", "train", "eval"):
+                raise ConfigError(f"train.overrides changes the environment and cannot hold '{key}'; set {key} itself")
         self.env = MultiliftEnv(build_config(config.model_dump(), config.train.overrides))
         self.learner = make_learner(config.train, self.env)
         self.frames_per_batch = self.env.vec.num_envs * config.train.horizon
@@ -138,7 +141,7 @@ class Trainer:
 
         policy = LearnedPolicy(self._content(), "the run")
         episodes = fly_episodes(
-            self.config, lambda vec: policy, self.config.eval.episodes, self.config.seed, TRAINING_EVALUATION
+            self.config, policy.bind, self.config.eval.episodes, self.config.seed, TRAINING_EVALUATION
         )
         summary = summarize(episodes)
         names = ("success_rate", "payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")

@@ -35,7 +35,6 @@ class GateOptions(Section):
 
     gates: Int = Field(1, ge=1, le=2, description="walls with a gap: one at x = 0, or two at x = -0.75 and 0.75 m")
     gap_width: Float = Field(1.0, gt=0, description="[m]")
-    gap_extra: Float = Field(0.0, ge=0, description="[m] drawn for each episode, gaps are up to this wider: to train")
     gap_height: Float = Field(3.0, gt=0, description="[m] from the ground")
     gap_offset: Float = Field(0.3, ge=0, description="[m] gap's middle within ± this of the line from start to goal")
     height: Float = Field(1.3, gt=0, description="[m] of start and goal")
@@ -53,8 +52,8 @@ class Gates(NamedTuple):
     """(G,) of the walls [m]."""
     y: np.ndarray
     """(E, G) of the gaps' middles [m]."""
-    half_width: np.ndarray
-    """(E,) of the gaps [m]."""
+    half_width: float
+    """Of the gaps [m]."""
     gap_height: float
     """[m]."""
     start: float
@@ -99,15 +98,15 @@ class Gate(Task):
         Component("clearance", 1, "-", "m", "own room to the next wall's edges, within ± 0.5"),
     )
     EXTRA_STATE: ClassVar[int] = 6
-    KEPT: ClassVar[tuple[str, ...]] = ("gap_y", "half_width")
+    KEPT: ClassVar[tuple[str, ...]] = ("gap_y",)
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
         option, system = self.options, world.system
         x = np.array([0.0] if option.gates == 1 else [-0.75, 0.75])
-        self.gap_y, self.half_width = np.zeros((world.num_envs, len(x))), np.zeros(world.num_envs)
+        self.gap_y = np.zeros((world.num_envs, len(x)))
         self.gates = Gates(
-            x, self.gap_y, self.half_width, option.gap_height, option.set_off,
+            x, self.gap_y, option.gap_width / 2, option.gap_height, option.set_off,
             option.arrival - option.set_off, option.height,
         )  # fmt: skip
         self.bodies = Bodies(
@@ -120,8 +119,6 @@ class Gate(Task):
         """Draw the gaps and where the team starts; see `Task.start`."""
         option = self.options
         self.gap_y[env] = rng.uniform(-option.gap_offset, option.gap_offset, option.gates)
-        extra = rng.uniform(0.0, option.gap_extra) if option.gap_extra > 0 else 0.0
-        self.half_width[env] = (option.gap_width + extra) / 2
         _start(env, rng, self.world.state, self.goal, self.rig, self.hanging, mass, self.gates, option.start_radius)
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
@@ -152,7 +149,7 @@ class Gate(Task):
 
     def scenery(self, env: int) -> list[Box]:
         """Return the walls; see `Task.scenery`."""
-        half, gap, top = 2.5, self.half_width[env], self.gates.gap_height
+        half, gap, top = 2.5, self.gates.half_width, self.gates.gap_height
         boxes = []
         for x, y in zip(self.gates.x, self.gap_y[env], strict=True):
             for side in (-1, 1):
@@ -216,7 +213,7 @@ def _room(e, g, centre, frame, half, gates):
     """Return the room [m] of a box to the edges of gap g if it is in the wall, else 1."""
     if abs(centre[0] - gates.x[g]) > 0.5 * THICKNESS + _reach(frame, half, 0):
         return 1.0
-    side = gates.half_width[e] - abs(centre[1] - gates.y[e, g]) - _reach(frame, half, 1)
+    side = gates.half_width - abs(centre[1] - gates.y[e, g]) - _reach(frame, half, 1)
     return min(side, gates.gap_height - centre[2] - _reach(frame, half, 2))
 
 
@@ -230,7 +227,7 @@ def _cable_room(e, g, low, high, gates):
     for side in (begin, end):
         share = 0.0 if abs(span) < 1e-9 else min(max((side - low[0]) / span, 0.0), 1.0)
         y, z = low[1] + share * (high[1] - low[1]), low[2] + share * (high[2] - low[2])
-        room = min(room, gates.half_width[e] - abs(y - gates.y[e, g]), gates.gap_height - z)
+        room = min(room, gates.half_width - abs(y - gates.y[e, g]), gates.gap_height - z)
     return room
 
 
@@ -253,7 +250,7 @@ def _least_room(e, state, gates, bodies):
 def _clearance(e, n, g, state, gates, bodies):
     """Return the room [m] that a drone would have in gap g if it flew straight on; below 0 it would hit the wall."""
     across = abs(state.drone_position[e, n, 1] - gates.y[e, g])
-    return gates.half_width[e] - across - _reach(mat(state.drone_rotation, e, n), bodies.drone[n], 1)
+    return gates.half_width - across - _reach(mat(state.drone_rotation, e, n), bodies.drone[n], 1)
 
 
 @kernel
