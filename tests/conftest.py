@@ -6,11 +6,17 @@ configuration of a cable model, for both models.
 
 from __future__ import annotations
 
+import os
+import tempfile
 from dataclasses import replace
 from math import sqrt
 
 import numpy as np
 import pytest
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # Numba's cache is not made for two that fill it at the same time
+    _kernels = tempfile.TemporaryDirectory(prefix="kernels")
+    os.environ["NUMBA_CACHE_DIR"] = _kernels.name
 
 import multilift_marl as ml
 from multilift_marl.config import System

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -27,8 +28,12 @@ def test_no_compiled_kernel_outlives_a_constant_it_was_compiled_with(tmp_path):
     package = tmp_path / "multilift_marl"
     shutil.copytree(Path(ml.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
 
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+
     def weights_lifted() -> float:
-        told = subprocess.run([sys.executable, "-c", HOVER], cwd=tmp_path, capture_output=True, text=True, check=True)
+        told = subprocess.run(
+            [sys.executable, "-c", HOVER], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
         return float(told.stdout)
 
     assert weights_lifted() == pytest.approx(1)

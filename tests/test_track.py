@@ -4,7 +4,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from conftest import make, zeros
+from conftest import make, refusal, zeros
 
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.tasks.paths import PATHS, RAMP, motion, own_time
@@ -12,8 +12,8 @@ from multilift_marl.tasks.paths import PATHS, RAMP, motion, own_time
 KINDS = pytest.mark.parametrize("kind", PATHS)
 
 
-def track(kind: str = "figure8", num_envs: int = 2, **keywords):
-    """Return environments of one path, reset."""
+def track(kind: str | list[str] = "figure8", num_envs: int = 2, **keywords):
+    """Return environments of one path, or of some forms, reset."""
     vec = make("track", num_envs=num_envs, **{"task_options.path": kind, **keywords})
     vec.reset(seed=0)
     return vec
@@ -74,6 +74,26 @@ def test_figure_eight_is_the_published_one():
     assert task.path.size[0] == pytest.approx(1.0625 * 2**2 / 4)
     assert task.path.rate[0] == pytest.approx(0.6655 * 4 / 2)
     assert task.path.size[0] * task.path.rate[0] * sqrt(2) == pytest.approx(2.0, rel=1e-3)
+
+
+def test_each_episode_draws_from_ranges_and_forms():
+    ranges = {"speed": [1.0, 2.0], "acceleration": [2.0, 4.0], "rate": [0.1, 0.4], "radius": [3.0, 5.0]}
+    vec = track(["figure8", "circle"], num_envs=64, **{f"task_options.{key}": value for key, value in ranges.items()})
+    path = vec.task.path
+    eights, circles = path.kind == PATHS.index("figure8"), path.kind == PATHS.index("circle")
+    assert (eights | circles).all() and 16 < eights.sum() < 48
+    v, a = path.size * path.rate * sqrt(2), path.size * path.rate**2 / (1.0625 * 0.6655**2)
+    for drawn, low, high in (
+        (v[eights], 1.0, 2.0), (a[eights], 2.0, 4.0), (path.rate[circles], 0.1, 0.4), (path.size[circles], 3.0, 5.0)
+    ):  # fmt: skip
+        span = high - low
+        assert low * 0.999 <= drawn.min() < low + 0.2 * span and high - 0.2 * span < drawn.max() <= high * 1.001
+
+
+def test_a_range_that_falls_is_refused():
+    message = refusal(track, **{"task_options.speed": [2.0, 1.0]})
+    assert message == "task_options.speed must not end at 1 before it begins at 2, but is [2.0, 1.0]"
+    assert refusal(track, kind=[]) == "task_options.path must not be empty"
 
 
 def test_on_the_circle_drones_face_along_the_path():

@@ -109,9 +109,9 @@ class Trainer:
     def step(self) -> dict[str, float]:
         """Collect one batch, learn from it, and return the iteration's numbers."""
         start, train, optimizer = time.perf_counter(), self.config.train, self.learner.optimizer
+        left = 1 - (1 - train.final_learning_rate) * self.iteration / self.iterations
         if not train.desired_kl:
-            progress = self.iteration / self.iterations
-            optimizer.param_groups[0]["lr"] = train.learning_rate * (1 - (1 - train.final_learning_rate) * progress)
+            optimizer.param_groups[0]["lr"] = train.learning_rate * left
         rate = optimizer.param_groups[0]["lr"]
         batch = next(self._batches)
         sampling = time.perf_counter() - start
@@ -119,7 +119,7 @@ class Trainer:
         values = update(self.learner, batch)
         torch.set_num_threads(1)
         if train.desired_kl:
-            optimizer.param_groups[0]["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
+            optimizer.param_groups[0]["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl * left)
         learning = values.pop("learning_seconds")
         values |= self._episodes(batch)
         self.iteration += 1

@@ -44,6 +44,8 @@ def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) 
     if kind == "extra_forbidden":
         home = key.removesuffix(path[-1])
         return f"unknown key '{key}'{source}{nearest(path[-1], section.model_fields, lambda near: home + near)}"
+    if kind == "too_short":
+        return f"{key}{source} must not be empty"
     if kind in ("missing", "too_long"):
         count = error["ctx"]["max_length"] if kind == "too_long" else 1 + max(e["loc"][-1] for e in about)
         return f"{key}{source} must be a list of {count} numbers, but is {value!r}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 
 def _integer(value: Any) -> Any:
@@ -61,12 +61,25 @@ def _level(value: Any) -> Any:
 
 
 def _range(value: Any) -> Any:
-    """Accept one whole number for a range of one."""
+    """Accept one number for a range of one."""
     return value if isinstance(value, list | tuple) else (value, value)
+
+
+def _rising(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError(f"must not end at {value[1]:g} before it begins at {value[0]:g}")
+    return value
+
+
+def _choice(value: Any) -> Any:
+    """Accept one name for a choice of one."""
+    return (value,) if isinstance(value, str) else value
 
 
 Level = Annotated[Float, Field(ge=0), BeforeValidator(_level)]
 Delay = Annotated[Int, Field(ge=0, le=50)]
+Span = Annotated[tuple[Positive, Positive], BeforeValidator(_range), AfterValidator(_rising)]
+Choice = BeforeValidator(_choice)
 Delays = Annotated[tuple[Delay, Delay], BeforeValidator(_range)]
 
 

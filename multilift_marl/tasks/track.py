@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import cos, pi, radians, sin, sqrt
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config
-from multilift_marl.config.values import Float, Section, Vector
+from multilift_marl.config.values import Choice, Float, Section, Span, Vector
 from multilift_marl.control.formation import Reference, face, place_formation
 from multilift_marl.math3d import add, matrow, norm, put, putmat, rot_z, row, sub, turn
 from multilift_marl.sim.world import World
@@ -40,14 +40,19 @@ AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
 _DRAWN = 400  # points of a path that is drawn
 
 
-class TrackOptions(Section):
-    """The path, and what counts as success."""
+Form = Literal["circle", "figure8", "lemniscate", "helix", "random"]
 
-    path: Literal["circle", "figure8", "lemniscate", "helix", "random"] = Field("figure8", description="its form")
-    speed: Float = Field(1.0, gt=0, description="[m/s] peak speed v of figure8, lemniscate and random")
-    acceleration: Float = Field(0.5, gt=0, description="[m/s²] their peak acceleration a")
-    radius: Float = Field(5.0, gt=0, description="[m] of circle and helix")
-    rate: Float = Field(0.2, gt=0, description="[rad/s] of circle and helix")
+
+class TrackOptions(Section):
+    """The path, drawn for each episode where it is given as a list of forms or a range, and what counts as success."""
+
+    path: Annotated[tuple[Form, ...], Choice] = Field(
+        ("figure8",), min_length=1, description="its form: circle, figure8, lemniscate, helix, random, or some to draw"
+    )
+    speed: Span = Field((1.0, 1.0), description="[m/s] peak speed v of figure8, lemniscate and random, or its range")
+    acceleration: Span = Field((0.5, 0.5), description="[m/s²] their peak acceleration a, or its range")
+    radius: Span = Field((5.0, 5.0), description="[m] of circle and helix, or its range")
+    rate: Span = Field((0.2, 0.2), description="[rad/s] of circle and helix, or its range")
     climb: Float = Field(0.5, ge=0, description="[m] that a helix goes up, and down, from its middle height")
     room: Vector = Field((3.0, 3.0, 0.5), description="[m] random way-points within ± this of the start")
     height: Float = Field(2.0, gt=0, description="[m] of the path's centre")
@@ -90,11 +95,13 @@ class Track(Task):
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw heading and, for a random path, way-points; the team hangs at its start. See `Task.start`."""
         option, path = self.options, self.path
-        kind = PATHS.index(option.path)
-        path.kind[env], path.heading[env], path.climb[env] = kind, rng.uniform(-pi, pi), option.climb
-        v, a = option.speed, option.acceleration
+        heading = rng.uniform(-pi, pi)
+        form = option.path[rng.integers(len(option.path))] if len(option.path) > 1 else option.path[0]
+        kind = PATHS.index(form)
+        path.kind[env], path.heading[env], path.climb[env] = kind, heading, option.climb
+        v, a = _draw(rng, option.speed), _draw(rng, option.acceleration)
         if kind in (CIRCLE, HELIX):
-            path.size[env], path.rate[env] = option.radius, option.rate
+            path.size[env], path.rate[env] = _draw(rng, option.radius), _draw(rng, option.rate)
         elif kind == FIGURE8:  # peak speed A ω √2, peak acceleration with its factor at that size
             path.size[env], path.rate[env] = 1.0625 * v**2 / a, 0.6655 * a / v
         elif kind == LEMNISCATE:  # Bernoulli's: peak speed A ω and acceleration 3 A ω² at the ends
@@ -133,6 +140,11 @@ class Track(Task):
     def succeeded(self) -> np.ndarray:
         """Never too far from the target."""
         return self.worst <= self.options.success_distance
+
+
+def _draw(rng: np.random.Generator, span: tuple[float, float]) -> float:
+    """Return a number uniform in a range; one that is given is not drawn."""
+    return span[0] if span[0] == span[1] else float(rng.uniform(*span))
 
 
 @kernel
