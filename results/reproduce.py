@@ -18,8 +18,9 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from multilift_marl.config.load import load_config
-from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.config.load import build_config, load_config
+from multilift_marl.control.scripted import SCRIPTED, fitting_scripts, make_scripted
+from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
@@ -108,7 +109,10 @@ def judge(flights: list[str]) -> None:
 
     for name in flights:
         flight, folder = FLIGHTS[name], HERE / name
-        teams = {script: (lambda vec, script=script: make_scripted(script, vec)) for script in SCRIPTED}
+        config = load_config(flight.config, flight.overrides)
+        probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
+        scripts = fitting_scripts(probe)
+        teams = {script: (lambda vec, script=script: make_scripted(script, vec)) for script in scripts}
         for weights in sorted((HERE / flight.recipe).glob("seed*/policy.pt")):
             policy = load_policy(weights)
             teams[weights.parent.name] = policy.bind
@@ -116,7 +120,6 @@ def judge(flights: list[str]) -> None:
             path = folder / f"{team}.json"
             if path.is_file():
                 continue
-            config = load_config(flight.config, flight.overrides)
             told = summarize(fly_episodes(config, maker, EPISODES, SEED))
             folder.mkdir(parents=True, exist_ok=True)
             content = {"episodes": EPISODES, "seed": SEED, "config": flight.config, "overrides": flight.overrides}

@@ -12,13 +12,14 @@ from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.trainer import new_run
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.config import load_config
-from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.control.scripted import make_scripted
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.evaluation import rollout
 from multilift_marl.evaluation.metrics import bootstrap, compare, summarize, wilson
 from multilift_marl.evaluation.report import format_table, make_report
 from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
 
+SCRIPTS = {"formation", "formation_integral", "payload_geometric"}  # those of every task
 CONTRACT = {
     "success_rate", "payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s",
     "return", "cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j",
@@ -149,7 +150,7 @@ def test_command_writes_metrics_plots_and_table(run, tmp_path, capsys):
     report = json.loads((tmp_path / "metrics.json").read_text())
     assert report["episodes"] == 4 and report["seed"] == 1000
     assert report["config"]["env"]["num_drones"] == 3 and report["config"]["payload"]["mass"] == 1.2
-    assert set(report["baselines"]) == set(SCRIPTED) == set(report["paired"])
+    assert set(report["baselines"]) == SCRIPTS == set(report["paired"])
     for summary in (report["policy"], *report["baselines"].values()):
         assert set(summary) >= CONTRACT
         for value in summary.values():
@@ -164,7 +165,7 @@ def test_command_flies_a_script_in_place_of_a_policy(tmp_path, capsys, monkeypat
     assert "formation on pose_easy: 2 episodes" in capsys.readouterr().out
     (folder,) = (tmp_path / "runs" / "formation-pose_easy" / "eval").iterdir()
     report = json.loads((folder / "metrics.json").read_text())
-    assert report["config"]["task"] == "pose" and set(report["baselines"]) == set(SCRIPTED) - {"formation"}
+    assert report["config"]["task"] == "pose" and set(report["baselines"]) == SCRIPTS - {"formation"}
     assert {"errors.png", "tensions.png", "paths.png"} <= {path.name for path in folder.iterdir()}
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from math import cos, radians
+
 import numpy as np
 import pytest
-from conftest import GRAVITY, make, make_system
+from conftest import GRAVITY, make, make_system, refusal
 
 from multilift_marl.control.formation import Goal, make_rig, place_formation
-from multilift_marl.control.scripted import INTEGRAL_GAIN, LINEAR, make_scripted
+from multilift_marl.control.scripted import INTEGRAL_GAIN, LEAD_GAIN, LINEAR, fitting_scripts, make_scripted
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import axis_angle, rot_z
 
@@ -108,7 +110,7 @@ def observed(vec, **values) -> np.ndarray:
 
 @pytest.mark.parametrize("name", LINEAR)
 def test_scripts_act_on_any_batch_within_the_limits(name):
-    vec = make(num_envs=1)
+    vec = make("track", num_envs=1)
     policy, observation = make_scripted(name, vec), 10 * observed(vec)
     assert policy.act(observation).shape == (5, 4, 4)
     assert policy.act(observation[0]).shape == (4, 4)
@@ -127,6 +129,24 @@ def test_the_integral_script_moves_the_slots_against_the_integral():
     action = make_scripted("formation_integral", vec).act(observed(vec, **integral))
     expected = [-INTEGRAL_GAIN * 0.1 / 0.4, INTEGRAL_GAIN * 0.2 / 0.4, -1.0, 0.0]
     np.testing.assert_allclose(action, np.broadcast_to(expected, action.shape), rtol=1e-6)
+
+
+def test_the_leading_script_stands_ahead_by_what_the_acceleration_asks():
+    vec = make("track", num_envs=1, **{"control.max_offset": 0.6})
+    v, a, height = 1.3, 2.0, cos(radians(30))
+    ways = {f"target_ahead_{t}ms_{axis}": sign * (v * t / 1e3 + 0.5 * a * (t / 1e3) ** 2)
+            for t in (100, 200, 400, 800) for axis, sign in ((0, 1), (1, -1))}  # fmt: skip
+    action = make_scripted("formation_lead", vec).act(observed(vec, **ways))
+    lead = LEAD_GAIN * height * a / 9.81 / 0.6
+    np.testing.assert_allclose(action, np.broadcast_to([lead, -lead, 0, 0], action.shape), atol=1e-4)
+
+
+def test_the_leading_script_needs_to_know_the_way():
+    assert "formation_lead" in fitting_scripts(make("track", num_envs=1))
+    assert "formation_lead" not in fitting_scripts(make("hover", num_envs=1))
+    assert fitting_scripts(make("track", num_envs=1, **{"control.action": "rotor"})) == []
+    message = refusal(make_scripted, "formation_lead", make("hover", num_envs=1))
+    assert message.startswith("formation_lead needs to know where the target will go, and task hover does not tell")
 
 
 def test_unknown_script_names_the_nearest():

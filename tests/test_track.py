@@ -1,12 +1,15 @@
 """Task track: paths, their motion, and what a team is told and paid."""
 
+from functools import partial
 from math import sqrt
 
 import numpy as np
 import pytest
 from conftest import make, refusal, zeros
 
+from multilift_marl.config.load import load_config
 from multilift_marl.control.scripted import make_scripted
+from multilift_marl.evaluation.rollout import fly_episodes
 from multilift_marl.tasks.paths import PATHS, RAMP, motion, own_time
 
 KINDS = pytest.mark.parametrize("kind", PATHS)
@@ -156,3 +159,13 @@ def test_the_formation_follows(kind):
         assert not terminated.any()
         distances.append(vec.task.errors.distance.copy())
     assert np.sqrt(np.mean(np.square(distances[250:]))) < 0.03
+
+
+def test_leading_scripts_follow_agile_paths_several_times_closer():
+    options = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
+    config = load_config("track", {"env.num_threads": 1, "env.episode_seconds": 12.0, **options})
+    rmse = {
+        name: fly_episodes(config, partial(make_scripted, name), 4, seed=1000)["payload_rmse_m"].mean()
+        for name in ("formation", "formation_lead")
+    }
+    assert rmse["formation_lead"] < 0.1 < 0.25 < rmse["formation"]

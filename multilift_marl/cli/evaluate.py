@@ -14,7 +14,7 @@ import numpy as np
 from multilift_marl.cli.common import announce_compiling, run_command
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
-from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.control.scripted import SCRIPTED, fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError, nearest
 from multilift_marl.evaluation.report import format_table, make_report, write_report
@@ -27,7 +27,7 @@ _USAGE = """Judge a team on fixed seeds, beside the scripted ones on the same ep
   python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
   run         a run folder, its name, "latest", or the name of a shipped policy ("hover")     (latest)
-  policy      script in place of a run: formation, formation_integral or payload_geometric    (none)
+  policy      script in place of a run: formation, formation_integral, formation_lead, payload_geometric    (none)
   config      environment of that script, a configuration's name or path                      (hover)
   checkpoint  best, last, or a file                                                           (best)
   episodes    how many                                                                        (200)
@@ -58,11 +58,11 @@ def _evaluate(values: dict[str, Any]) -> int:
     flown = _find_script(own) if own["policy"] is not None else _find_policy(str(own["run"]), str(own["checkpoint"]))
     config = build_config(flown.config.model_dump(), {"env.num_threads": 0} | values)
     _ = config.system
-    makers = {flown.name: flown.make}
-    if own["baseline"] != "none":
-        makers |= {name: _script(name) for name in SCRIPTED if name != flown.name}
     announce_compiling()
     probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
+    makers = {flown.name: flown.make}
+    if own["baseline"] != "none":
+        makers |= {name: _script(name) for name in (*fitting_scripts(probe), own["baseline"]) if name != flown.name}
     for make in makers.values():  # refuses what does not fit, before there is a folder
         make(probe)
     out = Path(own["out"]) if own["out"] else flown.folder / "eval" / time.strftime("%Y%m%d-%H%M%S")

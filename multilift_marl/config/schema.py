@@ -198,7 +198,7 @@ class TrainConfig(Section):
     critic: Literal["flat", "set", "attention"] = Field(
         "flat", description="of mappo; set, attention: the same value in whatever order the drones stand"
     )
-    residual: Literal["formation", "formation_integral"] = Field(
+    residual: Literal["formation", "formation_integral", "formation_lead"] = Field(
         "formation", description="script that an untrained policy flies and the learned one corrects"
     )
     frames: Int = Field(5_000_000, ge=1, description="environment steps in all")
@@ -208,7 +208,9 @@ class TrainConfig(Section):
     learning_rate: Float = Field(1e-3, gt=0, description="[-] of Adam, at the start")
     final_learning_rate: Float = Field(0.1, ge=0, le=1, description="[-] fraction of it left at the end (linear)")
     desired_kl: Float = Field(
-        0.0, ge=0, description="[-] approximate KL of the first updates that the rate is set for; 0: the rate falls linearly"
+        0.0,
+        ge=0,
+        description="[-] approximate KL that the rate is set for at first; 0: the rate falls linearly",
     )
     gamma: Float = Field(0.99, ge=0, le=1, description="[-] discount of one policy step")
     gae_lambda: Float = Field(0.95, ge=0, le=1, description="[-] of generalised advantage estimation")

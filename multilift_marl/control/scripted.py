@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from math import cos, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.payload_geometric import PayloadGeometric
 from multilift_marl.errors import ConfigError, nearest
 
@@ -13,6 +15,8 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 INTEGRAL_GAIN = 0.5  # [1/s]
+LEAD_TIME = 0.4  # [s] that a payload's acceleration follows a moved slot: the lags of reference and drone
+LEAD_GAIN = 0.87  # [-] of the displacement that the acceleration asks for; RMSE is least there at (2, 2) and (2, 4)
 
 
 class Formation:
@@ -53,16 +57,66 @@ class FormationIntegral(Formation):
         return matrix
 
 
-LINEAR: dict[str, type[Formation]] = {"formation": Formation, "formation_integral": FormationIntegral}
+class FormationLead(Formation):
+    """The formation displaced by what the payload's acceleration to come asks of its cables.
+
+    They pull along gravity and acceleration together (the payload's flatness, Sreenath and Kumar 2013), so that drones
+    stand h a / g ahead of their slots with h the height of the formation's cables; a is that of `LEAD_TIME` ahead, from
+    the places that the target is told to pass.
+
+    Raises:
+        ConfigError: the task tells none.
+    """
+
+    TOLD = tuple(f"target_ahead_{round(1000 * share * LEAD_TIME)}ms" for share in (1, 2))
+
+    def __init__(self, vec: MultiliftVec):
+        if not self.fits(vec):
+            raise ConfigError(
+                f"formation_lead needs to know where the target will go, and task {vec.config.task} does not tell; "
+                "take formation"
+            )
+        lengths, angle = vec.world.system.cable_length, vec.config.cable.angle
+        self._height = float(np.mean(lengths)) * cos(radians(angle))
+        super().__init__(vec)
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        matrix = super().matrix()
+        gain = LEAD_GAIN * self._height / GRAVITY / LEAD_TIME**2 / self._max_offset
+        for axis in range(2):
+            for name, weight in zip(self.TOLD, (-2, 1), strict=True):  # a second difference
+                matrix[axis, self._names.index(f"{name}_{axis}")] = weight * gain
+        return matrix
+
+    @classmethod
+    def fits(cls, vec: MultiliftVec) -> bool:
+        """Return whether the task tells where the target will go."""
+        return all(f"{name}_0" in vec.observation_names for name in cls.TOLD)
+
+
+LINEAR: dict[str, type[Formation]] = {
+    "formation": Formation,
+    "formation_integral": FormationIntegral,
+    "formation_lead": FormationLead,
+}
 """Scripts that are maps of the observation."""
 SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {**LINEAR, "payload_geometric": PayloadGeometric}
+
+
+def fitting_scripts(vec: MultiliftVec) -> list[str]:
+    """Return the names of the scripts that can fly the environments `vec`."""
+    if vec.config.control.action != "reference":
+        return []
+    return [name for name in SCRIPTED if name != "formation_lead" or FormationLead.fits(vec)]
 
 
 def make_scripted(name: str, vec: MultiliftVec) -> Formation | PayloadGeometric:
     """Return the scripted policy `name` for the environments `vec`.
 
     Raises:
-        ConfigError: there is no such script, or the environments have another action interface than scripts have.
+        ConfigError: there is no such script, or the environments have another action interface than scripts have, or
+            do not tell it what it needs.
     """
     if name not in SCRIPTED:
         raise ConfigError(f"unknown scripted policy '{name}'{nearest(name, SCRIPTED)}")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.config.schema import Config
-from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.evaluation.rollout import Policy
@@ -161,6 +161,4 @@ def _fitting(vec: MultiliftVec, learned: dict[str, Any]) -> dict[str, Callable[[
     for name, policy in learned.items():
         if not policy.misfit(vec):
             makers[name] = policy.bind
-    if vec.config.control.action == "reference":
-        makers |= {name: functools.partial(make_scripted, name) for name in SCRIPTED}
-    return makers
+    return makers | {name: functools.partial(make_scripted, name) for name in fitting_scripts(vec)}
