@@ -167,3 +167,29 @@ def test_the_learning_rate_follows_the_desired_kl(kl, factor):
 def test_the_adapted_learning_rate_stays_within_bounds():
     assert adapted_rate(1e-5, 1.0, 0.01) == 1e-5
     assert adapted_rate(1e-2, 0.0, 0.01) == 1e-2
+
+
+@pytest.mark.parametrize("desired_kl", [0.0, 0.01])
+def test_in_the_warmup_the_critic_alone_learns(tmp_path, desired_kl):
+    trainer = make_trainer(tmp_path, **{"train.warmup": 2, "train.desired_kl": desired_kl})
+    actor, critic = trainer.learner.actor.team, trainer.learner.critic
+    for iteration in range(3):
+        before = [[weight.detach().clone() for weight in net.parameters()] for net in (actor, critic)]
+        trainer.step()
+        same = [
+            all(torch.equal(a, b) for a, b in zip(old, net.parameters(), strict=True))
+            for old, net in zip(before, (actor, critic), strict=True)
+        ]
+        assert same == [iteration < 2, False]
+
+
+def test_the_critic_has_its_own_learning_rate(tmp_path):
+    trainer = make_trainer(
+        tmp_path, **{"train.learning_rate": 1e-4, "train.critic_learning_rate": 3e-3, "train.final_learning_rate": 0.5}
+    )
+    actor, critic = trainer.learner.optimizer.param_groups
+    assert {id(weight) for weight in actor["params"]} == {id(weight) for weight in trainer.learner.actor.parameters()}
+    for iteration in range(trainer.iterations // 2 + 1):
+        trainer.step()
+    left = 1 - 0.5 * iteration / trainer.iterations
+    assert (actor["lr"], critic["lr"]) == (pytest.approx(1e-4 * left), pytest.approx(3e-3 * left))

@@ -78,12 +78,13 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     loss.set_keys(**keys, action=agents["action"], sample_log_prob=("agents", "action_log_prob"))
     advantage = MultiAgentGAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=value)
     advantage.set_keys(**keys)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate, eps=1e-5)
+    groups = [{"params": list(actor.parameters())}, {"params": list(critic.parameters())}]  # rates of their own
+    optimizer = torch.optim.Adam(groups, lr=config.learning_rate, eps=1e-5)
     return Learner(config, actor, critic, policy, loss, advantage, optimizer)
 
 
 def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
-    """Improve the policy on one batch of rollouts [E, T]; return diagnostics.
+    """Improve policy and critic on one batch of rollouts [E, T]; return diagnostics.
 
     Args:
         learner: changed in place.

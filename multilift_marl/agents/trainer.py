@@ -110,16 +110,21 @@ class Trainer:
         """Collect one batch, learn from it, and return the iteration's numbers."""
         start, train, optimizer = time.perf_counter(), self.config.train, self.learner.optimizer
         left = 1 - (1 - train.final_learning_rate) * self.iteration / self.iterations
+        actor, critic = optimizer.param_groups
         if not train.desired_kl:
-            optimizer.param_groups[0]["lr"] = train.learning_rate * left
-        rate = optimizer.param_groups[0]["lr"]
+            actor["lr"] = train.learning_rate * left
+        critic["lr"] = train.critic_learning_rate * left if train.critic_learning_rate else actor["lr"]
+        rate = actor["lr"]
+        if self.iteration < train.warmup:
+            actor["lr"] = 0.0
         batch = next(self._batches)
         sampling = time.perf_counter() - start
         torch.set_num_threads(train.threads)
         values = update(self.learner, batch)
         torch.set_num_threads(1)
-        if train.desired_kl:
-            optimizer.param_groups[0]["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl * left)
+        actor["lr"] = rate
+        if train.desired_kl and self.iteration >= train.warmup:
+            actor["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
         learning = values.pop("learning_seconds")
         values |= self._episodes(batch)
         self.iteration += 1

@@ -210,8 +210,10 @@ class TrainConfig(Section):
     desired_kl: Float = Field(
         0.0,
         ge=0,
-        description="[-] approximate KL that the rate is set for at first; 0: the rate falls linearly",
+        description="[-] approximate KL of an update that the learning rate is set for; 0: it falls linearly",
     )
+    critic_learning_rate: Float | None = Field(None, gt=0, description="[-] of the critic; None: as the actor's")
+    warmup: Int = Field(0, ge=0, description="iterations in which the critic alone learns")
     gamma: Float = Field(0.99, ge=0, le=1, description="[-] discount of one policy step")
     gae_lambda: Float = Field(0.95, ge=0, le=1, description="[-] of generalised advantage estimation")
     clip: Float = Field(0.2, gt=0, description="[-] PPO's clipping range")
