@@ -29,7 +29,7 @@ PARTS = {
 
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
-    values = parse_overrides(arguments)
+    values = {"env.num_envs": 256} | parse_overrides(arguments)
     repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
     everything = {key: value for part in PARTS.values() for key, value in part.items()}
     runners = {

@@ -110,7 +110,7 @@ def measure(runners: dict[str, Runner], repeats: int, seconds: float) -> dict[st
 
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
-    values = parse_overrides(arguments)
+    values = {"env.num_envs": 256} | parse_overrides(arguments)
     repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
     config = load_config("hover", values)
     vec = ml.make_vec(config)

@@ -33,7 +33,7 @@ CASES = {  # name: what it switches on beside the shipped configuration
 
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
-    values = parse_overrides(arguments)
+    values = {"env.num_envs": 256} | parse_overrides(arguments)
     repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
     everything = {key: width for case in CASES.values() for key, width in case.items()}
     cases = {"off": {}, **CASES, "everything": everything}

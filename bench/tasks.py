@@ -27,7 +27,7 @@ def ratio(config: str, repeats: int, seconds: float, **overrides) -> tuple[float
 
 def main(arguments: list[str]) -> None:
     """Measure and print two tables."""
-    values = parse_overrides(arguments)
+    values = {"env.num_envs": 256} | parse_overrides(arguments)
     repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
     print("| task | ratio to bare | bare [µs] | core [µs] |\n|---|---|---|---|")
     for task in ml.list_tasks():

@@ -27,7 +27,6 @@ from multilift_marl.evaluation.rollout import fly_episodes
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
 EPISODES, SEED = 200, 1000
 FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
-AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
 FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
 
 
@@ -44,14 +43,14 @@ class Flight(NamedTuple):
 
 FLIGHTS: dict[str, Flight] = {
     "hover": Flight("hover", {}, "hover", "hover"),
-    "pose_easy": Flight("pose_easy", {}, "pose_easy", "pose, tilts to 20°"),
+    "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
     "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
     "circle_slow": Flight("track_circle", {}, "track_circle", "circle, 0.2 rad/s"),
     "circle_fast": Flight("track_circle", {"task_options.rate": 0.4}, "track_circle", "circle, 0.4 rad/s"),
     "track": Flight("track", {}, "track", "figure-eight, 1 m/s, 0.5 m/s²", "3.2 cm"),
-    "track_2_2": Flight("track", FASTER, "track_agile", "figure-eight, 2 m/s, 2 m/s²", "9.3 cm"),
-    "track_2_4": Flight("track", AGILE, "track_agile", "figure-eight, 2 m/s, 4 m/s²", "11.7 cm"),
-    "track_5_8": Flight("track", FASTEST, "track_agile", "figure-eight, 5 m/s, 8 m/s²", "19.7 cm"),
+    "track_2_2": Flight("track", FASTER, "track", "figure-eight, 2 m/s, 2 m/s²", "9.3 cm"),
+    "track_2_4": Flight("track_agile", {}, "track_agile", "figure-eight, 2 m/s, 4 m/s²", "11.7 cm"),
+    "track_5_8": Flight("track", FASTEST, "track", "figure-eight, 5 m/s, 8 m/s²", "19.7 cm"),
     "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),
     "land": Flight("land", {}, "land", "land"),
     "gate": Flight("gate", {}, "gate", "gate"),

@@ -37,7 +37,7 @@ INFO = {"success", "failure", "diverged", "failure_cause", "reward_terms", "rand
 JARGON = ("Input ", "Value error", "Field required", "Tuple ", "instance of", "\n", ". ", "  ", "Errno")
 SMALL = {
     "env.num_envs": 8, "env.num_threads": 1, "env.episode_seconds": 0.5, "train.horizon": 16, "train.frames": 1280,
-    "train.minibatches": 4, "train.checkpoint_every": 5, "eval.every": 4, "eval.episodes": 3,
+    "train.minibatches": 4, "train.warmup": 0, "train.checkpoint_every": 5, "eval.every": 4, "eval.episodes": 3,
 }  # fmt: skip
 
 

@@ -34,7 +34,7 @@ class EnvConfig(Section):
     """Size and timing of the environment."""
 
     num_drones: Int = Field(4, ge=1, le=64, description="drones in a team")
-    num_envs: Int = Field(256, ge=1, description="environments stepped together")
+    num_envs: Int = Field(128, ge=1, description="environments stepped together")
     num_threads: Int = Field(0, ge=0, description="threads that step them; 0: one for each CPU")
     episode_seconds: Float = Field(8.0, gt=0, description="[s] time limit of an episode")
     policy_hz: Float = Field(50.0, gt=0, description="[Hz] rate of actions and observations")
@@ -202,27 +202,27 @@ class TrainConfig(Section):
         "formation", description="script that an untrained policy flies and the learned one corrects"
     )
     frames: Int = Field(5_000_000, ge=1, description="environment steps in all")
-    horizon: Int = Field(32, ge=1, description="steps of each environment between updates")
+    horizon: Int = Field(128, ge=1, description="steps of each environment between updates")
     epochs: Int = Field(4, ge=1, description="passes over each batch")
-    minibatches: Int = Field(8, ge=1, description="minibatches of each pass")
-    learning_rate: Float = Field(1e-3, gt=0, description="[-] of Adam, at the start")
+    minibatches: Int = Field(4, ge=1, description="minibatches of each pass")
+    learning_rate: Float = Field(6e-4, gt=0, description="[-] of Adam, at the start")
     final_learning_rate: Float = Field(0.1, ge=0, le=1, description="[-] fraction of it left at the end (linear)")
     desired_kl: Float = Field(
         0.0,
         ge=0,
         description="[-] approximate KL of an update that the learning rate is set for; 0: it falls linearly",
     )
-    critic_learning_rate: Float | None = Field(None, gt=0, description="[-] of the critic; None: as the actor's")
-    warmup: Int = Field(0, ge=0, description="iterations in which the critic alone learns")
+    critic_learning_rate: Float | None = Field(2e-3, gt=0, description="[-] of the critic; None: as the actor's")
+    warmup: Int = Field(12, ge=0, description="iterations in which the critic alone learns")
     gamma: Float = Field(0.99, ge=0, le=1, description="[-] discount of one policy step")
-    gae_lambda: Float = Field(0.95, ge=0, le=1, description="[-] of generalised advantage estimation")
+    gae_lambda: Float = Field(0.985, ge=0, le=1, description="[-] of generalised advantage estimation")
     clip: Float = Field(0.2, gt=0, description="[-] PPO's clipping range")
     entropy: Float = Field(0.0, ge=0, description="[-] weight of the entropy bonus")
     value_weight: Float = Field(1.0, ge=0, description="[-] weight of the critic's loss")
     max_grad_norm: Float = Field(1.0, gt=0, description="[-] gradient clipping")
     target_kl: Float = Field(0.03, gt=0, description="[-] approximate KL that ends an update early")
-    hidden: tuple[Annotated[Int, Field(ge=1)], ...] = Field((128, 128), description="[-] widths of the hidden layers")
-    initial_std: Float = Field(0.3, gt=0, description="[-] of the action distribution at the start")
+    hidden: tuple[Annotated[Int, Field(ge=1)], ...] = Field((64, 64), description="[-] widths of the hidden layers")
+    initial_std: Float = Field(0.12, gt=0, description="[-] of the action distribution at the start")
     overrides: dict[str, Any] = Field({}, description="of the environment that it trains in, by dotted name")
     threads: Int = Field(1, ge=1, description="threads of the update; weights are bit-equal for the same number")
     checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
