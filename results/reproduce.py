@@ -45,6 +45,7 @@ FLIGHTS: dict[str, Flight] = {
     "hover": Flight("hover", {}, "hover", "hover"),
     "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
     "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
+    "pose_falcon3": Flight("pose_falcon3", {}, "pose_falcon3", "pose, three drones, tilts to 45°"),
     "circle_slow": Flight("track_circle", {}, "track_circle", "circle, 0.2 rad/s"),
     "circle_fast": Flight("track_circle", {"task_options.rate": 0.4}, "track_circle", "circle, 0.4 rad/s"),
     "track": Flight("track", {}, "track", "figure-eight, 1 m/s, 0.5 m/s²", "3.2 cm"),
