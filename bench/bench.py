@@ -29,9 +29,6 @@ Runner = Callable[[], int]
 def bare(vec: MultiliftVec, threads: int) -> Runner:
     """Return a runner of bare stepping, from the states and loads that the teams of `vec` are in at present."""
     batch = Batch(vec.world.model, vec.num_envs, nthread=threads)
-    vec.reset()
-    for _ in range(5):
-        vec.step(np.zeros((vec.num_envs, vec.num_drones, vec.action_size), np.float32))
     interval, ticks = vec.world.system.control_interval, vec.control_ticks
     batch.bind("sensordata")
 

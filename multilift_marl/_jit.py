@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import hashlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, TypeVarTuple, cast
@@ -20,7 +22,21 @@ def kernel(function: F) -> F:
 
     Arithmetic is exact IEEE, so results do not depend on how many environments are computed together.
     """
-    return cast(F, njit(cache=True, nogil=True, error_model="numpy")(function))
+    dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy")(function)
+    files = dispatcher._cache._cache_file
+    files.save = functools.partial(_save_in_turn, files, files.save)
+    return cast(F, dispatcher)
+
+
+def _save_in_turn(files: Any, save: Callable[[Any, Any], None], key: Any, data: Any) -> None:
+    """Add to the cache while no other process does.
+
+    Numba numbers a kernel's files by an index that it reads first: two processes that compile different signatures at
+    once would write the same file, and one would later be taken for the other.
+    """
+    with open(os.path.join(files._cache_path, "kernels.lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        save(key, data)
 
 
 def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Callable[[], None]:

@@ -93,7 +93,7 @@ class Track(Task):
         self.path, self.worst = Path.zeros(world.num_envs), np.zeros(world.num_envs)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
-        """Draw heading and, for a random path, way-points; the team hangs at its start. See `Task.start`."""
+        """Draw heading, form and figures of the path; the team hangs at its start. See `Task.start`."""
         option, path = self.options, self.path
         heading = rng.uniform(-pi, pi)
         form = option.path[rng.integers(len(option.path))] if len(option.path) > 1 else option.path[0]
