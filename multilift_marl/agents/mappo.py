@@ -6,8 +6,8 @@ import time
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torchrl.modules import IndependentNormal, PopArtValueNorm, ProbabilisticActor
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
@@ -21,6 +21,26 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.tasks.observations import drone_numbers
 
 
+class Explorer(TensorDictModuleBase):
+    """What flies the rollouts: actions drawn from the actor's Gaussian, with their log-probabilities.
+
+    A module of its own, since the bookkeeping of TensorDict's general ones costs as much as the network.
+    """
+
+    def __init__(self, actor: Actor):
+        super().__init__()
+        self.in_keys = [("agents", "observation")]
+        self.out_keys = [("agents", "action"), ("agents", "action_log_prob")]
+        self.actor = actor
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write action and log-probability of every drone."""
+        agents = tensordict["agents"]
+        agents["action"], agents["action_log_prob"] = draw_action(*self.actor(agents["observation"]))
+        return tensordict
+
+
 @dataclass
 class Learner:
     """What learns: networks, loss, advantage estimator, optimiser."""
@@ -28,7 +48,7 @@ class Learner:
     config: TrainConfig
     actor: Actor
     critic: CentralCritic | LocalCritic
-    policy: TensorDictSequential
+    policy: Explorer
     loss: MAPPOLoss
     advantage: MultiAgentGAE
     optimizer: torch.optim.Adam
@@ -49,12 +69,11 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     base = torch.from_numpy(residual_matrix(config.residual, vec))
     actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
     agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
-    drawn, gaussian = [agents["action"], ("agents", "action_log_prob")], [agents["loc"], agents["scale"]]
+    policy, gaussian = Explorer(actor), [agents["loc"], agents["scale"]]
     mean = TensorDictModule(actor, in_keys=[agents["observation"]], out_keys=gaussian)
-    policy = TensorDictSequential(mean, TensorDictModule(draw_action, in_keys=gaussian, out_keys=drawn))
     judged = ProbabilisticActor(
-        mean, in_keys=gaussian, out_keys=drawn[:1], distribution_class=IndependentNormal, return_log_prob=True,
-        log_prob_key=drawn[1],
+        mean, in_keys=gaussian, out_keys=[agents["action"]], distribution_class=IndependentNormal,
+        return_log_prob=True, log_prob_key=("agents", "action_log_prob"),
     )  # fmt: skip
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).

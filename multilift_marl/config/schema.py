@@ -224,7 +224,7 @@ class TrainConfig(Section):
     hidden: tuple[Annotated[Int, Field(ge=1)], ...] = Field((64, 64), description="[-] widths of the hidden layers")
     initial_std: Float = Field(0.12, gt=0, description="[-] of the action distribution at the start")
     overrides: dict[str, Any] = Field({}, description="of the environment that it trains in, by dotted name")
-    threads: Int = Field(1, ge=1, description="threads of the update; weights are bit-equal for the same number")
+    threads: Int = Field(2, ge=1, description="threads of the update; weights are bit-equal for the same number")
     checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
 
 
