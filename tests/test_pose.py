@@ -11,7 +11,7 @@ from conftest import floats, make, refusal, same, zeros
 import multilift_marl as ml
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.math3d import rotation_vector
-from multilift_marl.tasks.way import attitude_of, ease
+from multilift_marl.tasks.way import attitude_of
 
 CALM = {"randomization.payload_mass": 0.0}
 
@@ -67,15 +67,6 @@ def test_a_new_target_comes_every_four_seconds_and_is_not_seen_before():
         assert same(other._observation, seen[step])
     other.step(zeros(other))
     assert not same(other._observation[..., told], seen[200][..., told])
-
-
-def test_ease_is_smooth_from_rest_to_rest():
-    x = np.linspace(0, 1, 2001)
-    values = np.array([ease(t) for t in x])
-    assert values[0].tolist() == [0, 0, 0, 0]
-    np.testing.assert_allclose(values[-1], [1, 0, 0, 0], atol=1e-12)
-    for k in range(3):
-        np.testing.assert_allclose(np.gradient(values[:, k], x)[1:-1], values[1:-1, k + 1], atol=2e-3)
 
 
 def test_the_way_moves_as_its_velocities_say_and_ends_at_the_target():

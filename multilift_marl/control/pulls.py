@@ -28,6 +28,7 @@ from multilift_marl.math3d import (
 )
 from multilift_marl.sim.cables import cable_end
 
+WIDER = 1.5  # [-] at tilted targets, see `place_balanced`
 LEAST = 0.2  # of its tension in the level formation, with which every cable is to pull
 BALANCED = 1e-6  # [N] and [N m] for each N of weight: balance to within rounding
 _DAMPING = 1e-9  # relative; makes moments that no pulls can exert harmless
@@ -211,15 +212,18 @@ def place_slots(e, goal, rig, hanging):
 def place_balanced(e, goal, rig, hanging):
     """Do as `place_formation`, for tilted targets too; return whether the team can hold the payload there.
 
-    Over a level target the formation balances. Over a tilted one, its pulls are changed as little as balances weight
-    and moment with every cable pulling, and the slots follow from them.
+    Over a level target the formation balances. Over one tilted by θ its pulls, with 1 + `WIDER` (1 - cos θ) times their
+    level parts, are changed as little as balances weight and moment with every cable pulling, and the slots follow from
+    them. Wider pulls keep cables apart whose anchors come to lie one over the other.
     """
     place_formation(e, goal, rig)
     target = matrow(goal.rotation, e)
     if target[8] > 1.0 - 1e-12 or not np.any(rig.anchors != 0.0):
         return True
     for n in range(rig.anchors.shape[0]):
-        goal.pull[e, n, 2] -= hanging.weight[n]
+        pull = vec(goal.pull, e, n)
+        wide = 1.0 + WIDER * (1.0 - target[8])
+        put(goal.pull[e, n], (wide * pull[0], wide * pull[1], pull[2] - hanging.weight[n]))
     weight = hanging.payload_mass * GRAVITY
     left = solve_pulls((0.0, 0.0, weight), _STILL, target, rig.anchors, LEAST, goal.pull[e])
     place_slots(e, goal, rig, hanging)

@@ -33,7 +33,7 @@ class PoseOptions(Section):
     target_tilt: Float = Field(45.0, ge=0, lt=60, description="[deg] target roll and pitch within ± this")
     target_yaw: Float = Field(180.0, ge=0, le=180, description="[deg] target heading within ± this")
     target_seconds: Float = Field(4.0, gt=0, description="[s] until the next target")
-    way_seconds: Float = Field(2.8, gt=0, description="[s] that the planned way to a target takes")
+    way_seconds: Float = Field(3.0, gt=0, description="[s] that the planned way to a target takes")
     success_distance: Float = Field(0.05, gt=0, description="[m] payload within this of each target ...")
     success_angle: Float = Field(5.0, gt=0, description="[deg] ... and within this of its attitude ...")
     success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout its last seconds, or a shorter one's all")

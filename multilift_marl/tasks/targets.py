@@ -18,6 +18,7 @@ from multilift_marl.tasks.way import attitude_of
 
 MAX_LEAP = MAX_DISTANCE - 0.25  # [m] from a target to the next one: nearer than what counts as failure
 CLEARANCE = 0.1  # [m] of the payload from the ground at a target
+ABOVE = 0.1  # of a cable's length, by which every drone is to be above the payload there
 MARGIN = 1.2  # of distances between drones and cables at rest over those that count as failures
 MAX_REDRAWS = 1000
 
@@ -102,6 +103,8 @@ def _within(e, goal, rig, hanging, bounds):
         pull = sub(vec(goal.pull, e, n), rope)
         carried = add(scale(bounds.load, pull), add(rope, (0.0, 0.0, rig.drones.mass[n] * GRAVITY)))
         if norm(carried) > bounds.thrust[n]:
+            return False
+        if slot[2] - position[2] < ABOVE * hanging.length[n]:
             return False
         anchor = add(position, mul(target, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
         for m in range(n):

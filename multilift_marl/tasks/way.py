@@ -32,6 +32,9 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
+from multilift_marl.tasks.ground import ease
+
+DIP = 0.5  # [-] by which roll and pitch are less half-way: a payload that turns is easier to pull the less it tilts
 
 
 class Plan(NamedTuple):
@@ -61,15 +64,6 @@ def attitude_of(yaw, roll, pitch):
 def _tilt(roll, pitch):
     cr, sr, cp, sp = cos(roll), sin(roll), cos(pitch), sin(pitch)
     return (cp, 0.0, sp, sr * sp, cr, -sr * cp, -cr * sp, sr, cr * cp)
-
-
-@kernel
-def ease(x):
-    """Return s(x) from 0 to 1 and its first three derivatives; these and the fourth vanish at both ends."""
-    u, v = x * (1.0 - x), 1.0 - 2.0 * x
-    s = x * x * x * x * x * (126.0 - x * (420.0 - x * (540.0 - x * (315.0 - 70.0 * x))))
-    u2 = u * u
-    return s, 630.0 * u2 * u2, 2520.0 * u2 * u * v, 2520.0 * u2 * (3.0 * v * v - 2.0 * u)
 
 
 @kernel
@@ -133,14 +127,15 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         gone = time[e] - k * hold
         if gone >= seconds + 4.5 * dt:  # a little later than the way ends: the differences of the slots are zero
             continue
-        s, ds, dds, ddds = ease(min(gone / seconds, 1.0))
-        ds, dds, ddds = ds / seconds, dds / (seconds * seconds), ddds / (seconds * seconds * seconds)
+        s, ds, dds, ddds = ease(gone, 0.0, seconds)
         a, b = plan.pose[e, k], plan.pose[e, k + 1]
         before, start, step = row(way.position, e), (a[0], a[1], a[2]), (b[0] - a[0], b[1] - a[1], b[2] - a[2])
-        turned, rolled, pitched = wrap(b[3] - a[3]), b[4] - a[4], b[5] - a[5]
-        yaw, roll, pitch = a[3] + s * turned, a[4] + s * rolled, a[5] + s * pitched
+        turned = wrap(b[3] - a[3])
+        yaw = a[3] + s * turned
+        (roll, rolled, rolling), (pitch, pitched, pitching) = _dipped(a[4], b[4], s), _dipped(a[5], b[5], s)
         attitude, position = attitude_of(yaw, roll, pitch), add(start, scale(s, step))
         spin, swing = _spin(yaw, roll, turned, rolled, pitched)
+        swing = add(swing, _spin(yaw, roll, 0.0, rolling, pitching)[0])
         acceleration, turning = scale(dds, step), add(scale(dds, spin), scale(ds * ds, swing))
         rates, c, si = scale(ds, spin), cos(yaw), sin(yaw)
         put(way.position[e], position)
@@ -176,6 +171,14 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
             # the drones' controllers add the inertia of their share of the load, which these pulls hold already
             share = rig.force[n, 2] / GRAVITY
             put(way.pull[e, n], sub(held, scale(share, add(acceleration, change))))
+
+
+@kernel
+def _dipped(start, end, s):
+    """Return the angle at share s of the way from start to end, less half-way, and its two derivatives by s."""
+    straight, change, u = start + s * (end - start), end - start, s * (1.0 - s)
+    dip, first, second = 1.0 - DIP * 16.0 * u * u, -DIP * 32.0 * u * (1.0 - 2.0 * s), -DIP * 32.0 * (1.0 - 6.0 * u)
+    return straight * dip, change * dip + straight * first, 2.0 * change * first + straight * second
 
 
 @kernel
