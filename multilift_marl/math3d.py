@@ -1,6 +1,7 @@
-"""Vectors, rotations and quaternions on scalars, for compiled loops: a vector is a tuple of 3, a matrix of 9 (rows).
+"""Vectors, rotations, quaternions and smooth ways on scalars, for compiled loops.
 
-Quaternions are (w, x, y, z). Tuples live in registers, so that a loop over drones allocates nothing.
+A vector is a tuple of 3, a matrix of 9 (rows). Quaternions are (w, x, y, z). Tuples live in registers, so that a loop
+over drones allocates nothing.
 """
 
 from __future__ import annotations
@@ -260,3 +261,16 @@ def segment_distance(p1, q1, p2, q2):
     elif t > 1.0:
         t, s = 1.0, clip((b - c) / a, 0.0, 1.0)
     return norm(sub(add(p1, scale(s, d1)), add(p2, scale(t, d2))))
+
+
+@kernel
+def ease(t, begin, seconds):
+    """Return the share of a smooth way done at time t [s], and its first three derivatives in time.
+
+    The polynomial of degree seven whose first three derivatives are zero at both ends.
+    """
+    s = min(max((t - begin) / seconds, 0.0), 1.0)
+    u = s * (1.0 - s)
+    share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
+    second = 420.0 * u**2 * (1.0 - 2.0 * s) / seconds**2
+    return share, 140.0 * u**3 / seconds, second, 840.0 * u * (1.0 - 5.0 * u) / seconds**3

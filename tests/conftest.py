@@ -14,7 +14,7 @@ from math import sqrt
 import numpy as np
 import pytest
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # Numba's cache is not made for two that fill it at the same time
+if "PYTEST_XDIST_WORKER" in os.environ:  # each worker compiles for itself, so that none waits
     _kernels = tempfile.TemporaryDirectory(prefix="kernels")
     os.environ["NUMBA_CACHE_DIR"] = _kernels.name
 

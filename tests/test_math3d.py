@@ -207,3 +207,11 @@ def test_segment_distance_against_brute_force(seed):
 def test_segment_distance_of_special_pairs(p1, q1, p2, q2, expected):
     points = [tuple(float(x) for x in point) for point in (p1, q1, p2, q2)]
     close(math3d.segment_distance(*points), expected, 1e-8)
+
+
+def test_eased_ways_are_smooth_to_the_third_derivative():
+    t, h = np.linspace(0.9, 3.2, 60), 1e-4
+    values = np.array([[math3d.ease(x + k * h, 1.0, 2.0) for k in (-1, 0, 1)] for x in t])
+    slopes = (values[:, 2] - values[:, 0]) / (2 * h)
+    np.testing.assert_allclose(slopes[:, :3], values[:, 1, 1:], atol=2e-5)
+    assert tuple(math3d.ease(1.0, 1.0, 2.0)) == (0, 0, 0, 0) and tuple(math3d.ease(3.0, 1.0, 2.0)) == (1, 0, 0, 0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from math import pi
+from itertools import combinations
+from math import cos, pi
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from conftest import floats, make, refusal, same, zeros
 
 import multilift_marl as ml
 from multilift_marl.control.scripted import make_scripted
-from multilift_marl.math3d import rotation_vector
+from multilift_marl.math3d import rotation_vector, segment_distance
 from multilift_marl.tasks.way import attitude_of
 
 CALM = {"randomization.payload_mass": 0.0}
@@ -124,16 +125,37 @@ def test_pulls_of_the_way_give_the_payload_the_motion_of_the_way(num_drones):
     np.testing.assert_allclose(moment, change, atol=0.01 * np.abs(change).max() + 1e-3)
 
 
-def test_slots_turn_about_the_payload_and_never_meet():
-    vec = make("pose", num_envs=64)
+@pytest.mark.parametrize("name", ["pose", "pose_falcon3"])
+def test_drones_and_cables_stay_apart_and_no_drone_leans_far_on_the_way(name):
+    vec = ml.make_vec(name, num_envs=64, num_threads=1)
     vec.reset(seed=0)
-    lead, least = vec.task.planner(0, 64), 9.0
-    for _ in range(3000):
+    task, system, weight = vec.task, vec.world.system, 9.81 * vec.world.system.vehicles[0].mass
+    lead, way, pairs = task.planner(0, 64), task.way, list(combinations(range(vec.num_drones), 2))
+    drones, cables, upright = 9.0, 9.0, 1.0
+    for step in range(3000):
         lead()
-        slots = vec.task.way.slots
-        apart = np.linalg.norm(slots[:, :, None] - slots[:, None], axis=-1) + 9 * np.eye(4)
-        least = min(least, apart.min())
-    assert least > vec.world.system.min_separation.max()
+        if step % 10:
+            continue
+        feet = way.position[:, None] + np.einsum("eij,nj->eni", way.rotation, system.anchors)
+        for i, j in pairs:
+            drones = min(drones, np.linalg.norm(way.slots[:, i] - way.slots[:, j], axis=-1).min())
+            for e in range(64):
+                ends = (floats(line[e, n]) for n in (i, j) for line in (feet, way.slots))
+                cables = min(cables, segment_distance(*ends))
+        inertial = way.acceleration[:, None] + way.slot_acceleration
+        share = (system.drone_pull[:, 2] / 9.81)[None, :, None] * inertial
+        thrust = way.pull + share + weight / 9.81 * inertial + [0.0, 0.0, weight]
+        upright = min(upright, (thrust[..., 2] / np.linalg.norm(thrust, axis=-1)).min())
+    assert drones > system.min_separation.max()
+    assert cables > 0.12
+    assert upright > cos(pi / 4)
+
+
+def test_drones_are_above_a_tilted_payload():
+    vec = ml.make_vec("pose_falcon3", num_envs=256, num_threads=1)
+    vec.reset(seed=0)
+    above = vec.task.goal.slots[..., 2] - vec.task.goal.position[:, None, 2]
+    assert 0.1 < above.min() < 0.2  # some of them are as low as they may be
 
 
 def test_success_needs_the_last_second_of_every_target():

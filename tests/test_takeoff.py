@@ -10,7 +10,6 @@ from test_scripted_flights import fly_once
 import multilift_marl as ml
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.math3d import axis_angle
-from multilift_marl.tasks.ground import ease
 from multilift_marl.tasks.takeoff import ARRIVED, FLYING, LIFT, LIFTED, PULL, STANDING, TIGHTEN
 
 CALM = {"randomization.payload_mass": 0.0}
@@ -64,14 +63,6 @@ def test_drones_beside_a_payload_too_wide_for_their_cables_are_refused():
 
 
 # The plan
-
-
-def test_eased_ways_are_smooth_to_the_third_derivative():
-    t, h = np.linspace(0.9, 3.2, 60), 1e-4
-    values = np.array([[ease(x + k * h, 1.0, 2.0) for k in (-1, 0, 1)] for x in t])
-    slopes = (values[:, 2] - values[:, 0]) / (2 * h)
-    np.testing.assert_allclose(slopes[:, :3], values[:, 1, 1:], atol=2e-5)
-    assert tuple(ease(1.0, 1.0, 2.0)) == (0, 0, 0, 0) and tuple(ease(3.0, 1.0, 2.0)) == (1, 0, 0, 0)
 
 
 def test_the_velocities_of_the_plan_are_those_of_target_and_slots():

@@ -28,8 +28,8 @@ from multilift_marl.math3d import (
 )
 from multilift_marl.sim.cables import cable_end
 
-WIDER = 1.5  # [-] at tilted targets, see `place_balanced`
-LEAST = 0.2  # of its tension in the level formation, with which every cable is to pull
+WIDER = 1.8  # [-] at tilted targets, see `place_balanced`
+LEAST = 0.2  # of its given tension, with which every cable is to pull
 BALANCED = 1e-6  # [N] and [N m] for each N of weight: balance to within rounding
 _DAMPING = 1e-9  # relative; makes moments that no pulls can exert harmless
 _ITERATIONS = 20
@@ -213,8 +213,8 @@ def place_balanced(e, goal, rig, hanging):
     """Do as `place_formation`, for tilted targets too; return whether the team can hold the payload there.
 
     Over a level target the formation balances. Over one tilted by θ its pulls, with 1 + `WIDER` (1 - cos θ) times their
-    level parts, are changed as little as balances weight and moment with every cable pulling, and the slots follow from
-    them. Wider pulls keep cables apart whose anchors come to lie one over the other.
+    level parts, are changed as little as balances weight and moment, each cable keeping `LEAST` of its widened pull;
+    the slots follow from them. Wider pulls keep cables apart whose anchors come to lie one over the other.
     """
     place_formation(e, goal, rig)
     target = matrow(goal.rotation, e)

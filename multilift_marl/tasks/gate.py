@@ -13,13 +13,12 @@ from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config
 from multilift_marl.config.values import Float, Int, Section
 from multilift_marl.control.formation import Reference, place_formation
-from multilift_marl.math3d import add, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, triple, turn, vec
+from multilift_marl.math3d import add, ease, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, triple, turn, vec
 from multilift_marl.sim.scene import drone_half_size
 from multilift_marl.sim.standing import hook_place
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Box, Task
 from multilift_marl.tasks.failures import WALL
-from multilift_marl.tasks.ground import ease
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.paths import STEP, differences, set_goal
 from multilift_marl.tasks.starts import hang_team, in_ball

@@ -1,4 +1,4 @@
-"""Where tasks meet the ground: how a team stands there, and the smooth ways from it and to it."""
+"""Where tasks meet the ground: how a team stands there, and how its targets leave it and come to it."""
 
 from __future__ import annotations
 
@@ -91,19 +91,6 @@ def stand_team(e, rng, state, goal, rig, ground, distance, spread):
 
 
 @kernel
-def ease(t, begin, seconds):
-    """Return the share of a smooth way done at time t [s], and its first three derivatives in time.
-
-    The polynomial of degree seven whose first three derivatives are zero at both ends.
-    """
-    s = min(max((t - begin) / seconds, 0.0), 1.0)
-    u = s * (1.0 - s)
-    share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
-    second = 420.0 * u**2 * (1.0 - 2.0 * s) / seconds**2
-    return share, 140.0 * u**3 / seconds, second, 840.0 * u * (1.0 - 5.0 * u) / seconds**3
-
-
-@kernel
 def rest_goal(e, goal, position):
     """Put the target of environment e at `position` [m], at rest."""
     put(goal.position[e], position)
@@ -112,7 +99,7 @@ def rest_goal(e, goal, position):
 
 @kernel
 def move_goal(e, goal, way, eased):
-    """Move the target of environment e along `way` [m] as `eased`, see `ease`; several ways add up."""
+    """Move the target of environment e along `way` [m] as `eased`, see `math3d.ease`; several ways add up."""
     put(goal.position[e], add(row(goal.position, e), scale(eased[0], way)))
     put(goal.velocity[e], add(row(goal.velocity, e), scale(eased[1], way)))
     put(goal.acceleration[e], add(row(goal.acceleration, e), scale(eased[2], way)))

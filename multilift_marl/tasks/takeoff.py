@@ -13,14 +13,13 @@ from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference, place_formation
-from multilift_marl.math3d import add, clip, matrow, put, putmat, rot_z, row, scale, sub, vec
+from multilift_marl.math3d import add, clip, ease, matrow, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, forgive, payload_height
 from multilift_marl.tasks.ground import (
     cable_chord,
     cable_rise,
-    ease,
     make_ground,
     mean_slot_tolerance,
     move_goal,

@@ -19,6 +19,7 @@ from multilift_marl.control.pulls import place_slots, reach, spread
 from multilift_marl.math3d import (
     add,
     cross,
+    ease,
     matmul,
     matrow,
     mul,
@@ -32,7 +33,6 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
-from multilift_marl.tasks.ground import ease
 
 DIP = 0.5  # [-] by which roll and pitch are less half-way: a payload that turns is easier to pull the less it tilts
 
