@@ -170,7 +170,7 @@ def test_the_integral_formation_takes_off():
 
 def test_in_return_motors_off_lose_to_standing_by_to_the_formation_to_its_integral():
     def score(script=None, raised=0.0, **gains):
-        vec = make("takeoff", num_envs=32)
+        vec = make("takeoff", num_envs=32, **{"control.max_offset": 0.5})
         vec.pilot.gains = vec.pilot.gains._replace(**gains)
         vec._bind()
         vec.reset(seed=0)
