@@ -71,6 +71,11 @@ def make(task: str = "hover", num_envs: int = 4, num_drones: int = 4, num_thread
     return ml.make_vec(task, num_envs=num_envs, num_drones=num_drones, num_threads=num_threads, **keywords)
 
 
+def wide(task: str) -> dict[str, float]:
+    """Return offsets with which drones of any task can fail: those of `takeoff` and `land` are small."""
+    return {"control.max_offset": 0.5} if task in ("takeoff", "land") else {}
+
+
 def make_system(num_drones: int = 1, **overrides) -> System:
     """Return the hover team's system; overrides by dotted name."""
     return ml.load_config("hover", {"env.num_drones": num_drones, **overrides}).system

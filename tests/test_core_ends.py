@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import bold_actions, level, make, mask, mixed_actions, same, zeros
+from conftest import bold_actions, level, make, mask, mixed_actions, same, wide, zeros
 
 from multilift_marl.math3d import axis_angle
 
@@ -34,7 +34,9 @@ def test_a_reset_starts_the_clock_of_its_environments_only(task, cables):
 
 def test_ends_have_one_cause(task, num_drones, cables):
     harsh = {"task_options.grace": 0.0} if task == "recover" else {}
-    vec = make(task, num_envs=12, num_drones=num_drones, **{"env.episode_seconds": 1.5, **harsh}, **cables)
+    vec = make(
+        task, num_envs=12, num_drones=num_drones, **{"env.episode_seconds": 1.5, **harsh}, **wide(task), **cables
+    )
     vec.reset(seed=0)
     terminations = truncations = 0
     for step in range(300):

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from conftest import CABLES, TASKS, bold_actions, make, mixed_actions
+from conftest import CABLES, TASKS, bold_actions, make, mixed_actions, wide
 
 
 @pytest.fixture(scope="module", params=product(TASKS, CABLES), ids="-".join)
@@ -52,7 +52,7 @@ def test_the_state_tells_what_is_hidden_from_the_drones(task, cables):
 
 
 def test_reward_is_the_sum_of_its_named_terms_for_every_drone(task, num_drones, cables):
-    vec, paid = make(task, num_drones=num_drones, **cables), set()
+    vec, paid = make(task, num_drones=num_drones, **wide(task), **cables), set()
     vec.reset(seed=0)
     for step in range(vec.max_steps):
         _, reward, terminated, truncated, info = vec.step(0.2 * bold_actions(vec, step, hold=3))

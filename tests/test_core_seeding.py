@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from conftest import INFO, bold_actions, make, mask, same
+from conftest import INFO, bold_actions, make, mask, same, wide
 
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 
@@ -100,7 +100,7 @@ def test_rows_outside_the_mask_are_unchanged(task, cables):
 
 @pytest.mark.parametrize("threads", [(1, 1), (1, 2), (2, 1)], ids=str)
 def test_a_saved_batch_continues_bit_for_bit(task, cables, threads):
-    first, second = (make(task, num_envs=5, num_threads=count, seed=5, **cables) for count in threads)
+    first, second = (make(task, num_envs=5, num_threads=count, seed=5, **wide(task), **cables) for count in threads)
     first.reset()
     play(first, 90, row=0)
     saved = first.state_dict()
