@@ -27,6 +27,7 @@ from multilift_marl.evaluation.rollout import fly_episodes
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
 EPISODES, SEED = 200, 1000
 FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
+AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
 FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
 
 
@@ -43,27 +44,27 @@ class Flight(NamedTuple):
 
 FLIGHTS: dict[str, Flight] = {
     "hover": Flight("hover", {}, "hover", "hover"),
+    "hover_wind": Flight("hover_wind", {}, "hover_wind", "hover in wind of 5 m/s, noise, delay"),
     "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
     "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
     "pose_falcon3": Flight("pose_falcon3", {}, "pose_falcon3", "pose, three drones, tilts to 45°"),
+    "pose_wind": Flight("pose_wind", {}, "pose_wind", "pose, tilts to 45°, in wind of 5 m/s, noise, delay"),
     "circle_slow": Flight("track_circle", {}, "track_circle", "circle, 0.2 rad/s"),
     "circle_fast": Flight("track_circle", {"task_options.rate": 0.4}, "track_circle", "circle, 0.4 rad/s"),
     "track": Flight("track", {}, "track", "figure-eight, 1 m/s, 0.5 m/s²", "3.2 cm"),
     "track_2_2": Flight("track", FASTER, "track", "figure-eight, 2 m/s, 2 m/s²", "9.3 cm"),
-    "track_2_4": Flight("track_agile", {}, "track_agile", "figure-eight, 2 m/s, 4 m/s²", "11.7 cm"),
+    "track_2_4": Flight("track", AGILE, "track", "figure-eight, 2 m/s, 4 m/s²", "11.7 cm"),
     "track_5_8": Flight("track", FASTEST, "track", "figure-eight, 5 m/s, 8 m/s²", "19.7 cm"),
+    "track_auto6": Flight("track_auto6", {}, "track_auto6", "figure-eight, 4.5 m/s, 4 m/s², six drones, 7 kg", "41 cm"),
     "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),
     "land": Flight("land", {}, "land", "land"),
     "gate": Flight("gate", {}, "gate", "gate"),
     "gate_two": Flight("gate_two", {}, "gate", "two gates"),
     "recover": Flight("recover", {}, "recover", "recover"),
-    "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts"),
+    "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", "79.7 %"),
     "loss": Flight("loss", {}, "loss", "loss, 4 drones"),
-    "loss_6": Flight("loss", {"env.num_drones": 6}, "loss_6", "loss, 6 drones"),
+    "loss_6": Flight("loss_6", {}, "loss_6", "loss, 6 drones"),
     "loss_snap": Flight("loss_snap", {}, "loss", "loss with its cable"),
-}
-RECIPES: dict[str, tuple[str, dict[str, Any]]] = {  # what is trained: configuration, overrides
-    "loss_6": ("loss", {"env.num_drones": 6}),
 }
 
 
@@ -71,9 +72,8 @@ def train(recipe: str, seeds: list[int]) -> None:
     """Train a recipe on some seeds and keep what came of each."""
     from multilift_marl.agents.trainer import new_run
 
-    name, overrides = RECIPES.get(recipe, (recipe, {}))
     for seed in seeds:
-        trainer = new_run(load_config(name, {**overrides, "seed": seed}), recipe)
+        trainer = new_run(load_config(recipe, {"seed": seed}), recipe)
         if not trainer.run():
             sys.exit(
                 f"stopped; go on with: python train.py resume={trainer.folder}, then keep it with: "
@@ -136,29 +136,31 @@ def ship(recipes: list[str]) -> None:
 
 def table() -> str:
     """Return all flights as a Markdown table: success and error of each team, of learned ones the mean of all seeds."""
-    columns = ("learned", *SCRIPTED)
+    columns = ("learned", "training seeds", *SCRIPTED)
     lines = [
         f"| | {' | '.join(columns)} | published |",
         f"|---|{'---|' * (len(columns) + 1)}",
     ]
     for name, flight in FLIGHTS.items():
         error = "payload_rmse_m" if flight.config.startswith("track") else "payload_position_error_m"
-        cells = [_cell([HERE / name / f"{script}.json"], error) for script in SCRIPTED]
-        learned = _cell(sorted((HERE / name).glob("seed*.json")), error)
-        lines.append(f"| {flight.title} | {learned} | {' | '.join(cells)} | {flight.published} |")
+        seeds = sorted((HERE / name).glob("seed*.json"))
+        scripts = [_cell([HERE / name / f"{script}.json"], error) for script in SCRIPTED]
+        cells = [_cell(seeds, error), str(len(seeds)), *scripts, flight.published]
+        lines.append(f"| {flight.title} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def _cell(paths: list[Path], error: str) -> str:
-    """Return "success %, error cm", means of these results, each with its smallest and largest if there are more."""
+    """Return "success %, error cm", means of these results, with the smallest and the largest where they differ."""
     told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in paths if path.is_file()]
     if not told:
         return "-"
     parts = []
     for metric, unit, digits in (("success_rate", "%", 1), (error, "cm", 2)):
         values = [100 * one[metric]["mean"] for one in told]
-        mean, spread = sum(values) / len(values), f" ({min(values):.{digits}f} - {max(values):.{digits}f})"
-        parts.append(f"{mean:.{digits}f}{spread if len(values) > 1 else ''} {unit}")
+        least, most = (f"{value:.{digits}f}" for value in (min(values), max(values)))
+        spread = f" ({least} - {most})" if least != most else ""
+        parts.append(f"{sum(values) / len(values):.{digits}f}{spread} {unit}")
     return ", ".join(parts)
 
 

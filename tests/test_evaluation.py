@@ -12,6 +12,7 @@ from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.trainer import new_run
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.config import load_config
+from multilift_marl.config.load import build_config
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.evaluation import rollout
@@ -19,7 +20,7 @@ from multilift_marl.evaluation.metrics import bootstrap, compare, summarize, wil
 from multilift_marl.evaluation.report import format_table, make_report
 from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
 
-SCRIPTS = {"formation", "formation_integral", "payload_geometric"}  # those of every task
+SCRIPTS = {"formation", "formation_integral", "formation_feedback", "payload_geometric"}  # those of every task
 CONTRACT = {
     "success_rate", "payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s",
     "return", "cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j",
@@ -108,6 +109,22 @@ def test_trace_is_the_same_flight(flown):
     outside = trace.time[trace.distance > 0.05]
     assert flown["settling_time_s"][3] == pytest.approx(outside.max() if len(outside) else 0.0)
     assert trace.drone_position.shape == (400, 4, 3) and trace.tension.shape == (400, 4)
+
+
+def test_errors_along_the_axes_of_the_target_add_up(flown):
+    parts = [flown[f"payload_rmse_{axis}_m"] for axis in "xyz"]
+    np.testing.assert_allclose(np.sqrt(np.square(parts).sum(axis=0)), flown["payload_rmse_m"], rtol=1e-12)
+    still = {f"task_options.{key}": 0.0 for key in ("start_radius", "start_tilt", "start_speed")}
+    calm = {"randomization.payload_mass": 0.0, "randomization.payload_force": 0.0, "wind.velocity": [5.0, 0.0, 0.0]}
+    config = load_config("hover", still | calm)
+    vec = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 6}), EVALUATION)
+    vec.reset(seed=1000)
+    blown = fly_episodes(config, script("formation"), 6, seed=1000)
+    for across, along in (("y_m", "x_m"), ("roll_deg", "pitch_deg")):
+        share = blown[f"payload_rmse_{across}"] / blown[f"payload_rmse_{along}"] / np.abs(np.tan(vec.task.goal.yaw))
+        np.testing.assert_allclose(share, share[0], rtol=0.03)  # not 1: drag and stiffness differ along the two
+        assert 0.5 < share[0] < 1.5
+    assert (blown["payload_rmse_yaw_deg"] < 0.1 * blown["payload_attitude_error_deg"]).all()
 
 
 def test_energy_of_a_hovering_team_is_its_rotors_power_times_time():

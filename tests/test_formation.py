@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import cos, radians
 
 import numpy as np
 import pytest
 from conftest import GRAVITY, make, make_system, refusal
 
+from multilift_marl.config import load_config
 from multilift_marl.control.formation import Goal, make_rig, place_formation
-from multilift_marl.control.scripted import INTEGRAL_GAIN, LEAD_GAIN, LINEAR, fitting_scripts, make_scripted
+from multilift_marl.control.scripted import (
+    FEEDBACK,
+    INTEGRAL_GAIN,
+    LEAD_GAIN,
+    LINEAR,
+    fitting_scripts,
+    make_scripted,
+)
 from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.rollout import fly_episodes
 from multilift_marl.math3d import axis_angle, rot_z
 
 # The formation
@@ -100,9 +110,10 @@ def test_an_action_moves_the_slot_outward_sideways_and_up_and_turns_it(commanded
 # Scripts
 
 
-def observed(vec, **values) -> np.ndarray:
-    """Return random observations (5, N, D) with some numbers, by name, set."""
-    observation = np.random.default_rng(0).normal(size=(5, vec.num_drones, vec.observation_size)).astype(np.float32)
+def observed(vec, spread=1.0, **values) -> np.ndarray:
+    """Return random observations (5, N, D) of this deviation with some numbers, by name, set."""
+    shape = (5, vec.num_drones, vec.observation_size)
+    observation = np.random.default_rng(0).normal(scale=spread, size=shape).astype(np.float32)
     for name, value in values.items():
         observation[..., vec.observation_names.index(name)] = value
     return observation
@@ -129,6 +140,40 @@ def test_the_integral_script_moves_the_slots_against_the_integral():
     action = make_scripted("formation_integral", vec).act(observed(vec, **integral))
     expected = [-INTEGRAL_GAIN * 0.1 / 0.4, INTEGRAL_GAIN * 0.2 / 0.4, -1.0, 0.0]
     np.testing.assert_allclose(action, np.broadcast_to(expected, action.shape), rtol=1e-6)
+
+
+def test_the_feedback_script_moves_the_slots_against_what_it_observes():
+    vec = make(num_envs=1, **{"control.max_offset": 0.4})
+    script = make_scripted("formation_feedback", vec)
+    for name, axis, moved, gain in FEEDBACK:
+        expected = [0.0] * 4
+        expected[moved] = gain * 0.1 / 0.4
+        action = script.act(observed(vec, 0.0, **{f"{name}_{axis}": 0.1}))
+        np.testing.assert_allclose(action, np.broadcast_to(expected, action.shape), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("task", "along"),
+    [
+        ("pose", {"payload_error_0": 0.3, "way_position_0": 0.3, "payload_velocity_1": 0.2, "way_velocity_1": 0.2}),
+        ("pose", {"payload_rotation_error_1": 0.2, "way_rotation_1": 0.2}),
+        ("track", {"payload_velocity_0": 1.0, "target_velocity_0": 1.0}),
+    ],
+)
+def test_the_feedback_script_lets_the_payload_go_where_it_is_meant_to(task, along):
+    vec = make(task, num_envs=1)
+    script = make_scripted("formation_feedback", vec)
+    np.testing.assert_allclose(script.act(observed(vec, 0.0, **along)), 0, atol=1e-6)
+    assert all(np.abs(script.act(observed(vec, 0.0, **{name: 0.2}))).max() > 0.03 for name in along)
+
+
+def test_the_feedback_script_holds_a_payload_in_turbulence_that_the_integral_does_not():
+    config = load_config("hover_wind")
+    success = {
+        name: fly_episodes(config, partial(make_scripted, name), 12, seed=1000)["success_rate"].mean()
+        for name in ("formation_integral", "formation_feedback")
+    }
+    assert success["formation_feedback"] > 0.8 > 0.4 > success["formation_integral"]
 
 
 def test_the_leading_script_stands_ahead_by_what_the_acceleration_asks():

@@ -228,11 +228,12 @@ def test_observations_tell_where_the_way_is_and_how_much_time_is_left():
     for _ in flown(vec, 230):
         pass
     goal, way, names = vec.task.goal, vec.task.way, vec.observation_names
-    at = names.index("way_position_0")
     c, s = goal.slot_frame[..., 0], goal.slot_frame[..., 1]
-    ahead = (way.position - goal.position)[:, None]
-    expected = np.stack([c * ahead[..., 0] + s * ahead[..., 1], c * ahead[..., 1] - s * ahead[..., 0]], axis=-1)
-    np.testing.assert_allclose(vec._observation[..., at : at + 2], expected, atol=1e-5)
+    assert np.linalg.norm(way.velocity, axis=1).min() > 0.1
+    for name, (x, y, z) in (("position", (way.position - goal.position).T), ("velocity", way.velocity.T)):
+        x, y, z = x[:, None], y[:, None], np.broadcast_to(z[:, None], c.shape)
+        at, expected = names.index(f"way_{name}_0"), np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
+        np.testing.assert_allclose(vec._observation[..., at : at + 3], expected, atol=1e-5)
     assert names[-1] == "time_left_0"
     np.testing.assert_allclose(vec._observation[..., -1], 1 - (230 - 200) / 200, atol=1e-6)
     np.testing.assert_allclose(vec.state()[:, -1], vec._observation[:, 0, -1])

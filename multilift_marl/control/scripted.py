@@ -15,6 +15,27 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 INTEGRAL_GAIN = 0.5  # [1/s]
+FEEDBACK = (  # of `formation_feedback`: what, its axis in the slot frame, axis of the slot, metres for each unit
+    *(
+        (name, axis, axis, gain)
+        for axis in (0, 1)
+        for name, gain in (
+            ("payload_error_integral", -0.55),
+            ("payload_error", -0.15),
+            ("payload_velocity", -0.4),
+            ("tracking_error", -0.45),
+        )
+    ),
+    ("payload_error_integral", 2, 2, -0.5),
+    ("payload_velocity", 2, 2, -0.25),
+    ("rotation_error_integral", 1, 2, 0.55),
+    ("payload_rotation_error", 1, 2, 0.2),
+)
+WANTED = {  # what the payload is meant to do meanwhile, where a task tells
+    "payload_error": ("way_position",),
+    "payload_velocity": ("way_velocity", "target_velocity"),
+    "payload_rotation_error": ("way_rotation",),
+}
 LEAD_TIME = 0.4  # [s] that a payload's acceleration follows a moved slot: the lags of reference and drone
 LEAD_GAIN = 0.87  # [-] of what the acceleration asks for; RMSE is least at 0.81 for (2, 2), at 1 for (2, 4)
 
@@ -54,6 +75,25 @@ class FormationIntegral(Formation):
         matrix = super().matrix()
         for axis in range(3):
             matrix[axis, self._names.index(f"payload_error_integral_{axis}")] = -INTEGRAL_GAIN / self._max_offset
+        return matrix
+
+
+class FormationFeedback(Formation):
+    """The formation with its slots moved by linear feedback of what a drone observes, by the gains `FEEDBACK`.
+
+    Level, against the payload's error from where it should be by now, the integral of that and its velocity, and
+    against the drone's own distance from its reference, which tells how wind pushes it before the payload moves; up
+    and down also so that the payload turns back to its target attitude.
+    """
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        matrix = super().matrix()
+        for name, axis, moved, gain in FEEDBACK:
+            matrix[moved, self._names.index(f"{name}_{axis}")] = gain / self._max_offset
+            for wanted in WANTED.get(name, ()):
+                if (told := f"{wanted}_{axis}") in self._names:
+                    matrix[moved, self._names.index(told)] = -gain / self._max_offset
         return matrix
 
 
@@ -98,6 +138,7 @@ class FormationLead(Formation):
 LINEAR: dict[str, type[Formation]] = {
     "formation": Formation,
     "formation_integral": FormationIntegral,
+    "formation_feedback": FormationFeedback,
     "formation_lead": FormationLead,
 }
 """Scripts that are maps of the observation."""

@@ -84,7 +84,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
     policy.reset()
     running = np.ones(e, bool)
     total, length, settling = np.zeros(e), np.zeros(e), np.zeros(e)
-    square, counted, change = np.zeros((3, e))
+    square, counted, change = np.zeros((6, e)), np.zeros(e), np.zeros(e)
     final_distance, final_angle, final_steps = np.zeros(e), np.zeros(e), np.zeros(e)
     result = {name: np.zeros(e) for name in _AT_END}
     result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
@@ -97,7 +97,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
         length += running
         change += running * ((np.clip(action, -1, 1) - previous) ** 2).mean(axis=(1, 2))
         if (step + 1) * dt > vec.task.RMSE_AFTER:
-            square += running * errors.distance**2
+            square += running * _along_axes(vec) ** 2
             counted += running
         settling = np.where(running & (errors.distance > SETTLED), (step + 1) * dt, settling)
         if vec.task.counts((step + 1) * dt, vec.max_steps * dt):
@@ -125,11 +125,31 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
     return result | {
         "payload_position_error_m": np.where(failed, MAX_DISTANCE, final_distance / steps),
         "payload_attitude_error_deg": np.where(failed, 180.0, final_angle / steps),
-        "payload_rmse_m": np.where(failed, MAX_DISTANCE, np.sqrt(square / np.maximum(counted, 1))),
+        "payload_rmse_m": np.where(failed, MAX_DISTANCE, np.sqrt(square[:3].sum(axis=0) / np.maximum(counted, 1))),
+        **{
+            name: np.where(
+                failed, MAX_DISTANCE if name.endswith("m") else 180.0, np.sqrt(part / np.maximum(counted, 1))
+            )
+            for name, part in zip(_AXES, square, strict=True)
+        },
         "settling_time_s": np.where(failed, limit, settling),
         "return": total,
         "action_rate": np.sqrt(change / np.maximum(length, 1)),
     }
+
+
+_AXES = (
+    "payload_rmse_x_m", "payload_rmse_y_m", "payload_rmse_z_m",
+    "payload_rmse_roll_deg", "payload_rmse_pitch_deg", "payload_rmse_yaw_deg",
+)  # fmt: skip
+
+
+def _along_axes(vec: MultiliftVec) -> np.ndarray:
+    """Return position error [m] and rotation vector [deg] along the axes of the target's heading frame, (6, E)."""
+    errors, yaw = vec.task.errors, vec.task.goal.yaw
+    c, s = np.cos(yaw), np.sin(yaw)
+    (x, y, z), (roll, pitch, turn) = errors.position.T, np.rad2deg(errors.rotation.T)
+    return np.stack([c * x + s * y, c * y - s * x, z, c * roll + s * pitch, c * pitch - s * roll, turn])
 
 
 _AT_END = ("cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j")

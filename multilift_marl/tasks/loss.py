@@ -127,7 +127,7 @@ def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms,
         speed, spin = norm(row(state.payload_velocity, e)), norm(row(state.payload_body_rates, e))
         terms[e, 0] = weights[0] * tolerance(distance, 0.25)
         terms[e, 1] = weights[1] * tolerance(distance, 0.03)
-        terms[e, 2] = weights[2] * tolerance(angle, radians(10.0))
+        terms[e, 2] = weights[2] * tolerance(angle, radians(20.0))
         terms[e, 3] = weights[3] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
         terms[e, 4] = weights[4] * mean_change(e, action, previous)
         good_time[e] = good_time[e] + dt if distance <= success[0] and angle <= success[1] else 0.0

@@ -55,10 +55,11 @@ class Pose(Task):
     }
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("way_position", 3, "slot", "m", "the planned way's present position minus target"),
-        Component("way_rotation", 3, "slot", "rad", "rotation vector from target to the planned way's attitude"),
+        Component("way_velocity", 3, "slot", "m/s", "the way's velocity"),
+        Component("way_rotation", 3, "slot", "rad", "rotation vector from target to the way's attitude"),
         Component("time_left", 1, "-", "-", "until the next target, over the time that each one has"),
     )
-    EXTRA_STATE: ClassVar[int] = 7
+    EXTRA_STATE: ClassVar[int] = 10
     KEPT: ClassVar[tuple[str, ...]] = ("reached", "_pose", "_pull", "_stage")
 
     def __init__(self, config: Config, world: World, reference: Reference):
@@ -167,18 +168,18 @@ def _score(lo, hi, state, errors, action, previous, weights, success, clock, tim
 def _observe(lo, hi, goal, way, time, plan, hold, observation, critic):
     size, state = observation.shape[2], critic.shape[1]
     for e in range(lo, hi):
-        ahead = sub(row(way.position, e), row(goal.position, e))
+        ahead, velocity = sub(row(way.position, e), row(goal.position, e)), row(way.velocity, e)
         twisted = rotation_vector(matmul(matrow(way.rotation, e), transpose(matrow(goal.rotation, e))))
         left = (plan.stage[e] + 1) - time[e] / hold
         for n in range(observation.shape[1]):
             c, s = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]  # world to slot frame
-            _tell(observation[e, n, size - 7 :], turn(c, s, ahead), turn(c, s, twisted), left)
-        c, s = cos(goal.yaw[e]), -sin(goal.yaw[e])
-        _tell(critic[e, state - 7 :], turn(c, s, ahead), turn(c, s, twisted), left)
+            _tell(observation[e, n, size - 10 :], c, s, ahead, velocity, twisted, left)
+        _tell(critic[e, state - 10 :], cos(goal.yaw[e]), -sin(goal.yaw[e]), ahead, velocity, twisted, left)
 
 
 @kernel
-def _tell(out, ahead, twisted, left):
-    put(out[0:3], ahead)
-    put(out[3:6], twisted)
-    out[6] = left
+def _tell(out, c, s, ahead, velocity, twisted, left):
+    put(out[0:3], turn(c, s, ahead))
+    put(out[3:6], turn(c, s, velocity))
+    put(out[6:9], turn(c, s, twisted))
+    out[9] = left
