@@ -38,6 +38,7 @@ JARGON = ("Input ", "Value error", "Field required", "Tuple ", "instance of", "\
 SMALL = {
     "env.num_envs": 8, "env.num_threads": 1, "env.episode_seconds": 0.5, "train.horizon": 16, "train.frames": 1280,
     "train.minibatches": 4, "train.warmup": 0, "train.checkpoint_every": 5, "eval.every": 4, "eval.episodes": 3,
+    "train.residual": "formation",
 }  # fmt: skip
 
 
