@@ -12,10 +12,10 @@ from conftest import GRAVITY, make, make_system, refusal
 from multilift_marl.config import load_config
 from multilift_marl.control.formation import Goal, make_rig, place_formation
 from multilift_marl.control.scripted import (
-    FEEDBACK,
     INTEGRAL_GAIN,
     LEAD_GAIN,
     LINEAR,
+    FormationFeedback,
     fitting_scripts,
     make_scripted,
 )
@@ -145,7 +145,7 @@ def test_the_integral_script_moves_the_slots_against_the_integral():
 def test_the_feedback_script_moves_the_slots_against_what_it_observes():
     vec = make(num_envs=1, **{"control.max_offset": 0.4})
     script = make_scripted("formation_feedback", vec)
-    for name, axis, moved, gain in FEEDBACK:
+    for name, axis, moved, gain in FormationFeedback.GAINS:
         expected = [0.0] * 4
         expected[moved] = gain * 0.1 / 0.4
         action = script.act(observed(vec, 0.0, **{f"{name}_{axis}": 0.1}))

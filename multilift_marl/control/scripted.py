@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import cos, radians
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -15,22 +15,6 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 INTEGRAL_GAIN = 0.5  # [1/s]
-FEEDBACK = (  # of `formation_feedback`: what, its axis in the slot frame, axis of the slot, metres for each unit
-    *(
-        (name, axis, axis, gain)
-        for axis in (0, 1)
-        for name, gain in (
-            ("payload_error_integral", -0.55),
-            ("payload_error", -0.15),
-            ("payload_velocity", -0.4),
-            ("tracking_error", -0.45),
-        )
-    ),
-    ("payload_error_integral", 2, 2, -0.5),
-    ("payload_velocity", 2, 2, -0.25),
-    ("rotation_error_integral", 1, 2, 0.55),
-    ("payload_rotation_error", 1, 2, 0.2),
-)
 WANTED = {  # what the payload is meant to do meanwhile, where a task tells
     "payload_error": ("way_position",),
     "payload_velocity": ("way_velocity", "target_velocity"),
@@ -45,7 +29,13 @@ class Formation:
 
     Args:
         vec: environments with the interface `reference`.
+
+    Attributes:
+        GAINS: how a script based on this one moves the slots: what is observed, its axis in the slot frame, the axis of
+            the slot's offset, and metres for each unit.
     """
+
+    GAINS: ClassVar[tuple[tuple[str, int, int, float], ...]] = ()
 
     def __init__(self, vec: MultiliftVec):
         self._names, self._actions = vec.observation_names, vec.action_names
@@ -54,7 +44,13 @@ class Formation:
 
     def matrix(self) -> np.ndarray:
         """Return M (A, D) float32 with which the action is M times the observation, clipped to [-1, 1]."""
-        return np.zeros((len(self._actions), len(self._names)), np.float32)
+        matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
+        for name, axis, moved, gain in self.GAINS:
+            matrix[moved, self._names.index(f"{name}_{axis}")] = gain / self._max_offset
+            for wanted in WANTED.get(name, ()):
+                if (told := f"{wanted}_{axis}") in self._names:
+                    matrix[moved, self._names.index(told)] = -gain / self._max_offset
+        return matrix
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (..., N, A) float32 in [-1, 1] for observations (..., N, D)."""
@@ -70,31 +66,31 @@ class FormationIntegral(Formation):
     By -k ∫ e dt [m], k = 0.5 1/s, along each axis of a drone's slot frame; a full action is `control.max_offset`.
     """
 
-    def matrix(self) -> np.ndarray:
-        """See `Formation.matrix`."""
-        matrix = super().matrix()
-        for axis in range(3):
-            matrix[axis, self._names.index(f"payload_error_integral_{axis}")] = -INTEGRAL_GAIN / self._max_offset
-        return matrix
+    GAINS = tuple(("payload_error_integral", axis, axis, -INTEGRAL_GAIN) for axis in range(3))
 
 
 class FormationFeedback(Formation):
-    """The formation with its slots moved by linear feedback of what a drone observes, by the gains `FEEDBACK`.
+    """The formation with its slots moved by linear feedback of what a drone observes.
 
     Level, against the payload's error from where it should be by now, the integral of that and its velocity, and
     against the drone's own distance from its reference, which tells how wind pushes it before the payload moves; up
     and down also so that the payload turns back to its target attitude.
     """
 
-    def matrix(self) -> np.ndarray:
-        """See `Formation.matrix`."""
-        matrix = super().matrix()
-        for name, axis, moved, gain in FEEDBACK:
-            matrix[moved, self._names.index(f"{name}_{axis}")] = gain / self._max_offset
-            for wanted in WANTED.get(name, ()):
-                if (told := f"{wanted}_{axis}") in self._names:
-                    matrix[moved, self._names.index(told)] = -gain / self._max_offset
-        return matrix
+    GAINS = (
+        ("payload_error_integral", 0, 0, -0.55),
+        ("payload_error_integral", 1, 1, -0.55),
+        ("payload_error_integral", 2, 2, -0.5),
+        ("payload_error", 0, 0, -0.15),
+        ("payload_error", 1, 1, -0.15),
+        ("payload_velocity", 0, 0, -0.4),
+        ("payload_velocity", 1, 1, -0.4),
+        ("payload_velocity", 2, 2, -0.25),
+        ("tracking_error", 0, 0, -0.45),
+        ("tracking_error", 1, 1, -0.45),
+        ("rotation_error_integral", 1, 2, 0.55),
+        ("payload_rotation_error", 1, 2, 0.2),
+    )
 
 
 class FormationLead(Formation):
