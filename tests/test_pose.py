@@ -12,7 +12,7 @@ from conftest import floats, make, refusal, same, zeros
 import multilift_marl as ml
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.math3d import rotation_vector, segment_distance
-from multilift_marl.tasks.way import attitude_of
+from multilift_marl.tasks.way import COURSES, GENTLE, attitude_of, rest
 
 CALM = {"randomization.payload_mass": 0.0}
 
@@ -151,11 +151,46 @@ def test_drones_and_cables_stay_apart_and_no_drone_leans_far_on_the_way(name):
     assert upright > cos(pi / 4)
 
 
+def test_ways_that_would_swing_a_drone_about_take_another_course():
+    vec = ml.make_vec("pose_falcon3", num_envs=512, num_threads=1)
+    vec.reset(seed=0)
+    task, plan = vec.task, vec.task.plan
+    usual = plan.course[..., 1:] == COURSES[0][1:]
+    turned = np.diff(plan.pose[..., 3], axis=1)
+    assert 0.9 < usual.all(axis=-1).mean() < 0.99
+    np.testing.assert_allclose(np.exp(1j * plan.course[..., 0]), np.exp(1j * turned), atol=1e-9)
+    longer = np.abs(plan.course[..., 0]) > pi
+    assert longer.any() and not (longer & usual.all(axis=-1)).any()
+
+    def hardest():
+        """Return the largest acceleration of a slot on each way (512, 3) [m/s²]."""
+        task.time[:], plan.stage[:] = 0.0, 0
+        for e in range(512):
+            rest(e, 0, plan, task.way, task.rig, task.nominal_hanging)
+        lead, most = task.planner(0, 512), np.zeros((512, 3))
+        for step in range(3000):
+            lead()
+            size = np.linalg.norm(task.way.acceleration[:, None] + task.way.slot_acceleration, axis=-1).max(axis=1)
+            if step % 1000 > 2:  # a new way's slots take a step or two to be where they should
+                most[:, step // 1000] = np.maximum(most[:, step // 1000], size)
+        return most
+
+    chosen = hardest()
+    plan.course[..., 0] = (turned + pi) % (2 * pi) - pi
+    plan.course[..., 1:] = COURSES[0][1:]
+    before = hardest()
+    kept = usual.all(axis=-1)
+    np.testing.assert_allclose(chosen[kept], before[kept], atol=1e-6)
+    assert (before[kept] < 1.05 * GENTLE).mean() > 0.99
+    assert (chosen[~kept] < before[~kept]).mean() > 0.95
+    assert np.sort(chosen, axis=None)[-20:].mean() < 0.85 * np.sort(before, axis=None)[-20:].mean()
+
+
 def test_drones_are_above_a_tilted_payload():
     vec = ml.make_vec("pose_falcon3", num_envs=256, num_threads=1)
     vec.reset(seed=0)
     above = vec.task.goal.slots[..., 2] - vec.task.goal.position[:, None, 2]
-    assert 0.1 < above.min() < 0.2  # some of them are as low as they may be
+    assert 0.15 < above.min() < 0.25  # some of them are as low as they may be
 
 
 def test_success_needs_the_last_second_of_every_target():

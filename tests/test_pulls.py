@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from conftest import floats, make_system
 
+from multilift_marl.config.load import load_config
 from multilift_marl.control.formation import Goal, make_rig, place_formation
-from multilift_marl.control.pulls import BALANCED, make_spread, place_balanced, solve_pulls, spread
-from multilift_marl.math3d import axis_angle, matmul, rot_z
+from multilift_marl.control.pulls import BALANCED, make_spread, place_balanced, settles, solve_pulls, spread
+from multilift_marl.math3d import axis_angle
 from multilift_marl.tasks.starts import make_hanging
+from multilift_marl.tasks.way import attitude_of
 
 LEVEL = floats(np.eye(3))
 SQUARE = np.array([[0.3, 0.2, 0.1], [-0.3, 0.2, 0.1], [-0.3, -0.2, 0.1], [0.3, -0.2, 0.1]])
@@ -104,13 +106,13 @@ def test_one_cable_pulls_a_point_as_told():
     assert left < 1e-6
 
 
-def placed(system, yaw: float, roll: float, place) -> Goal:
+def placed(system, yaw: float, roll: float, place, pitch: float = 0.0) -> Goal:
     goal, rig = (
         Goal.zeros(1, system.num_drones),
         make_rig(system),
     )
     goal.position[0] = [0.3, -0.2, 1.5]
-    goal.rotation[0] = np.reshape(matmul(rot_z(yaw), axis_angle((1.0, 0.0, 0.0), roll)), (3, 3))
+    goal.rotation[0] = np.reshape(attitude_of(yaw, roll, pitch), (3, 3))
     place(goal, rig)
     return goal
 
@@ -154,3 +156,32 @@ def test_one_or_two_cables_cannot_hold_a_tilted_box(num_drones):
     hanging = make_hanging(system)
     placed(system, 0.0, 0.3, lambda goal, rig: held.append(place_balanced(0, goal, rig, hanging)))
     assert held == [False]
+
+
+def energy(moved, system, goal, pull, stiffness) -> float:
+    """Return the potential energy [J] of payload, cables and drones on springs, moved (6 + 3 N) from their goal."""
+    angle = float(np.linalg.norm(moved[3:6]))
+    turn = np.reshape(axis_angle(floats(moved[3:6] / (angle or 1.0)), angle), (3, 3))
+    arms, drones = system.anchors @ goal.rotation[0].T, moved[6:].reshape(-1, 3)
+    cables = goal.slots[0] + drones - (goal.position[0] + moved[:3] + arms @ turn.T)
+    stretch = np.linalg.norm(cables, axis=1) - system.cable_length
+    spring = 0.5 * stiffness @ (drones**2).sum(axis=1) - (pull * drones).sum()
+    return float(9.81 * system.payload_mass * moved[2] + 0.5 * 1e3 * (stretch**2).sum() + spring)
+
+
+def test_a_payload_settles_where_its_potential_energy_is_convex():
+    system = load_config("pose_falcon3", {"cable.stiffness": 1e3}).system
+    hanging, found = make_hanging(system), []
+    for soft in (3.0, 6.0, 12.0):
+        for roll, pitch in ((0.3, -0.2), (0.75, 0.6), (-0.78, 0.6), (0.7, -0.7), (-0.6, -0.5)):
+            goal = placed(system, 0.4, roll, lambda goal, rig: place_balanced(0, goal, rig, hanging), pitch)
+            stiffness, size, step = np.array([soft, 2 * soft, soft]), 6 + 9, 1e-4
+            moves = step * np.eye(size)
+            corners = np.array([[
+                sum(p * q * energy(p * moves[i] + q * moves[j], system, goal, goal.pull[0], stiffness)
+                    for p in (1, -1) for q in (1, -1))
+                for j in range(size)] for i in range(size)])  # fmt: skip
+            least = np.linalg.eigvalsh(corners / (4 * step**2)).min()
+            found.append(settles(0, goal, make_rig(system), hanging, stiffness))
+            assert found[-1] == (least > 0), (soft, roll, pitch, least)
+    assert 0 < sum(found) < len(found)

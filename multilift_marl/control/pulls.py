@@ -228,3 +228,47 @@ def place_balanced(e, goal, rig, hanging):
     left = solve_pulls((0.0, 0.0, weight), _STILL, target, rig.anchors, LEAST, goal.pull[e])
     place_slots(e, goal, rig, hanging)
     return left <= BALANCED * weight
+
+
+@kernel
+def settles(e, goal, rig, hanging, stiffness):
+    """Return whether the payload, pushed a little, would come back to a tilted goal, the drones held by springs.
+
+    The potential energy of payload, cables and springs is to be convex there. Between its spring and the payload a
+    cable gives way across by L/T and along by 1/k, so that an anchor moved by x is pulled back by S x,
+    S⁻¹ = (T/L (1 - u uᵀ) + k u uᵀ)⁻¹ + 1/κ; where the payload turns, the arm of the pull turns too.
+
+    Args:
+        e, goal, rig, hanging: after `place_balanced`.
+        stiffness: (N,) κ [N/m].
+    """
+    target = matrow(goal.rotation, e)
+    a = b = c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for n in range(rig.anchors.shape[0]):
+        r = mul(target, row(rig.anchors, n))
+        f = sub(vec(goal.pull, e, n), (0.0, 0.0, hanging.weight[n]))
+        size = norm(f)
+        u, soft = scale(1.0 / size, f), 1.0 / stiffness[n]
+        across = 1.0 / (hanging.length[n] / size + soft)
+        along = 1.0 / (1.0 / hanging.stiffness[n] + soft) - across
+        s = _plus(_diagonal(across), _outer(scale(along, u), u))
+        x = (0.0, r[2], -r[1], -r[2], 0.0, r[0], r[1], -r[0], 0.0)  # x θ = θ × r
+        sx, arm = matmul(s, x), _outer(scale(0.5, r), f)
+        a, b = _plus(a, s), _plus(b, sx)
+        c = _plus(c, _minus(_plus(matmul(transpose(x), sx), _diagonal(dot(r, f))), _plus(arm, transpose(arm))))
+    m = _minus(c, matmul(matmul(transpose(b), _inverse(a, 0.0)), b))
+    determinant = dot((m[0], m[1], m[2]), cross((m[3], m[4], m[5]), (m[6], m[7], m[8])))
+    return m[0] > 0.0 and m[0] * m[4] - m[1] * m[3] > 0.0 and determinant > 0.0
+
+
+@kernel
+def _diagonal(x):
+    return (x, 0.0, 0.0, 0.0, x, 0.0, 0.0, 0.0, x)
+
+
+@kernel
+def _outer(x, y):
+    return (
+        x[0] * y[0], x[0] * y[1], x[0] * y[2], x[1] * y[0], x[1] * y[1], x[1] * y[2], x[2] * y[0], x[2] * y[1],
+        x[2] * y[2],
+    )  # fmt: skip

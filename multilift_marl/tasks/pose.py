@@ -22,7 +22,7 @@ from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.starts import hang_team
 from multilift_marl.tasks.targets import draw_plan, make_bounds
 from multilift_marl.tasks.terms import mean_change, tolerance
-from multilift_marl.tasks.way import Plan, aim, lead
+from multilift_marl.tasks.way import Plan, aim, choose_courses, lead, rest
 
 
 class PoseOptions(Section):
@@ -60,7 +60,7 @@ class Pose(Task):
         Component("time_left", 1, "-", "-", "until the next target, over the time that each one has"),
     )
     EXTRA_STATE: ClassVar[int] = 10
-    KEPT: ClassVar[tuple[str, ...]] = ("reached", "_pose", "_pull", "_stage")
+    KEPT: ClassVar[tuple[str, ...]] = ("reached", "_pose", "_pull", "_course", "_stage")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
@@ -76,10 +76,11 @@ class Pose(Task):
         self.targets = ceil(self._length / self._hold - 1e-9)
         self.reached = np.zeros((e, self.targets), bool)
         self.plan = Plan.zeros(e, self.targets, world.num_drones)
-        self._pose, self._pull, self._stage = self.plan
+        self._pose, self._pull, self._course, self._stage = self.plan
         way = Goal.zeros(e, world.num_drones)
         self.way = way._replace(slot_frame=self.goal.slot_frame)  # actions point as the observations do
-        self._bounds = make_bounds(system, self.limits, 1 + config.randomization.payload_mass)
+        self._balance = make_spread(self.rig.anchors)
+        self._bounds = make_bounds(system, config.control, self.limits, 1 + config.randomization.payload_mass)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw a level pose to start from and the targets; the team hangs there at rest; see `Task.start`."""
@@ -91,8 +92,10 @@ class Pose(Task):
                 "this team can hold hardly any of the poses of task pose; lower task_options.target_tilt, raise "
                 "target_height or change the rig"
             )
-        rest, own = self.nominal_hanging, self.hanging
-        _start(env, self.world.state, self.plan, self.goal, self.way, self.rig, rest, own, mass)
+        way, inertia, nominal = self.way, self.world.system.inertia_matrix, self.nominal_hanging
+        planned = self._balance, self._hold, option.way_seconds
+        choose_courses(env, self.time, self.plan, way, self.rig, nominal, inertia, *planned, self._bounds.separation)
+        _start(env, self.world.state, self.plan, self.goal, way, self.rig, nominal, self.hanging, mass)
         self.reached[env] = False
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
@@ -100,7 +103,7 @@ class Pose(Task):
         inertia, attitude = self.world.system.inertia_matrix, self.world.state.payload_rotation
         return bind(
             lead, lo, hi, self.time, self.control_dt, self.plan, self.goal, self.way, self.rig, self.hanging,
-            inertia, make_spread(self.rig.anchors), attitude, self._hold, self.options.way_seconds,
+            inertia, self._balance, attitude, self._hold, self.options.way_seconds,
         )  # fmt: skip
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
@@ -131,17 +134,11 @@ class Pose(Task):
 
 
 @kernel
-def _start(e, state, plan, goal, way, rig, rest, hanging, mass):
-    aim(e, 0, plan, way, rig, rest)
-    for moving in (way.velocity, way.acceleration, way.jerk, way.angular_velocity):
-        moving[e] = 0.0
-    for moving in (way.slot_velocity, way.slot_acceleration, way.slot_jerk):
-        moving[e] = 0.0
-    way.drone_yaw_rate[e] = 0.0
+def _start(e, state, plan, goal, way, rig, nominal, hanging, mass):
+    rest(e, 0, plan, way, rig, nominal)
     still = (0.0, 0.0, 0.0)
     hang_team(e, state, way, rig, hanging, mass, row(way.position, e), matrow(way.rotation, e), still, still)
-    plan.stage[e] = 0
-    aim(e, 1, plan, goal, rig, rest)  # last, since it shares the slot frames with the way
+    aim(e, 1, plan, goal, rig, nominal)  # last, since it shares the slot frames with the way
 
 
 @kernel

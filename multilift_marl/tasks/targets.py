@@ -8,18 +8,21 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
+from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import goal_hook
-from multilift_marl.control.pulls import place_balanced
+from multilift_marl.control.gains import make_gains
+from multilift_marl.control.pulls import place_balanced, settles
 from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, row, scale, segment_distance, sub, turn, vec
 from multilift_marl.tasks.failures import MAX_DISTANCE, Limits
 from multilift_marl.tasks.way import attitude_of
 
 MAX_LEAP = MAX_DISTANCE - 0.25  # [m] from a target to the next one: nearer than what counts as failure
 CLEARANCE = 0.1  # [m] of the payload from the ground at a target
-ABOVE = 0.1  # of a cable's length, by which every drone is to be above the payload there
+ABOVE = 0.15  # of a cable's length, by which every drone is to be above the payload there
 MARGIN = 1.2  # of distances between drones and cables at rest over those that count as failures
+SOFT = 0.5  # of the stiffness with which drones hold their places, at which the payload is still to settle
 MAX_REDRAWS = 1000
 
 
@@ -38,11 +41,13 @@ class Bounds(NamedTuple):
     """(N, N) distance between cables [m]."""
     half: np.ndarray
     """(3,) half edges of the payload [m]."""
+    stiffness: np.ndarray
+    """(N,) with which drones hold their places [N/m]."""
 
 
-def make_bounds(system: System, limits: Limits, load: float) -> Bounds:
+def make_bounds(system: System, control: ControlConfig, limits: Limits, load: float) -> Bounds:
     """Return the bounds of a team whose payload may be `load` times the nominal mass, some margin left."""
-    spread = system.anchors - system.anchors.mean(axis=0)
+    spread, gains = system.anchors - system.anchors.mean(axis=0), make_gains(control, system)
     return Bounds(
         tilts=bool(np.linalg.matrix_rank(spread, tol=1e-6) >= 2),
         thrust=np.array([0.9 * 4 * vehicle.rotor_thrust_max for vehicle in system.vehicles]),
@@ -50,6 +55,7 @@ def make_bounds(system: System, limits: Limits, load: float) -> Bounds:
         separation=MARGIN * limits.separation,
         cables=MARGIN * limits.cables,
         half=limits.payload_half,
+        stiffness=SOFT * gains.mass * gains.k_p,
     )
 
 
@@ -115,4 +121,4 @@ def _within(e, goal, rig, hanging, bounds):
             end, beside = goal_hook(e, n, goal, rig), goal_hook(e, m, goal, rig)
             if segment_distance(anchor, end, foot, beside) < bounds.cables[n, m]:
                 return False
-    return True
+    return target[8] > 1.0 - 1e-12 or settles(e, goal, rig, hanging, bounds.stiffness)

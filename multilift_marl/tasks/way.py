@@ -7,7 +7,7 @@ it needs, these the pulls, these the slots (differential flatness, Sreenath and 
 
 from __future__ import annotations
 
-from math import cos, sin
+from math import cos, pi, sin
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from multilift_marl.math3d import (
     matmul,
     matrow,
     mul,
+    norm,
     put,
     putmat,
     rot_z,
@@ -34,7 +35,17 @@ from multilift_marl.math3d import (
     vec,
 )
 
-DIP = 0.5  # [-] by which roll and pitch are less half-way: a payload that turns is easier to pull the less it tilts
+COURSES = (  # the usual one first: whether to turn the longer way round, and two shares, see `Plan.course`
+    (False, 0.5, 0.0),
+    (False, 1.0, 0.3),
+    (True, 0.25, 0.3),
+    (False, 1.0, 0.0),
+    (False, 0.0, 0.3),
+    (True, 0.0, 0.6),
+    (False, 0.75, -0.3),
+)
+GENTLE = 5.0  # [m/s²] of a slot, at most: ways that ask no more are flown by the first course
+_SAMPLES = 60
 
 
 class Plan(NamedTuple):
@@ -44,14 +55,19 @@ class Plan(NamedTuple):
     """(E, K + 1, 6) x, y, z [m], yaw, roll, pitch [rad]; the attitude is Rz(yaw) Rx(roll) Ry(pitch)."""
     pull: np.ndarray
     """(E, K + 1, N, 3) of the cables on the payload at rest there, in the frame turned by the yaw alone [N]."""
+    course: np.ndarray
+    """(E, K, 3) of the way to each target: by how much it turns [rad], which share of roll and pitch is taken away
+    half-way (a payload that turns is easier to pull the less it tilts), and how far the pulls are those of the level
+    start there."""
     stage: np.ndarray
     """(E,) int64, which target is the present one, from 0."""
 
     @classmethod
     def zeros(cls, num_envs: int, targets: int, num_drones: int) -> Plan:
         """Return empty plans."""
-        e, k = num_envs, targets + 1
-        return cls(np.zeros((e, k, 6)), np.zeros((e, k, num_drones, 3)), np.zeros(num_envs, np.int64))
+        e, k = num_envs, targets
+        pose, pull = np.zeros((e, k + 1, 6)), np.zeros((e, k + 1, num_drones, 3))
+        return cls(pose, pull, np.zeros((e, k, 3)), np.zeros(e, np.int64))
 
 
 @kernel
@@ -83,6 +99,67 @@ def aim(e, k, plan, goal, rig, hanging):
 def mat_row(a, i, j, n):
     """Return row (i, j, n) of an array of four axes."""
     return (a[i, j, n, 0], a[i, j, n, 1], a[i, j, n, 2])
+
+
+@kernel
+def choose_courses(e, time, plan, way, rig, hanging, inertia, balance, hold, seconds, separation):
+    """Choose the course of each way of environment e: the first of `COURSES` that is gentle, else the gentlest one.
+
+    What decides is how a slot is accelerated: a drone whose cable is nearly slack is swung about by little changes.
+
+    Args:
+        e: the environment.
+        time, way: overwritten.
+        plan: Plan, its courses written; the present stage is the first one then.
+        rig, hanging, inertia, balance, hold, seconds: see `lead`.
+        separation: (N, N) of slots on the way [m].
+    """
+    for k in range(plan.course.shape[1]):
+        least, best = np.inf, 0
+        for i in range(len(COURSES)):
+            _take(e, k, plan, i)
+            asked = _asked(e, k, time, plan, way, rig, hanging, inertia, balance, hold, seconds, separation)
+            if asked < least:
+                least, best = asked, i
+            if asked <= GENTLE:
+                break
+        _take(e, k, plan, best)
+    plan.stage[e], time[e] = 0, 0.0
+
+
+@kernel
+def _take(e, k, plan, i):
+    """Let way k have course i."""
+    longer, dip, level = COURSES[i]
+    turned = wrap(plan.pose[e, k + 1, 3] - plan.pose[e, k, 3])
+    put(plan.course[e, k], (turned - 2.0 * pi * np.sign(turned) if longer else turned, dip, level))
+
+
+@kernel
+def _asked(e, k, time, plan, way, rig, hanging, inertia, balance, hold, seconds, separation):
+    """Return the largest acceleration of a slot on way k [m/s²], twice that where two slots come too close."""
+    rest(e, k, plan, way, rig, hanging)
+    plan.stage[e], most, factor, dt = k, 0.0, 1.0, seconds / _SAMPLES
+    for i in range(_SAMPLES):
+        time[e] = k * hold + (i + 1) * dt
+        _go(e, e + 1, time, dt, plan, way, rig, hanging, inertia, balance, hold, seconds)
+        for n in range(rig.slots.shape[0]):
+            most = max(most, norm(add(row(way.acceleration, e), vec(way.slot_acceleration, e, n))))
+            for m in range(n):
+                if norm(sub(vec(way.slots, e, n), vec(way.slots, e, m))) < separation[n, m]:
+                    factor = 2.0
+    return factor * most
+
+
+@kernel
+def rest(e, k, plan, way, rig, hanging):
+    """Let the way of environment e be at rest at pose k of the plan."""
+    aim(e, k, plan, way, rig, hanging)
+    for moving in (way.velocity, way.acceleration, way.jerk, way.angular_velocity):
+        moving[e] = 0.0
+    for moving in (way.slot_velocity, way.slot_acceleration, way.slot_jerk):
+        moving[e] = 0.0
+    way.drone_yaw_rate[e] = 0.0
 
 
 @kernel
@@ -130,9 +207,10 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         s, ds, dds, ddds = ease(gone, 0.0, seconds)
         a, b = plan.pose[e, k], plan.pose[e, k + 1]
         before, start, step = row(way.position, e), (a[0], a[1], a[2]), (b[0] - a[0], b[1] - a[1], b[2] - a[2])
-        turned = wrap(b[3] - a[3])
+        turned, dip, level = plan.course[e, k]
         yaw = a[3] + s * turned
-        (roll, rolled, rolling), (pitch, pitched, pitching) = _dipped(a[4], b[4], s), _dipped(a[5], b[5], s)
+        roll, rolled, rolling = _dipped(a[4], b[4], s, dip)
+        pitch, pitched, pitching = _dipped(a[5], b[5], s, dip)
         attitude, position = attitude_of(yaw, roll, pitch), add(start, scale(s, step))
         spin, swing = _spin(yaw, roll, turned, rolled, pitched)
         swing = add(swing, _spin(yaw, roll, 0.0, rolling, pitching)[0])
@@ -149,9 +227,11 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         body = matmul(matmul(attitude, inertia), transpose(attitude))
         moment = add(mul(body, turning), cross(rates, mul(body, rates)))
         force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
+        level *= 16.0 * s * s * (1.0 - s) * (1.0 - s)
         for n in range(count):
             old, new = mat_row(plan.pull, e, k, n), mat_row(plan.pull, e, k + 1, n)
-            pull = turn(c, si, add(scale(1.0 - s, old), scale(s, new)))
+            mixed = scale(1.0 - level, add(scale(1.0 - s, old), scale(s, new)))
+            pull = turn(c, si, add(mixed, scale(level, mat_row(plan.pull, e, 0, n))))
             put(way.pull[e, n], pull)
             force, moment = sub(force, pull), sub(moment, cross(mul(attitude, row(rig.anchors, n)), pull))
         linear, angular = spread(force, moment, attitude, balance)
@@ -174,10 +254,10 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
 
 
 @kernel
-def _dipped(start, end, s):
+def _dipped(start, end, s, by):
     """Return the angle at share s of the way from start to end, less half-way, and its two derivatives by s."""
     straight, change, u = start + s * (end - start), end - start, s * (1.0 - s)
-    dip, first, second = 1.0 - DIP * 16.0 * u * u, -DIP * 32.0 * u * (1.0 - 2.0 * s), -DIP * 32.0 * (1.0 - 6.0 * u)
+    dip, first, second = 1.0 - by * 16.0 * u * u, -by * 32.0 * u * (1.0 - 2.0 * s), -by * 32.0 * (1.0 - 6.0 * u)
     return straight * dip, change * dip + straight * first, 2.0 * change * first + straight * second
 
 
