@@ -36,7 +36,18 @@ def test_every_task_and_preset_is_flown_by_every_script():
     for name, flight in reproduce.FLIGHTS.items():
         for script in fitting_scripts(ml.make_vec(flight.config, num_envs=1, num_threads=1)):
             told = json.loads((ROOT / "results" / name / f"{script}.json").read_text(encoding="utf-8"))
-            assert (told["episodes"], told["seed"]) == (reproduce.EPISODES, reproduce.SEED)
+            assert (told["episodes"], told["seed"]) == (reproduce.EPISODES["script"], reproduce.SEED)
+
+
+def test_every_learned_team_is_flown_a_thousand_times():
+    flown = 0
+    for name, flight in reproduce.FLIGHTS.items():
+        for weights in (ROOT / "results" / flight.recipe).glob("seed*/policy.pt"):
+            path = ROOT / "results" / name / f"{weights.parent.name}.json"
+            told = json.loads(path.read_text(encoding="utf-8"))
+            assert (told["episodes"], told["seed"]) == (1000, reproduce.SEED)
+            flown += 1
+    assert flown > len(reproduce.FLIGHTS)
 
 
 @pytest.mark.parametrize("weights", sorted((ROOT / "results").glob("*/seed0/policy.pt")), ids=lambda p: p.parts[-3])

@@ -182,8 +182,9 @@ class MultiliftVec:
             ValueError: it is of other environments: an array is missing or of another shape.
         """
         for key, array in self.state_dict().items():
-            found = np.shape(saved[key]) if key in saved else None
-            if found != array.shape:
+            if key not in saved:
+                raise ValueError(f"the saved state does not fit these environments: '{key}' is missing")
+            if (found := np.shape(saved[key])) != array.shape:
                 raise ValueError(
                     f"the saved state does not fit these environments: '{key}' has shape {found}, expected "
                     f"{array.shape}; use the configuration it was saved with"

@@ -93,8 +93,8 @@ class Pose(Task):
                 "target_height or change the rig"
             )
         way, inertia, nominal = self.way, self.world.system.inertia_matrix, self.nominal_hanging
-        planned = self._balance, self._hold, option.way_seconds
-        choose_courses(env, self.time, self.plan, way, self.rig, nominal, inertia, *planned, self._bounds.separation)
+        known = inertia, self._balance, self._hold, option.way_seconds, self._bounds
+        choose_courses(env, self.time, self.plan, way, self.rig, nominal, *known)
         _start(env, self.world.state, self.plan, self.goal, way, self.rig, nominal, self.hanging, mass)
         self.reached[env] = False
 
@@ -138,6 +138,7 @@ def _start(e, state, plan, goal, way, rig, nominal, hanging, mass):
     rest(e, 0, plan, way, rig, nominal)
     still = (0.0, 0.0, 0.0)
     hang_team(e, state, way, rig, hanging, mass, row(way.position, e), matrow(way.rotation, e), still, still)
+    plan.stage[e] = 0
     aim(e, 1, plan, goal, rig, nominal)  # last, since it shares the slot frames with the way
 
 

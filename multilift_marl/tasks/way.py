@@ -29,6 +29,7 @@ from multilift_marl.math3d import (
     rot_z,
     row,
     scale,
+    segment_distance,
     sub,
     transpose,
     turn,
@@ -44,7 +45,9 @@ COURSES = (  # the usual one first: whether to turn the longer way round, and tw
     (True, 0.0, 0.6),
     (False, 0.75, -0.3),
 )
-GENTLE = 5.0  # [m/s²] of a slot, at most: ways that ask no more are flown by the first course
+GENTLE = 5.0  # [m/s²] of a slot, about: a way is flown by the first course that asks no more
+GAIN = 0.95  # of what the course before asks for, at most, where another one is to be taken
+CLOSE = 30.0  # [m/s²] that drones or cables count, which touch, and in proportion those closer than their bound
 _SAMPLES = 60
 
 
@@ -57,8 +60,8 @@ class Plan(NamedTuple):
     """(E, K + 1, N, 3) of the cables on the payload at rest there, in the frame turned by the yaw alone [N]."""
     course: np.ndarray
     """(E, K, 3) of the way to each target: by how much it turns [rad], which share of roll and pitch is taken away
-    half-way (a payload that turns is easier to pull the less it tilts), and how far the pulls are those of the level
-    start there."""
+    half-way (a payload that turns is easier to pull the less it tilts), and which share the pulls of the level start
+    have there, where a negative one leads away from them."""
     stage: np.ndarray
     """(E,) int64, which target is the present one, from 0."""
 
@@ -102,7 +105,7 @@ def mat_row(a, i, j, n):
 
 
 @kernel
-def choose_courses(e, time, plan, way, rig, hanging, inertia, balance, hold, seconds, separation):
+def choose_courses(e, time, plan, way, rig, hanging, inertia, balance, hold, seconds, bounds):
     """Choose the course of each way of environment e: the first of `COURSES` that is gentle, else the gentlest one.
 
     What decides is how a slot is accelerated: a drone whose cable is nearly slack is swung about by little changes.
@@ -110,21 +113,21 @@ def choose_courses(e, time, plan, way, rig, hanging, inertia, balance, hold, sec
     Args:
         e: the environment.
         time, way: overwritten.
-        plan: Plan, its courses written; the present stage is the first one then.
+        plan: Plan, its courses written.
         rig, hanging, inertia, balance, hold, seconds: see `lead`.
-        separation: (N, N) of slots on the way [m].
+        bounds: Bounds, those of distances between drones and cables.
     """
     for k in range(plan.course.shape[1]):
         least, best = np.inf, 0
         for i in range(len(COURSES)):
             _take(e, k, plan, i)
-            asked = _asked(e, k, time, plan, way, rig, hanging, inertia, balance, hold, seconds, separation)
-            if asked < least:
+            asked = _asked(e, k, time, plan, way, rig, hanging, inertia, balance, hold, seconds, bounds)
+            if asked < GAIN * least:
                 least, best = asked, i
             if asked <= GENTLE:
                 break
         _take(e, k, plan, best)
-    plan.stage[e], time[e] = 0, 0.0
+    time[e] = 0.0
 
 
 @kernel
@@ -136,19 +139,22 @@ def _take(e, k, plan, i):
 
 
 @kernel
-def _asked(e, k, time, plan, way, rig, hanging, inertia, balance, hold, seconds, separation):
-    """Return the largest acceleration of a slot on way k [m/s²], twice that where two slots come too close."""
+def _asked(e, k, time, plan, way, rig, hanging, inertia, balance, hold, seconds, bounds):
+    """Return the largest acceleration of a slot on way k [m/s²], or more where drones or cables come too close."""
     rest(e, k, plan, way, rig, hanging)
-    plan.stage[e], most, factor, dt = k, 0.0, 1.0, seconds / _SAMPLES
+    plan.stage[e], most, room, dt = k, 0.0, 1.0, seconds / _SAMPLES
     for i in range(_SAMPLES):
         time[e] = k * hold + (i + 1) * dt
         _go(e, e + 1, time, dt, plan, way, rig, hanging, inertia, balance, hold, seconds)
+        position, attitude = row(way.position, e), matrow(way.rotation, e)
         for n in range(rig.slots.shape[0]):
             most = max(most, norm(add(row(way.acceleration, e), vec(way.slot_acceleration, e, n))))
+            slot, foot = vec(way.slots, e, n), add(position, mul(attitude, row(rig.anchors, n)))
             for m in range(n):
-                if norm(sub(vec(way.slots, e, n), vec(way.slots, e, m))) < separation[n, m]:
-                    factor = 2.0
-    return factor * most
+                other, beside = vec(way.slots, e, m), add(position, mul(attitude, row(rig.anchors, m)))
+                room = min(room, norm(sub(slot, other)) / bounds.separation[n, m])
+                room = min(room, segment_distance(foot, slot, beside, other) / bounds.cables[n, m])
+    return most if room >= 1.0 else max(most, GENTLE) + CLOSE * (1.0 - room)
 
 
 @kernel
@@ -227,11 +233,11 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         body = matmul(matmul(attitude, inertia), transpose(attitude))
         moment = add(mul(body, turning), cross(rates, mul(body, rates)))
         force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
-        level *= 16.0 * s * s * (1.0 - s) * (1.0 - s)
+        share = level * 16.0 * s * s * (1.0 - s) * (1.0 - s)
         for n in range(count):
             old, new = mat_row(plan.pull, e, k, n), mat_row(plan.pull, e, k + 1, n)
-            mixed = scale(1.0 - level, add(scale(1.0 - s, old), scale(s, new)))
-            pull = turn(c, si, add(mixed, scale(level, mat_row(plan.pull, e, 0, n))))
+            mixed = scale(1.0 - share, add(scale(1.0 - s, old), scale(s, new)))
+            pull = turn(c, si, add(mixed, scale(share, mat_row(plan.pull, e, 0, n))))
             put(way.pull[e, n], pull)
             force, moment = sub(force, pull), sub(moment, cross(mul(attitude, row(rig.anchors, n)), pull))
         linear, angular = spread(force, moment, attitude, balance)
