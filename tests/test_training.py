@@ -66,7 +66,7 @@ def test_a_few_iterations_improve_the_return(tmp_path):
             "env.num_envs": 64, "env.num_threads": 0, "env.episode_seconds": 4.0, "train.horizon": 32,
             "train.frames": 64 * 32 * 40, "eval.episodes": 64, "train.residual": "formation", "train.overrides": {},
             "train.initial_std": 0.3, "train.learning_rate": 1e-3, "train.critic_learning_rate": None,
-            "train.gae_lambda": 0.95, "train.hidden": [128, 128],
+            "train.epochs": 4, "train.gae_lambda": 0.95, "train.hidden": [128, 128],
         },
     )  # fmt: skip
     rewards, values = [], {}
