@@ -182,13 +182,11 @@ class MultiliftVec:
             ValueError: it is of other environments: an array is missing or of another shape.
         """
         for key, array in self.state_dict().items():
-            if key not in saved:
-                raise ValueError(f"the saved state does not fit these environments: '{key}' is missing")
-            if (found := np.shape(saved[key])) != array.shape:
-                raise ValueError(
-                    f"the saved state does not fit these environments: '{key}' has shape {found}, expected "
-                    f"{array.shape}; use the configuration it was saved with"
-                )
+            found = np.shape(saved[key]) if key in saved else None
+            if found != array.shape:
+                wrong = f"has shape {found}, expected {array.shape}; use the configuration it was saved with"
+                wrong = wrong if key in saved else "is missing"
+                raise ValueError(f"the saved state does not fit these environments: '{key}' {wrong}")
         groups: dict[str, Rows] = {"world": {}, "task": {}, "imperfections": {}}
         for key, array in saved.items():
             group, _, name = key.partition(".")
