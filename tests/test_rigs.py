@@ -41,6 +41,16 @@ def test_falcon4_is_the_default_rig():
             assert first == second, field.name
 
 
+@pytest.mark.parametrize(
+    ("recipe", "rig"), [("track_auto6", "auto6"), ("pose_falcon3", "falcon3"), ("recover_crazymarl", "crazyflie2")]
+)
+def test_recipes_that_repeat_a_rig_say_the_same(recipe, rig):
+    flown, shipped = ml.load_config(recipe), ml.load_config(f"rigs/{rig}")
+    assert flown.env.num_drones == shipped.env.num_drones
+    for section in ("vehicle", "payload", "cable"):
+        assert getattr(flown, section) == getattr(shipped, section)
+
+
 @pytest.mark.parametrize("name", RIGS)
 def test_scripted_teams_fly_every_rig(name):
     vec = ml.make_vec(name, num_envs=8, num_threads=1)
