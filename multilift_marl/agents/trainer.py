@@ -64,6 +64,7 @@ class Trainer:
             total_frames=-1,
             track_traj_ids=False,
             auto_register_policy_transforms=False,
+            device="cpu",
         )
         self._batches = iter(self.collector)
         if checkpoint is None:

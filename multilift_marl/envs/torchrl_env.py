@@ -64,32 +64,34 @@ class MultiliftEnv(EnvBase):
         else:
             seed, self._seed, self._resumed = self._seed, None, False
             observation, info = self.vec.reset(seed, None if mask is None else mask.reshape(-1).numpy())
-        out = self._package(observation, info)
         ended = torch.from_numpy(self.vec.ended).unsqueeze(-1)  # of environments that this reset leaves alone
-        out["terminated"], out["truncated"] = ended & self._terminated, ended & ~self._terminated
-        out["done"] = ended
-        return out
+        return self._package(observation, info, ended & self._terminated, ended & ~self._terminated)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["agents", "action"].detach().numpy()
         observation, reward, terminated, truncated, info = self.vec.step(action)
         self._resumed = False
-        out = self._package(observation, info)
-        out["agents", "reward"] = torch.from_numpy(reward).unsqueeze(-1)
-        out["terminated"] = self._terminated = torch.from_numpy(terminated).unsqueeze(-1)
-        out["truncated"] = torch.from_numpy(truncated).unsqueeze(-1)
-        out["done"] = out["terminated"] | out["truncated"]
-        return out
+        self._terminated = torch.from_numpy(terminated).unsqueeze(-1)
+        return self._package(observation, info, self._terminated, torch.from_numpy(truncated).unsqueeze(-1), reward)
 
-    def _package(self, observation: np.ndarray, info: dict[str, Any]) -> TensorDict:
+    def _package(
+        self, observation: np.ndarray, info: dict[str, Any], terminated: torch.Tensor, truncated: torch.Tensor,
+        reward: np.ndarray | None = None,
+    ) -> TensorDict:  # fmt: skip
         e, n = self.vec.num_envs, self.vec.num_drones
+        agents = {"observation": torch.from_numpy(observation)}
+        if reward is not None:
+            agents["reward"] = torch.from_numpy(reward).unsqueeze(-1)
         flags = {key: torch.from_numpy(info[key]).unsqueeze(-1) for key in ("success", "failure", "diverged")}
         terms = torch.from_numpy(self.vec.task.terms.astype(np.float32))
-        return TensorDict(
+        return TensorDict(  # whole, since every key that is added later is checked again
             {
-                "agents": TensorDict({"observation": torch.from_numpy(observation)}, (e, n)),
+                "agents": TensorDict(agents, (e, n)),
                 "state": torch.from_numpy(self.vec.state()),
                 "info": TensorDict({**flags, "reward_terms": terms}, (e,)),
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
             },
             (e,),
         )
