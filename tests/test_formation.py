@@ -11,14 +11,7 @@ from conftest import GRAVITY, make, make_system, refusal
 
 from multilift_marl.config import load_config
 from multilift_marl.control.formation import Goal, make_rig, place_formation
-from multilift_marl.control.scripted import (
-    INTEGRAL_GAIN,
-    LEAD_GAIN,
-    LINEAR,
-    FormationFeedback,
-    fitting_scripts,
-    make_scripted,
-)
+from multilift_marl.control.scripted import INTEGRAL_GAIN, LEAD_GAIN, LINEAR, fitting_scripts, make_scripted
 from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.rollout import fly_episodes
 from multilift_marl.math3d import axis_angle, rot_z
@@ -142,13 +135,16 @@ def test_the_integral_script_moves_the_slots_against_the_integral():
     np.testing.assert_allclose(action, np.broadcast_to(expected, action.shape), rtol=1e-6)
 
 
-def test_the_feedback_script_moves_the_slots_against_what_it_observes():
+@pytest.mark.parametrize("name", ["formation_feedback", "formation_gusts"])
+def test_feedback_scripts_move_the_slots_against_what_they_observe(name):
     vec = make(num_envs=1, **{"control.max_offset": 0.4})
-    script = make_scripted("formation_feedback", vec)
-    for name, axis, moved, gain in FormationFeedback.GAINS:
+    script, gains = make_scripted(name, vec), LINEAR[name].GAINS
+    for told in {gain[:2] for gain in gains}:
         expected = [0.0] * 4
-        expected[moved] = gain * 0.1 / 0.4
-        action = script.act(observed(vec, 0.0, **{f"{name}_{axis}": 0.1}))
+        for *observation, moved, gain in gains:
+            if tuple(observation) == told:
+                expected[moved] = gain * 0.1 / 0.4
+        action = script.act(observed(vec, 0.0, **{"{}_{}".format(*told): 0.1}))
         np.testing.assert_allclose(action, np.broadcast_to(expected, action.shape), rtol=1e-6)
 
 

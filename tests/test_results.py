@@ -4,14 +4,19 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from conftest import refusal
 
 import multilift_marl as ml
-from multilift_marl.control.scripted import fitting_scripts
+from multilift_marl.control.scripted import LINEAR, fitting_scripts
+from multilift_marl.envs.core import TRAINING_EVALUATION
+from multilift_marl.evaluation.rollout import fly_episodes
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "results"))
 import reproduce  # noqa: E402
+import search_gains  # noqa: E402
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/tasks.md"])
@@ -54,3 +59,44 @@ def test_every_learned_team_is_flown_a_thousand_times():
 def test_shipped_weights_are_those_of_the_results(weights):
     shipped = ROOT / "multilift_marl" / "policies" / f"{weights.parts[-3]}.pt"
     assert shipped.read_bytes() == weights.read_bytes()
+
+
+@pytest.mark.parametrize("script", ["formation_feedback", "formation_gusts"])
+def test_the_search_begins_with_the_gains_of_its_script(script):
+    vec = ml.make_vec("pose", num_envs=1, num_threads=1)
+    begun = search_gains.make_script(search_gains.starting_gains(script))
+    np.testing.assert_array_equal(begun(vec).matrix(), LINEAR[script](vec).matrix())
+
+
+@pytest.mark.parametrize(
+    ("name", "script"), [("hover_wind", "formation_integral"), ("pose_wind", "formation_feedback")]
+)
+def test_the_search_counts_as_success_what_the_task_does(name, script):
+    config = ml.load_config(name, {"env.num_envs": 16})
+    flown = search_gains.fly(config, LINEAR[script], seed=3)
+    told = fly_episodes(config, LINEAR[script], 16, 3, TRAINING_EVALUATION)
+    assert flown.success == told["success_rate"].mean() and 0 < flown.success < 1
+    assert flown.distance > np.median(told["payload_position_error_m"])
+    assert flown.angle > np.median(told["payload_attitude_error_deg"])
+
+
+def test_the_search_prints_gains_that_a_script_can_have(capsys):
+    keys = {"config": "hover", "minutes": 1e-3, "env.num_envs": 4, "env.episode_seconds": 2.0}
+    assert search_gains.main(keys) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = [eval(line.strip().rstrip(",")) for line in lines if line.startswith("        (")]
+    assert len(rows) == sum(len(axes) for _, axes, _ in search_gains.FREE)
+    assert lines[0].startswith("1: cost") and lines[-1].startswith("searched: ")
+    told = [(name, axis, moved) for name, axes, _ in search_gains.FREE for axis, moved in axes]
+    assert [row[:3] for row in rows] == told
+
+
+@pytest.mark.parametrize(
+    ("keys", "reason"),
+    [
+        ({"script": "formation_gust"}, "did you mean 'formation_gusts'"),
+        ({"config": "track"}, "task track bounds no distance and angle"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused(keys, reason):
+    assert reason in refusal(search_gains.main, dict(keys))

@@ -27,8 +27,8 @@ _USAGE = """Judge a team on fixed seeds, beside the scripted ones on the same ep
   python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
   run         a run folder, its name, "latest", or the name of a shipped policy ("hover")     (latest)
-  policy      script in place of a run: formation, formation_integral, formation_feedback, formation_lead,
-              payload_geometric                                                               (none)
+  policy      script in place of a run: formation, formation_integral, formation_feedback, formation_gusts,
+              formation_lead, payload_geometric                                               (none)
   config      environment of that script, a configuration's name or path                      (hover)
   checkpoint  best, last, or a file                                                           (best)
   episodes    how many                                                                        (200)

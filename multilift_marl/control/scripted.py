@@ -93,6 +93,37 @@ class FormationFeedback(Formation):
     )
 
 
+class FormationGusts(Formation):
+    """The formation with its slots moved by linear feedback that holds tilted payloads in turbulent wind.
+
+    More of what `FormationFeedback` does, on the payload's position above all; drones also move along the tangent at
+    their slot, against the payload's turning about the vertical, and outward where it tilts towards them. The gains
+    are those that `results/search_gains.py` found for `configs/pose_wind.yaml`.
+    """
+
+    GAINS = (
+        ("payload_error_integral", 0, 0, -0.57),
+        ("payload_error_integral", 1, 1, -0.57),
+        ("payload_error_integral", 2, 2, -0.74),
+        ("payload_error", 0, 0, -0.5),
+        ("payload_error", 1, 1, -0.5),
+        ("payload_error", 2, 2, -0.54),
+        ("payload_velocity", 0, 0, -0.54),
+        ("payload_velocity", 1, 1, -0.54),
+        ("payload_velocity", 2, 2, -0.22),
+        ("tracking_error", 0, 0, -0.12),
+        ("tracking_error", 1, 1, -0.12),
+        ("rotation_error_integral", 1, 2, 0.16),
+        ("payload_rotation_error", 1, 2, 0.34),
+        ("payload_angular_velocity", 1, 2, 0.03),
+        ("rotation_error_integral", 2, 1, -0.73),
+        ("payload_rotation_error", 2, 1, 0.09),
+        ("payload_angular_velocity", 2, 1, 0.02),
+        ("payload_rotation_error", 1, 0, 0.27),
+        ("payload_angular_velocity", 1, 0, 0.05),
+    )
+
+
 class FormationLead(Formation):
     """The formation displaced by what the payload's acceleration to come asks of its cables.
 
@@ -135,6 +166,7 @@ LINEAR: dict[str, type[Formation]] = {
     "formation": Formation,
     "formation_integral": FormationIntegral,
     "formation_feedback": FormationFeedback,
+    "formation_gusts": FormationGusts,
     "formation_lead": FormationLead,
 }
 """Scripts that are maps of the observation."""
