@@ -14,16 +14,14 @@ import time
 from math import radians
 from typing import Any, NamedTuple
 
-import cma
 import numpy as np
 
 from multilift_marl.cli.common import run_command
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
-from multilift_marl.control.scripted import LINEAR, Formation
+from multilift_marl.control.scripted import LINEAR, Formation, check_interface
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.tasks import TASKS
 
 LEVEL, TANGENT, RADIAL, UP = ((0, 0), (1, 1)), ((2, 1),), ((1, 0),), ((2, 2),)
 LIFT = ((1, 2),)  # what a drone does up and down turns the payload about the tangent at its slot
@@ -46,6 +44,8 @@ FREE: tuple[tuple[str, tuple[tuple[int, int], ...], float], ...] = (
     ("payload_angular_velocity", RADIAL, 0.05),
 )
 """What is observed; axes in the slot frame, of it and of the slot's offset, that share a gain; how far to look."""
+TASKS = ("hover", "pose")  # succeed where distance and angle stay within bounds, and judge nothing else
+SCRIPTS = tuple(name for name in LINEAR if name != "formation_lead")  # those that are all gains
 POPULATION, RENEWED = 12, 3  # candidates of a generation; generations that fly the same episodes
 SOFT = 0.15  # how far from a bound of success an episode counts half as lost, as a part of the bound
 
@@ -101,9 +101,17 @@ def fly(config: Config, script: type[Formation], seed: int) -> Flown:
 
 
 def search(config: Config, start: np.ndarray, spread: float, minutes: float) -> np.ndarray:
-    """Return the mean of the last generation; Ctrl-C ends the search early."""
+    """Return the mean of the last generation; Ctrl-C ends the search early.
+
+    Raises:
+        ConfigError: the package `cma` is missing.
+    """
+    try:
+        import cma
+    except ModuleNotFoundError:
+        raise ConfigError("the search needs the package cma; install it with: pip install cma") from None
     scale = np.array([far for _, _, far in FREE])
-    options = {"popsize": POPULATION, "seed": config.seed + 1, "verbose": -9}
+    options = {"popsize": POPULATION, "seed": config.seed % (2**32 - 1) + 1, "verbose": -9}
     strategy, end, generation = cma.CMAEvolutionStrategy(np.zeros(len(FREE)), spread, options), 60 * minutes, 0
     begun = time.monotonic()
     try:
@@ -128,17 +136,22 @@ def search(config: Config, start: np.ndarray, spread: float, minutes: float) -> 
 def main(values: dict[str, Any]) -> int:
     """Search, print and test."""
     own = {key: values.pop(key, default) for key, default in OWN.items()}
-    if own["script"] not in LINEAR:
-        raise ConfigError(f"unknown linear script '{own['script']}'{nearest(own['script'], LINEAR)}")
+    for key in ("minutes", "spread"):
+        if isinstance(own[key], bool) or not isinstance(own[key], int | float) or not 0 < own[key] < float("inf"):
+            raise ConfigError(f"{key} must be a positive number, but is {own[key]!r}")
+    script = str(own["script"])
+    if script not in SCRIPTS:
+        raise ConfigError(f"the search cannot begin with script '{script}'{nearest(script, SCRIPTS)}")
     config = load_config(str(own["config"]), {"env.num_envs": 48, **values})
-    if not {"success_distance", "success_angle"} <= TASKS[config.task].Options.model_fields.keys():
-        raise ConfigError(f"task {config.task} bounds no distance and angle to judge a script by; take hover or pose")
-    start, fresh = starting_gains(own["script"]), build_config(config.model_dump(), {"env.num_envs": 256})
-    gains = search(config, start, float(own["spread"]), float(own["minutes"]))
+    check_interface(script, config.control.action)
+    if config.task not in TASKS:
+        raise ConfigError(f"task {config.task} cannot be searched; take hover or pose")
+    start, fresh = starting_gains(script), build_config(config.model_dump(), {"env.num_envs": 256})
+    gains = search(config, start, own["spread"], own["minutes"])
     for (name, axes, _), gain in zip(FREE, gains, strict=True):
         for axis, moved in axes:
             print(f'        ("{name}", {axis}, {moved}, {gain:.3f}),')
-    for title, each in ((own["script"], start), ("searched", gains)):
+    for title, each in ((script, start), ("searched", gains)):
         _, success, distance, angle = fly(fresh, make_script(each), config.seed + 10**6)
         print(f"{title}: {success:.1%} of 256 new episodes; median of the worst {100 * distance:.1f} cm, {angle:.1f}°")
     return 0

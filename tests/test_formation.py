@@ -172,6 +172,15 @@ def test_the_feedback_script_holds_a_payload_in_turbulence_that_the_integral_doe
     assert success["formation_feedback"] > 0.8 > 0.4 > success["formation_integral"]
 
 
+def test_the_script_for_gusts_holds_poses_in_turbulence_that_the_feedback_script_does_not():
+    config = load_config("pose_wind")
+    success = {
+        name: fly_episodes(config, partial(make_scripted, name), 24, seed=1000)["success_rate"].mean()
+        for name in ("formation_feedback", "formation_gusts")
+    }
+    assert success["formation_gusts"] > 0.75 > success["formation_feedback"]
+
+
 def test_the_leading_script_stands_ahead_by_what_the_acceleration_asks():
     vec = make("track", num_envs=1, **{"control.max_offset": 0.6})
     v, a, height = 1.3, 2.0, cos(radians(30))

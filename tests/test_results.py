@@ -91,12 +91,35 @@ def test_the_search_prints_gains_that_a_script_can_have(capsys):
     assert [row[:3] for row in rows] == told
 
 
+def test_the_search_finds_gains_that_cost_less(monkeypatch):
+    def bowl(config, script, seed):
+        return search_gains.Flown(sum((gain - 0.3) ** 2 for *_, gain in script.GAINS), 0.0, 0.0, 0.0)
+
+    monkeypatch.setattr(search_gains, "fly", bowl)
+    start = search_gains.starting_gains("formation_feedback")
+    found = search_gains.search(ml.load_config("pose"), start, spread=0.3, minutes=0.03)
+    assert np.abs(found - 0.3).max() < 0.3 * np.abs(start - 0.3).max()
+
+
 @pytest.mark.parametrize(
     ("keys", "reason"),
     [
         ({"script": "formation_gust"}, "did you mean 'formation_gusts'"),
-        ({"config": "track"}, "task track bounds no distance and angle"),
+        ({"script": None}, "cannot begin with script 'None'"),
+        ({"script": "formation_lead"}, "cannot begin with script 'formation_lead'"),
+        ({"config": "track"}, "task track cannot be searched; take hover or pose"),
+        ({"config": "loss"}, "task loss cannot be searched"),
+        ({"control.action": "velocity"}, "cannot fly control.action=velocity"),
+        ({"minutes": "abc"}, "minutes must be a positive number, but is 'abc'"),
+        ({"minutes": 0}, "minutes must be a positive number"),
+        ({"spread": float("nan")}, "spread must be a positive number"),
     ],
 )
 def test_what_cannot_be_searched_is_refused(keys, reason):
     assert reason in refusal(search_gains.main, dict(keys))
+
+
+def test_a_search_without_its_package_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cma", None)
+    start = search_gains.starting_gains("formation_feedback")
+    assert "pip install cma" in refusal(search_gains.search, ml.load_config("pose"), start, 0.3, 1.0)

@@ -96,9 +96,10 @@ class FormationFeedback(Formation):
 class FormationGusts(Formation):
     """The formation with its slots moved by linear feedback that holds tilted payloads in turbulent wind.
 
-    More of what `FormationFeedback` does, on the payload's position above all; drones also move along the tangent at
-    their slot, against the payload's turning about the vertical, and outward where it tilts towards them. The gains
-    are those that `results/search_gains.py` found for `configs/pose_wind.yaml`.
+    Against the payload's position and level velocity more than by `FormationFeedback`, against the drone's own lag and
+    the integral of the payload's tilt less; drones also move along the tangent at their slot, against the payload's
+    turning about the vertical, and outward where it tilts towards them. The gains are rounded from a search like that
+    of `results/search_gains.py` for `configs/pose_wind.yaml`.
     """
 
     GAINS = (
