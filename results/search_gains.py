@@ -47,7 +47,7 @@ FREE: tuple[tuple[str, tuple[tuple[int, int], ...], float], ...] = (
 TASKS = ("hover", "pose")  # succeed where distance and angle stay within bounds, and judge nothing else
 SCRIPTS = tuple(name for name in LINEAR if name != "formation_lead")  # those that are all gains
 POPULATION, RENEWED = 12, 3  # candidates of a generation; generations that fly the same episodes
-SOFT = 0.15  # how far from a bound of success an episode counts half as lost, as a part of the bound
+SOFT = 0.15  # over which an episode turns from held to lost, as a part of the bounds; at them it counts half
 
 
 class Flown(NamedTuple):
