@@ -184,8 +184,8 @@ class MultiliftVec:
         for key, array in self.state_dict().items():
             found = np.shape(saved[key]) if key in saved else None
             if found != array.shape:
-                wrong = f"has shape {found}, expected {array.shape}; use the configuration it was saved with"
-                wrong = wrong if key in saved else "is missing"
+                shapes = f"has shape {found}, expected {array.shape}; use the configuration it was saved with"
+                wrong = "is missing" if found is None else shapes
                 raise ValueError(f"the saved state does not fit these environments: '{key}' {wrong}")
         groups: dict[str, Rows] = {"world": {}, "task": {}, "imperfections": {}}
         for key, array in saved.items():
