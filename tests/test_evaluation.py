@@ -21,9 +21,8 @@ from multilift_marl.evaluation.report import format_table, make_report
 from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
 
 SCRIPTS = {  # those of every task
-    *("formation", "formation_integral", "formation_feedback", "formation_gusts"),
-    "payload_geometric",
-}
+    "formation", "formation_integral", "formation_feedback", "formation_gusts", "payload_geometric",
+}  # fmt: skip
 CONTRACT = {
     "success_rate", "payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s",
     "return", "cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j",
