@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import hover_thrust, make_system, mask, same
 
+from multilift_marl import make_vec
 from multilift_marl.sim import World
 
 # Many at once
@@ -163,3 +166,41 @@ def test_divergence_writes_no_file_and_nothing_to_the_screen(tmp_path, monkeypat
     assert "simulation is unstable" in caplog.text
     assert capfd.readouterr() == ("", "")
     assert list(Path.cwd().iterdir()) == []
+
+
+# The solver
+
+
+def step_once(model, start, solver: int, tolerance: float, iterations: int) -> np.ndarray:
+    data = copy.copy(start)
+    model.opt.solver, model.opt.tolerance, model.opt.iterations = solver, tolerance, iterations
+    mujoco.mj_step(model, data)
+    return data.qvel.copy()
+
+
+@pytest.mark.parametrize(
+    "name, num_drones", [("hover", 4), ("recover_crazymarl", 3), ("loss", 4), ("takeoff", 8), ("track_auto6", 6)]
+)
+def test_conjugate_gradients_find_what_newtons_method_finds(name, num_drones):
+    vec = make_vec(name, num_envs=4, num_threads=1, num_drones=num_drones)
+    model, batch = copy.copy(vec.world.model), vec.world.shards[0].batch
+    used = model.opt.solver, model.opt.tolerance, model.opt.iterations
+    assert used[0] == mujoco.mjtSolver.mjSOL_CG
+    rng, data, far, slack, contacts = np.random.default_rng(0), mujoco.MjData(model), [], 0, 0
+    vec.reset(seed=0)
+    action = np.zeros((4, num_drones, vec.action_size))
+    for _ in range(80):
+        action = np.clip(0.9 * action + 0.5 * rng.normal(size=action.shape), -1, 1)
+        _, _, terminated, truncated, _ = vec.step(action)
+        if (ended := terminated | truncated).any():
+            vec.reset(mask=ended)
+        for e in range(4):
+            for name in ("qpos", "qvel", "qfrc_applied", "qacc_warmstart"):
+                getattr(data, name)[:] = batch.bind(name)[e]
+            exact = step_once(model, data, mujoco.mjtSolver.mjSOL_NEWTON, 1e-14, 200)
+            far.append(np.abs(step_once(model, data, *used) - exact).max())
+            mujoco.mj_forward(model, data)
+            contacts += data.ncon > 0
+            slack += data.nefc - 4 * data.ncon < num_drones
+    assert np.max(far) < 1e-6 and np.median(far) < 1e-10  # [m/s], [rad/s]
+    assert contacts > 0 if name == "takeoff" else slack > 0

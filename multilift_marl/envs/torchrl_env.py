@@ -74,6 +74,18 @@ class MultiliftEnv(EnvBase):
         self._terminated = torch.from_numpy(terminated).unsqueeze(-1)
         return self._package(observation, info, self._terminated, torch.from_numpy(truncated).unsqueeze(-1), reward)
 
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Start new episodes where `tensordict` is done, and set there to 0 what a policy has added.
+
+        As `EnvBase.maybe_reset`, but faster: what the core returns is whole, and needs no merging.
+        """
+        done = tensordict["done"]
+        if not done.any():
+            return tensordict
+        fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
+        added = tensordict.exclude(*fresh.keys(True, True))
+        return added.masked_fill(done.squeeze(-1), 0).update(fresh)
+
     def _package(
         self, observation: np.ndarray, info: dict[str, Any], terminated: torch.Tensor, truncated: torch.Tensor,
         reward: np.ndarray | None = None,
@@ -84,16 +96,17 @@ class MultiliftEnv(EnvBase):
             agents["reward"] = torch.from_numpy(reward).unsqueeze(-1)
         flags = {key: torch.from_numpy(info[key]).unsqueeze(-1) for key in ("success", "failure", "diverged")}
         terms = torch.from_numpy(self.vec.task.terms.astype(np.float32))
-        return TensorDict(  # whole, since every key that is added later is checked again
+        return TensorDict(  # whole, and with its device: TensorDict checks and copies what is not
             {
-                "agents": TensorDict(agents, (e, n)),
+                "agents": TensorDict(agents, (e, n), device=self.device),
                 "state": torch.from_numpy(self.vec.state()),
-                "info": TensorDict({**flags, "reward_terms": terms}, (e,)),
+                "info": TensorDict({**flags, "reward_terms": terms}, (e,), device=self.device),
                 "done": terminated | truncated,
                 "terminated": terminated,
                 "truncated": truncated,
             },
             (e,),
+            device=self.device,
         )
 
     def _set_seed(self, seed: int | None) -> None:
