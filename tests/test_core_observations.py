@@ -8,6 +8,14 @@ import numpy as np
 import pytest
 from conftest import CABLES, TASKS, bold_actions, make, mixed_actions, wide
 
+from multilift_marl.tasks import find_task
+
+UNPAID = 0.1  # a weight for terms that have none by default
+
+
+def unpaid(task: str) -> dict[str, float]:
+    return {f"reward.{name}": UNPAID for name, weight in find_task(task).REWARD.items() if weight == 0}
+
 
 @pytest.fixture(scope="module", params=product(TASKS, CABLES), ids="-".join)
 def ensemble(request):
@@ -52,7 +60,7 @@ def test_the_state_tells_what_is_hidden_from_the_drones(task, cables):
 
 
 def test_reward_is_the_sum_of_its_named_terms_for_every_drone(task, num_drones, cables):
-    vec, paid = make(task, num_drones=num_drones, **wide(task), **cables), set()
+    vec, paid = make(task, num_drones=num_drones, **wide(task), **unpaid(task), **cables), set()
     vec.reset(seed=0)
     for step in range(vec.max_steps):
         _, reward, terminated, truncated, info = vec.step(0.2 * bold_actions(vec, step, hold=3))
@@ -68,16 +76,15 @@ def test_reward_is_the_sum_of_its_named_terms_for_every_drone(task, num_drones, 
 
 def test_a_weight_scales_its_term_and_no_other(task, cables):
     def terms(**weights):
-        vec = make(task, **weights, **cables)
+        vec = make(task, **unpaid(task) | weights, **cables)
         vec.reset(seed=0)
         for step in range(3):
             *_, info = vec.step(0.3 * bold_actions(vec, step, hold=1))
         return info["reward_terms"]
 
     plain = terms()
-    weights = make(task, num_envs=1, **cables).task.REWARD
-    for name, weight in weights.items():
-        heavier = terms(**{f"reward.{name}": 3 * weight})
+    for name, weight in find_task(task).REWARD.items():
+        heavier = terms(**{f"reward.{name}": 3 * (weight or UNPAID)})
         for other in plain:
             factor = 3 if other == name else 1
             np.testing.assert_allclose(heavier[other], factor * plain[other], rtol=1e-12)

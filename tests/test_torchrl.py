@@ -1,6 +1,7 @@
 """The TorchRL door: specs, masked resets, terminal observations, equality with the core."""
 
 import numpy as np
+import pytest
 import torch
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
@@ -55,9 +56,10 @@ def test_partial_reset_touches_only_its_rows_and_keeps_the_terminal_observation(
     assert env.vec.steps.tolist() == [3, 0, 3, 3]
 
 
-def test_rollouts_go_on_as_with_torchrls_own_resets():
+@pytest.mark.parametrize("num_envs", [1, 5])
+def test_rollouts_go_on_as_with_torchrls_own_resets(num_envs):
     ours, theirs = (
-        ml.torchrl_env("hover", num_envs=5, seed=2, **{"env.episode_seconds": 0.2, "control.max_offset": 1.5})
+        ml.torchrl_env("hover", num_envs=num_envs, seed=2, **{"env.episode_seconds": 0.2, "control.max_offset": 1.5})
         for _ in range(2)
     )
     theirs.maybe_reset = lambda tensordict: EnvBase.maybe_reset(theirs, tensordict)
@@ -66,16 +68,16 @@ def test_rollouts_go_on_as_with_torchrls_own_resets():
     theirs.vec.stagger()
     generator, ended = torch.Generator().manual_seed(0), 0
     for _ in range(25):
-        action = 2 * torch.rand((5, 4, 4), generator=generator) - 1
+        action = 2 * torch.rand((num_envs, 4, 4), generator=generator) - 1
         for now in (ours_now, theirs_now):
-            now["agents", "action"], now["memory"] = action.clone(), torch.ones(5, 2)
+            now["agents", "action"], now["memory"] = action.clone(), torch.ones(num_envs, 2)
         ours_stepped, ours_now = ours.step_and_maybe_reset(ours_now)
         theirs_stepped, theirs_now = theirs.step_and_maybe_reset(theirs_now)
         assert set(ours_now.keys(True, True)) == set(theirs_now.keys(True, True))
         assert bool((ours_stepped == theirs_stepped).all())
         assert bool((ours_now == theirs_now).all())
         ended += int(ours_stepped["next", "done"].sum())
-    assert ended > 5
+    assert ended > num_envs
 
 
 def test_set_seed_starts_episode_zero_of_that_seed():

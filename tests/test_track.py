@@ -5,7 +5,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from conftest import make, refusal, zeros
+from conftest import bold_actions, make, refusal, zeros
 
 from multilift_marl.config.load import load_config
 from multilift_marl.control.scripted import make_scripted
@@ -147,6 +147,15 @@ def test_success_is_never_to_be_far():
     for _ in range(vec.max_steps - 1):
         info = vec.step(zeros(vec))[4]
     assert info["success"].tolist() == [True, False]
+
+
+def test_heading_pays_for_the_rotation_about_the_vertical_alone():
+    vec = track(num_envs=8, **{"reward.heading": 0.2})
+    for step in range(40):
+        *_, info = vec.step(0.5 * bold_actions(vec, step))
+    roll, _, yaw = np.rad2deg(vec.task.errors.rotation.T)
+    np.testing.assert_allclose(info["reward_terms"]["heading"], 0.2 / (1 + (yaw / 0.5) ** 2), rtol=1e-12)
+    assert np.ptp(np.abs(yaw)) > 0.5 and np.ptp(np.abs(roll)) > 0.5
 
 
 @pytest.mark.parametrize("kind", ["circle", "figure8"])

@@ -75,16 +75,17 @@ class MultiliftEnv(EnvBase):
         return self._package(observation, info, self._terminated, torch.from_numpy(truncated).unsqueeze(-1), reward)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Start new episodes where `tensordict` is done, and set there to 0 what a policy has added.
+        """Start new episodes where `tensordict`, the root of a next step, is done.
 
-        As `EnvBase.maybe_reset`, but faster: what the core returns is whole, and needs no merging.
+        As `EnvBase.maybe_reset` does, but without its merging: all rows of what the environment tells are the core's,
+        those of episodes that go on, too. What a policy has added is 0 where an episode starts, unless all do.
         """
         done = tensordict["done"]
         if not done.any():
             return tensordict
         fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
         added = tensordict.exclude(*fresh.keys(True, True))
-        return added.masked_fill(done.squeeze(-1), 0).update(fresh)
+        return (added if done.all() else added.masked_fill(done.squeeze(-1), 0)).update(fresh)
 
     def _package(
         self, observation: np.ndarray, info: dict[str, Any], terminated: torch.Tensor, truncated: torch.Tensor,

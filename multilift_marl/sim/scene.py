@@ -76,11 +76,11 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
 
 
 def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
-    """Set integrator, solver, Jacobian, gravity and flags, the same for every model of this package."""
+    """Set integrator, gravity, flags and, for all models but chains, solver and Jacobian."""
     option, disable = spec.option, mujoco.mjtDisableBit
     option.timestep, option.gravity = timestep, [0, 0, -GRAVITY]
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    option.solver, option.tolerance = mujoco.mjtSolver.mjSOL_CG, 1e-18  # as good as Newton's, and faster
+    option.solver, option.tolerance, option.iterations = mujoco.mjtSolver.mjSOL_CG, 1e-18, 300
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.disableflags |= disable.mjDSBL_REFSAFE | disable.mjDSBL_AUTORESET | disable.mjDSBL_ISLAND
 

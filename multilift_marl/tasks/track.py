@@ -71,6 +71,7 @@ class Track(Task):
         "precision": 0.3,
         "attitude": 0.1,
         "velocity": 0.2,
+        "heading": 0.0,
         "action_rate": -0.05,
     }
     EXTRA: ClassVar[tuple[Component, ...]] = (
@@ -216,5 +217,6 @@ def _score(lo, hi, state, goal, errors, action, previous, weights, terms, worst)
         terms[e, 1] = weights[1] * tolerance(distance, 0.02)
         terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
         terms[e, 3] = weights[3] * tolerance(slip, 0.2)
-        terms[e, 4] = weights[4] * mean_change(e, action, previous)
+        terms[e, 4] = weights[4] * tolerance(errors.rotation[e, 2], radians(0.5))
+        terms[e, 5] = weights[5] * mean_change(e, action, previous)
         worst[e] = max(worst[e], distance)
