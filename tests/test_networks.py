@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.modules import PopArtValueNorm
 
-from multilift_marl.agents.networks import Actor, CentralCritic, draw_action
+from multilift_marl.agents.networks import Actor, CentralCritic, Tanh, draw_action
 from multilift_marl.tasks.observations import DroneNumbers
 
 KINDS = ("local", "set", "attention")
@@ -70,3 +70,13 @@ def test_actions_are_drawn_from_the_gaussian_that_their_probability_says():
     torch.testing.assert_close(log_prob, torch.distributions.Normal(mean, deviation).log_prob(action).sum(-1))
     torch.testing.assert_close(action.std((0, 1)), deviation[0, 0], rtol=0.02, atol=0)
     torch.testing.assert_close(action.mean((0, 1)), mean[0, 0], rtol=0.01, atol=0)
+
+
+def test_the_fast_tanh_is_tanh_and_its_gradient_too():
+    x, tanh = torch.linspace(-20, 20, 100_001), Tanh()
+    assert (tanh(x).double() - torch.tanh(x.double())).abs().max() < 2e-7
+    wide = torch.linspace(-4, 4, 20, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(tanh, wide)
+    with torch.no_grad():
+        assert torch.equal(tanh(wide), tanh(wide.detach()))
+    assert torch.equal(tanh(wide).detach(), tanh(wide.detach()))

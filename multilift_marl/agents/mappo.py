@@ -6,8 +6,8 @@ import time
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.modules import IndependentNormal, PopArtValueNorm, ProbabilisticActor
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
@@ -36,8 +36,25 @@ class Explorer(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write action and log-probability of every drone."""
-        agents = tensordict["agents"]
-        agents["action"], agents["action_log_prob"] = draw_action(*self.actor(agents["observation"]))
+        agents = tensordict.get("agents")
+        action, log_prob = draw_action(*self.actor(agents.get("observation")))
+        agents.set("action", action).set("action_log_prob", log_prob)
+        return tensordict
+
+
+class Between(TensorDictModuleBase):
+    """A network from one key to some others: TensorDictModule without its bookkeeping, see `Explorer`."""
+
+    def __init__(self, network: nn.Module, source: NestedKey, targets: list[NestedKey]):
+        super().__init__()
+        self.in_keys, self.out_keys = [source], targets
+        self.network = network
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write what the network returns."""
+        values = self.network(tensordict.get(self.in_keys[0]))
+        for key, value in zip(self.out_keys, values if isinstance(values, tuple) else (values,), strict=True):
+            tensordict.set(key, value)
         return tensordict
 
 
@@ -70,7 +87,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
     agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
     policy, gaussian = Explorer(actor), [agents["loc"], agents["scale"]]
-    mean = TensorDictModule(actor, in_keys=[agents["observation"]], out_keys=gaussian)
+    mean = Between(actor, agents["observation"], gaussian)
     judged = ProbabilisticActor(
         mean, in_keys=gaussian, out_keys=[agents["action"]], distribution_class=IndependentNormal,
         return_log_prob=True, log_prob_key=("agents", "action_log_prob"),
@@ -85,21 +102,26 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
         critic, source = CentralCritic(config.critic, vec.state_size, drones, config.hidden, value_norm), "state"
     else:
         critic, source = LocalCritic(vec.observation_size, config.hidden, value_norm), agents["observation"]
-    value = TensorDictModule(critic, in_keys=[source], out_keys=[agents["state_value"]])
+    value = Between(critic, source, [agents["state_value"]])
 
     # 3. The loss and the advantage estimator. Time-outs are bootstrapped: only `terminated` ends a return.
     keys = {"value": agents["state_value"], "reward": agents["reward"], "done": "done", "terminated": "terminated"}
     loss = (MAPPOLoss if config.algorithm == "mappo" else IPPOLoss)(
         judged, value, value_norm=value_norm, clip_epsilon=config.clip,
         entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.value_weight,
-        loss_critic_type="l2", normalize_advantage=False,
+        loss_critic_type="l2", normalize_advantage=False, functional=False,
     )  # fmt: skip
     loss.set_keys(**keys, action=agents["action"], sample_log_prob=("agents", "action_log_prob"))
     advantage = MultiAgentGAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=value)
     advantage.set_keys(**keys)
     groups = [{"params": list(actor.parameters())}, {"params": list(critic.parameters())}]  # rates of their own
-    optimizer = torch.optim.Adam(groups, lr=config.learning_rate, eps=1e-5)
+    optimizer = torch.optim.Adam(groups, lr=config.learning_rate, eps=1e-5, fused=True)
     return Learner(config, actor, critic, policy, loss, advantage, optimizer)
+
+
+def _rows(data: TensorDictBase, chosen: torch.Tensor) -> TensorDictBase:
+    """Return some rows of `data`, as `data[chosen]` does, in a quarter of the time."""
+    return data.apply(lambda values: values.index_select(0, chosen), batch_size=chosen.shape)
 
 
 def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
@@ -125,7 +147,7 @@ def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
     for _ in range(config.epochs):
         order = torch.randperm(data.shape[0])
         for chunk in order.chunk(config.minibatches):
-            losses = learner.loss(data[chunk])
+            losses = learner.loss(_rows(data, chunk))
             total = losses["loss_objective"] + losses["loss_critic"]
             if config.entropy > 0:
                 total = total + losses["loss_entropy"]

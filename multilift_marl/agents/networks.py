@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
@@ -48,14 +48,39 @@ class Normalizer(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return (..., size) with zero mean and unit variance, clipped."""
-        return ((x - self.shift) * self.scale).clamp(-self.clip, self.clip)
+        return (x - self.shift).mul_(self.scale).clamp(-self.clip, self.clip)
+
+
+def fast_tanh(x: torch.Tensor) -> torch.Tensor:
+    """Return tanh(x) as 2 / (1 + exp(-2x)) - 1: to 2e-7, several times as fast as torch.tanh is on CPUs."""
+    return torch.add(-torch.ones((), dtype=x.dtype), (2 * x).sigmoid_(), alpha=2)
+
+
+class _Tanh(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+        y = fast_tanh(x)
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:
+        return torch.ops.aten.tanh_backward(gradient, *ctx.saved_tensors)
+
+
+class Tanh(nn.Module):
+    """`fast_tanh` and its gradient."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return tanh(x)."""
+        return _Tanh.apply(x) if x.requires_grad else fast_tanh(x)
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int, gain: float) -> nn.Sequential:
     """Return a perceptron with tanh layers, initialised orthogonally, its last layer with `gain`."""
     widths, layers = [inputs, *hidden], []
     for fan_in, fan_out in zip(widths[:-1], widths[1:], strict=True):
-        layers += [_orthogonal(nn.Linear(fan_in, fan_out), math.sqrt(2)), nn.Tanh()]
+        layers += [_orthogonal(nn.Linear(fan_in, fan_out), math.sqrt(2)), Tanh()]
     return nn.Sequential(*layers, _orthogonal(nn.Linear(widths[-1], outputs), gain))
 
 
@@ -83,7 +108,7 @@ class TeamNet(nn.Module):
         if kind == "local":
             self.net = mlp(inputs, hidden, outputs, gain)
             return
-        self.embed = mlp(inputs, inner, last, gain=math.sqrt(2))
+        self.embed = mlp(inputs, inner, last, gain=math.sqrt(2)).append(Tanh())
         if kind == "attention":
             self.attention = nn.MultiheadAttention(last, self.HEADS, batch_first=True)
         self.net = mlp(2 * last, [last], outputs, gain)
@@ -92,7 +117,7 @@ class TeamNet(nn.Module):
         """Return (..., N, outputs)."""
         if self.kind == "local":
             return self.net(rows)
-        held = torch.tanh(self.embed(rows))
+        held = self.embed(rows)
         if self.kind == "set":
             others = held.mean(-2, keepdim=True).expand_as(held)
         else:
@@ -137,8 +162,9 @@ class Actor(nn.Module):
 def draw_action(mean: torch.Tensor, deviation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return actions (..., N, A) drawn from a Gaussian and their log-probabilities (..., N)."""
     noise = torch.randn_like(mean)
-    log_prob = -0.5 * noise**2 - deviation.log() - 0.5 * math.log(2 * math.pi)
-    return mean + deviation * noise, log_prob.sum(-1)
+    width = deviation[(0,) * (deviation.dim() - 1)]  # the same for all rows
+    constant = width.log().sum() + 0.5 * math.log(2 * math.pi) * len(width)
+    return torch.addcmul(mean, noise, width), noise.square().sum(-1).mul_(-0.5) - constant
 
 
 class CentralCritic(nn.Module):

@@ -74,6 +74,10 @@ class MultiliftEnv(EnvBase):
         self._terminated = torch.from_numpy(terminated).unsqueeze(-1)
         return self._package(observation, info, self._terminated, torch.from_numpy(truncated).unsqueeze(-1), reward)
 
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """Skip what EnvBase completes and reshapes after a step: `_package` gives all of it."""
+        return super()._step_proc_data(next_tensordict_out) if self.run_type_checks else next_tensordict_out
+
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Start new episodes where `tensordict`, the root of a next step, is done.
 
@@ -84,8 +88,11 @@ class MultiliftEnv(EnvBase):
         if not done.any():
             return tensordict
         fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
-        added = tensordict.exclude(*fresh.keys(True, True))
-        return (added if done.all() else added.masked_fill(done.squeeze(-1), 0)).update(fresh)
+        started = done.new_zeros(()) if done.all() else done
+        for key in set(tensordict.keys(True, True)).difference(fresh.keys(True, True)):
+            value = tensordict.get(key)
+            fresh.set(key, value.masked_fill(started.reshape(-1, *(1,) * (value.dim() - 1)), 0))
+        return fresh
 
     def _package(
         self, observation: np.ndarray, info: dict[str, Any], terminated: torch.Tensor, truncated: torch.Tensor,
