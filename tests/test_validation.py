@@ -5,6 +5,7 @@ import json
 import re
 from pathlib import Path
 
+import mujoco
 import pytest
 
 from multilift_marl.sim import scene, world
@@ -61,12 +62,13 @@ def change_model(monkeypatch, change):
     monkeypatch.setattr(world, "build_model", spoilt)
 
 
-def drag_bodies(model):
-    model.dof_damping[:] = 1e-3
+def drag_bodies(model, dofs=slice(None)):
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    model.dof_damping[dofs] = 1e-3
 
 
 def favour_an_axis(model):
-    model.dof_damping[6] = 1e-3  # of the first drone, along x
+    drag_bodies(model, 6)  # of the first drone, along x
 
 
 def add_weight(model):
@@ -74,7 +76,7 @@ def add_weight(model):
 
 
 def soften_the_ground(model):
-    model.geom_solref[:] = [0.2, 1.0]
+    model.pair_solref[:] = [0.2, 1.0]
 
 
 @pytest.mark.parametrize(

@@ -89,9 +89,10 @@ class MultiliftEnv(EnvBase):
             return tensordict
         fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
         started = done.new_zeros(()) if done.all() else done
-        for key in set(tensordict.keys(True, True)).difference(fresh.keys(True, True)):
-            value = tensordict.get(key)
-            fresh.set(key, value.masked_fill(started.reshape(-1, *(1,) * (value.dim() - 1)), 0))
+        told = set(fresh.keys(True, True))
+        for key, value in tensordict.items(True, True):
+            if key not in told:
+                fresh.set(key, value.masked_fill(started.reshape(-1, *(1,) * (value.dim() - 1)), 0))
         return fresh
 
     def _package(

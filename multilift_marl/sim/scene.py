@@ -118,7 +118,10 @@ def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
 
 
 def _pair_bodies(spec: mujoco.MjSpec, num_drones: int) -> None:
-    """Let ground, payload and drones touch each other, by pairs: cheaper than MuJoCo's sweep over all bodies."""
+    """Let ground, payload and drones touch each other, by pairs: cheaper than MuJoCo's sweep over all bodies.
+
+    What contacts are like stands in the `pair_*` fields of the compiled model, not in those of its geoms.
+    """
     names = ("floor", "payload", *(f"drone_{i}" for i in range(num_drones)))
     for name in names:
         spec.geom(name).contype = spec.geom(name).conaffinity = 0
