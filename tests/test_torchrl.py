@@ -57,12 +57,13 @@ def test_partial_reset_touches_only_its_rows_and_keeps_the_terminal_observation(
 
 
 @pytest.mark.parametrize("num_envs", [1, 5])
-def test_rollouts_go_on_as_with_torchrls_own_resets(num_envs):
+def test_rollouts_go_on_as_with_torchrls_own_steps_and_resets(num_envs):
     ours, theirs = (
         ml.torchrl_env("hover", num_envs=num_envs, seed=2, **{"env.episode_seconds": 0.2, "control.max_offset": 1.5})
         for _ in range(2)
     )
     theirs.maybe_reset = lambda tensordict: EnvBase.maybe_reset(theirs, tensordict)
+    theirs._step_proc_data = lambda tensordict: EnvBase._step_proc_data(theirs, tensordict)
     ours_now, theirs_now = ours.reset(), theirs.reset()
     ours.vec.stagger()
     theirs.vec.stagger()

@@ -13,6 +13,7 @@ from conftest import hover_thrust, make_system, mask, same
 
 from multilift_marl import make_vec
 from multilift_marl.sim import World
+from multilift_marl.sim.scene import build_spec
 
 # Many at once
 
@@ -210,3 +211,34 @@ def test_conjugate_gradients_find_what_newtons_method_finds(preset, num_drones):
 def test_chains_keep_newtons_method():
     model = World(make_system(2, **{"cable.model": "chain"}), 1, 1).model
     assert model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON and model.opt.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE
+
+
+# Contact
+
+
+def falls(model) -> tuple[np.ndarray, int]:
+    """Return where all bodies of a team are in each of 250 steps without thrust, and how many contacts there were."""
+    data, motion, contacts = mujoco.MjData(model), [], 0
+    for _ in range(250):
+        mujoco.mj_step(model, data)
+        motion.append(np.concatenate([data.qpos, data.qvel]))
+        contacts += data.ncon
+    return np.array(motion), contacts
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [{}, {"payload.shape": "point"}, {"payload.shape": "cylinder"}, {"cable.hook": [0.0, 0.0, -0.05]},
+     {"cable.model": "chain"}],
+)  # fmt: skip
+def test_contact_by_pairs_is_that_of_mujocos_own_search(overrides):
+    spec = build_spec(make_system(3, **overrides))
+    paired, contacts = falls(spec.compile())
+    for pair in list(spec.pairs):
+        spec.delete(pair)
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = int(geom.name != "")
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    searched, _ = falls(spec.compile())
+    assert contacts > 100
+    np.testing.assert_array_equal(paired, searched)

@@ -21,30 +21,11 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.tasks.observations import drone_numbers
 
 
-class Explorer(TensorDictModuleBase):
-    """What flies the rollouts: actions drawn from the actor's Gaussian, with their log-probabilities.
-
-    A module of its own, since the bookkeeping of TensorDict's general ones costs as much as the network.
-    """
-
-    def __init__(self, actor: Actor):
-        super().__init__()
-        self.in_keys = [("agents", "observation")]
-        self.out_keys = [("agents", "action"), ("agents", "action_log_prob")]
-        self.actor = actor
-
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write action and log-probability of every drone."""
-        agents = tensordict.get("agents")
-        mean, _ = self.actor(agents.get("observation"))
-        action, log_prob = draw_action(mean, self.actor.log_std.exp())
-        agents.set("action", action).set("action_log_prob", log_prob)
-        return tensordict
-
-
 class KeyedNetwork(TensorDictModuleBase):
-    """A network whose input and outputs are keys of a TensorDict: TensorDictModule without its bookkeeping."""
+    """A network whose input and outputs are keys of a TensorDict.
+
+    TensorDict's own module does the same with bookkeeping that costs as much as a small network.
+    """
 
     def __init__(self, network: nn.Module, source: NestedKey, targets: list[NestedKey]):
         super().__init__()
@@ -59,6 +40,19 @@ class KeyedNetwork(TensorDictModuleBase):
         return tensordict
 
 
+class Explorer(nn.Module):
+    """What flies the rollouts: observations to actions drawn from the actor's Gaussian, and their log-probabilities."""
+
+    def __init__(self, actor: Actor):
+        super().__init__()
+        self.actor = actor
+
+    @torch.no_grad()
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return actions (..., N, A) and log-probabilities (..., N)."""
+        return draw_action(self.actor(observation)[0], self.actor.log_std.exp())
+
+
 @dataclass
 class Learner:
     """What learns: networks, loss, advantage estimator, optimiser."""
@@ -66,7 +60,7 @@ class Learner:
     config: TrainConfig
     actor: Actor
     critic: CentralCritic | LocalCritic
-    policy: Explorer
+    policy: KeyedNetwork
     loss: MAPPOLoss
     advantage: MultiAgentGAE
     optimizer: torch.optim.Adam
@@ -87,11 +81,12 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     base = torch.from_numpy(residual_matrix(config.residual, vec))
     actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
     agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
-    policy, gaussian = Explorer(actor), [agents["loc"], agents["scale"]]
+    gaussian, log_prob = [agents["loc"], agents["scale"]], ("agents", "action_log_prob")
+    policy = KeyedNetwork(Explorer(actor), agents["observation"], [agents["action"], log_prob])
     mean = KeyedNetwork(actor, agents["observation"], gaussian)
     judged = ProbabilisticActor(
         mean, in_keys=gaussian, out_keys=[agents["action"]], distribution_class=IndependentNormal,
-        return_log_prob=True, log_prob_key=("agents", "action_log_prob"),
+        return_log_prob=True, log_prob_key=log_prob,
     )  # fmt: skip
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
@@ -112,7 +107,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
         entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.value_weight,
         loss_critic_type="l2", normalize_advantage=False, functional=False,
     )  # fmt: skip
-    loss.set_keys(**keys, action=agents["action"], sample_log_prob=("agents", "action_log_prob"))
+    loss.set_keys(**keys, action=agents["action"], sample_log_prob=log_prob)
     advantage = MultiAgentGAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=value)
     advantage.set_keys(**keys)
     groups = [{"params": list(actor.parameters())}, {"params": list(critic.parameters())}]  # rates of their own
