@@ -6,10 +6,13 @@ configuration of a cable model, for both models.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import tempfile
 from dataclasses import replace
 from math import sqrt
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -65,6 +68,14 @@ def _enough_drones(request):
 
 def _names(argument: str | tuple[str, ...]) -> list[str]:
     return [part.strip() for part in argument.split(",")] if isinstance(argument, str) else list(argument)
+
+
+def load_script(name: str) -> ModuleType:
+    """Return a script beside the package, such as "bench/training", as a module."""
+    spec = importlib.util.spec_from_file_location(name.replace("/", "_"), Path(__file__).parents[1] / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def make(task: str = "hover", num_envs: int = 4, num_drones: int = 4, num_threads: int = 1, **keywords) -> MultiliftVec:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 from math import exp
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import GRAVITY, make, refusal, same, zeros
+from conftest import GRAVITY, load_script, make, refusal, same, zeros
 
 import multilift_marl as ml
 from multilift_marl.control.disturbance import Disturbance, make_rejection
@@ -16,17 +14,7 @@ from multilift_marl.control.gains import make_gains
 
 KINDS = ("integral", "indi")
 RIGS = ("falcon4", "report4", "crazyflie2", "auto6")
-
-
-def load_bench():
-    path = Path(__file__).parents[1] / "bench" / "disturbance.py"
-    spec = importlib.util.spec_from_file_location("bench_disturbance", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-bench = load_bench()
+bench = load_script("bench/disturbance")
 
 
 def windy(kind: str, wind: float = 3.0, **overrides) -> bench.Flight:

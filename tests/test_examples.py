@@ -1,24 +1,15 @@
 """The examples of training by others: what needs no other environment is trained, all is short, listed and compiles."""
 
-import importlib.util
 import re
 import sys
 from pathlib import Path
 
 import pytest
+from conftest import load_script
 
 FOLDER = Path(__file__).parents[1] / "examples"
 HERE = ("cleanrl_ppo", "torchrl_wrapper")  # need no more than the package's own `train` extra
-
-
-def load(name):
-    spec = importlib.util.spec_from_file_location(f"examples_{name}", FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-check = load("check")
+check = load_script("examples/check")
 
 
 @pytest.mark.parametrize("name", HERE)

@@ -170,6 +170,8 @@ def test_commands_of_documents_run_in_order(tmp_path):
             command += " 1"  # iteration
         if script in ("bench/air.py", "bench/bench.py", "bench/randomization.py"):
             command += " repeats=1 seconds=0.05 env.num_envs=4"
+        if script == "bench/training.py":
+            command = command.split(" repeats=")[0] + f" repeats=1 {short} train.minibatches=2"
         if script == "results/search_gains.py":
             command = re.sub(r"minutes=\d+", "minutes=0.001", command) + " env.num_envs=2 env.episode_seconds=2.0"
         if script == "bench/tasks.py":

@@ -1,13 +1,15 @@
 """Training: it learns, resumes bit for bit, and logs what a reader needs."""
 
+import copy
 import json
 
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer
+from conftest import load_script, make_trainer
 
 from multilift_marl.agents.logging import RunLog, read_metrics
+from multilift_marl.agents.mappo import update
 from multilift_marl.agents.networks import Normalizer
 from multilift_marl.agents.trainer import adapted_rate, resume_run
 from multilift_marl.config import load_config
@@ -110,6 +112,25 @@ def test_time_outs_are_bootstrapped_and_failures_are_not(tmp_path):
     with torch.no_grad():
         trainer.learner.advantage(batch)
     torch.testing.assert_close(batch["advantage"][done], (reward - value)[done], rtol=1e-4, atol=1e-4)
+
+
+def test_learning_is_mappo_as_written_with_torch_alone(tmp_path):
+    trainer = make_trainer(tmp_path, **{"env.episode_seconds": 0.2, "train.target_kl": 1.0})
+    for _ in range(2):
+        trainer.step()
+    arithmetic = load_script("bench/training").Arithmetic(trainer)
+    arithmetic.optimizer.load_state_dict(copy.deepcopy(trainer.learner.optimizer.state_dict()))
+    batch = next(iter(trainer.collector))
+    assert batch["next", "truncated"].any()
+    before = [parameter.clone() for parameter in trainer.learner.actor.parameters()]
+    torch.manual_seed(1)
+    arithmetic.seconds(batch)
+    torch.manual_seed(1)
+    update(trainer.learner, batch)
+    assert any((old != new).any() for old, new in zip(before, trainer.learner.actor.parameters(), strict=True))
+    for ours, theirs in ((arithmetic.actor, trainer.learner.actor), (arithmetic.critic, trainer.learner.critic)):
+        for (name, value), expected in zip(ours.state_dict().items(), theirs.state_dict().values(), strict=True):
+            torch.testing.assert_close(value, expected, rtol=1e-4, atol=1e-6, msg=name)
 
 
 def test_normalizer_equals_the_statistics_of_all_batches():

@@ -125,9 +125,9 @@ def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
 
     Args:
         learner: changed in place.
-        batch: what the collector returned.
+        batch: what the collector returned; not changed.
     """
-    config, start = learner.config, time.perf_counter()
+    config, start, batch = learner.config, time.perf_counter(), batch.copy()
     # 1. Advantages, from values of the critic before the update.
     with torch.no_grad():
         learner.advantage(batch)
@@ -139,6 +139,7 @@ def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
     data["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
 
     # 2. Some epochs of minibatches, fewer if the policy moves too far.
+    actor, critic = (group["params"] for group in learner.optimizer.param_groups)
     diagnostics, stop = [], False
     for _ in range(config.epochs):
         order = torch.randperm(data.shape[0])
@@ -149,8 +150,8 @@ def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
                 total = total + losses["loss_entropy"]
             learner.optimizer.zero_grad(set_to_none=True)
             total.backward()
-            norm = nn.utils.clip_grad_norm_(learner.actor.parameters(), config.max_grad_norm)
-            nn.utils.clip_grad_norm_(learner.critic.parameters(), config.max_grad_norm)
+            norm = nn.utils.clip_grad_norm_(actor, config.max_grad_norm)
+            nn.utils.clip_grad_norm_(critic, config.max_grad_norm)
             learner.optimizer.step()
             values = [
                 losses["kl_approx"],

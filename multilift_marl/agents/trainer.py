@@ -64,6 +64,7 @@ class Trainer:
             total_frames=-1,
             track_traj_ids=False,
             auto_register_policy_transforms=False,
+            return_same_td=True,  # a batch is used up before the next one
             device="cpu",
         )
         self._batches = iter(self.collector)
