@@ -26,6 +26,21 @@ def test_an_override_leaves_its_neighbours_in_the_file_alone(write):
     assert (config.randomization.payload_mass, config.randomization.payload_force) == (0.0, 1.0)
 
 
+@pytest.mark.parametrize("key", ["train.overrides", "task_options", "reward"])
+def test_mappings_add_and_an_empty_one_empties(write, key):
+    section, _, name = key.partition(".")
+    path = write(f"{section}: " + (f"{{{name}: {{position: 2.0}}}}" if name else "{position: 2.0}"))
+
+    def found(*arguments):
+        values = load_config(path, parse_overrides(arguments)).model_dump()[section]
+        return values[name] if name else values
+
+    assert found() == {"position": 2.0}
+    assert found(f"{key}={{precision: 1.0}}") == {"position": 2.0, "precision": 1.0}
+    assert found(f"{key}={{}}") == {}
+    assert found(f"{key}={{}}", f"{key}.level=3") == {"level": 3}
+
+
 def test_a_section_as_an_override_leaves_its_neighbours_in_the_file_alone():
     config = load_config("hover", {"randomization": {"payload_mass": 0.1}})
     assert (config.randomization.payload_mass, config.randomization.payload_force) == (0.1, 1.5)

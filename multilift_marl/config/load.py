@@ -34,7 +34,8 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
 
     Args:
         name: a shipped configuration's name or the path of a YAML file.
-        overrides: values by dotted name, such as {"payload.mass": 2.0}.
+        overrides: values by dotted name, such as {"payload.mass": 2.0}; mappings add to what is there, and an empty
+            one, {"train.overrides": {}}, empties it.
 
     Raises:
         ConfigError: an unknown name or key, a wrong type or a value out of range.
@@ -172,11 +173,12 @@ def _read(name: str | Path) -> dict[str, Any]:
 
 
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` with `changes`, section by section."""
+    """Return `base` with `changes`, section by section; an empty section empties what `base` has there."""
     merged = dict(base)
     for key, value in changes.items():
-        known = merged.get(key)
-        merged[key] = (
-            _merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
-        )
+        if isinstance(value, Mapping) and value:
+            known = merged.get(key)
+            merged[key] = _merge(known if isinstance(known, Mapping) else {}, value)
+        else:
+            merged[key] = value
     return merged
