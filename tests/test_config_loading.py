@@ -41,6 +41,10 @@ def test_mappings_add_and_an_empty_one_empties(write, key):
     assert found(f"{key}={{}}", f"{key}.level=3") == {"level": 3}
 
 
+def test_an_empty_section_changes_nothing():
+    assert load_config("hover", {"train": {}, "env": {}}) == load_config("hover")
+
+
 def test_a_section_as_an_override_leaves_its_neighbours_in_the_file_alone():
     config = load_config("hover", {"randomization": {"payload_mass": 0.1}})
     assert (config.randomization.payload_mass, config.randomization.payload_force) == (0.1, 1.5)

@@ -11,6 +11,7 @@ import pytest
 from conftest import refusal
 
 import multilift_marl as ml
+from multilift_marl.agents.checkpoint import load_checkpoint
 from multilift_marl.control.scripted import LINEAR, fitting_scripts
 from multilift_marl.envs.core import TRAINING_EVALUATION
 from multilift_marl.evaluation.rollout import fly_episodes
@@ -55,6 +56,29 @@ def test_every_learned_team_is_flown_a_thousand_times():
             assert (told["episodes"], told["seed"]) == (1000, reproduce.SEED)
             flown += 1
     assert flown > len(reproduce.FLIGHTS)
+
+
+def flat(section, prefix=""):
+    """Return values by dotted name."""
+    found = {}
+    for key, value in section.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) and value else {prefix + key: value}
+    return found
+
+
+@pytest.mark.parametrize(
+    "weights", sorted((ROOT / "results").glob("*/seed*/policy.pt")), ids=lambda path: "-".join(path.parts[-3:-1])
+)
+def test_kept_weights_were_trained_by_the_recipe(weights):
+    stored = flat(load_checkpoint(weights)["config"])
+    recipe = flat(ml.load_config(weights.parts[-3]).model_dump(mode="json"))
+    assert stored["seed"] == int(weights.parts[-2].removeprefix("seed"))
+    own = {"seed", "env.num_threads", "train.threads"}
+    later = recipe.keys() - stored.keys()  # keys that were added since
+    assert later <= {"train.critic_learning_rate", "train.warmup"}
+    assert {key: stored[key] for key in stored.keys() - own} == {
+        key: recipe[key] for key in recipe.keys() - own - later
+    }
 
 
 @pytest.mark.parametrize("weights", sorted((ROOT / "results").glob("*/seed0/policy.pt")), ids=lambda p: p.parts[-3])

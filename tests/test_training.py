@@ -114,13 +114,14 @@ def test_time_outs_are_bootstrapped_and_failures_are_not(tmp_path):
     torch.testing.assert_close(batch["advantage"][done], (reward - value)[done], rtol=1e-4, atol=1e-4)
 
 
-def test_learning_is_mappo_as_written_with_torch_alone(tmp_path):
+def test_learning_is_mappo_as_written_without_torchrls_losses(tmp_path):
     trainer = make_trainer(tmp_path, **{"env.episode_seconds": 0.2, "train.target_kl": 1.0})
     for _ in range(2):
         trainer.step()
     arithmetic = load_script("bench/training").Arithmetic(trainer)
     arithmetic.optimizer.load_state_dict(copy.deepcopy(trainer.learner.optimizer.state_dict()))
     batch = next(iter(trainer.collector))
+    batch["next", "terminated"][0, 3] = batch["next", "done"][0, 3] = True
     assert batch["next", "truncated"].any()
     before = [parameter.clone() for parameter in trainer.learner.actor.parameters()]
     torch.manual_seed(1)

@@ -34,8 +34,8 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
 
     Args:
         name: a shipped configuration's name or the path of a YAML file.
-        overrides: values by dotted name, such as {"payload.mass": 2.0}; mappings add to what is there, and an empty
-            one, {"train.overrides": {}}, empties it.
+        overrides: values by dotted name, such as {"payload.mass": 2.0}; mappings add to what is there, but an empty one
+            drops it where names are free: {"train.overrides": {}}, {"task_options": {}}, {"reward": {}}.
 
     Raises:
         ConfigError: an unknown name or key, a wrong type or a value out of range.
@@ -55,6 +55,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
     merged = _merge({}, values)
+    free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
     for dotted, value in (overrides or {}).items():
         *sections, key = dotted.split(".")
         change, node = {key: value}, merged
@@ -65,6 +66,8 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
         for part in reversed(sections):
             change = {part: change}
         merged = _merge(merged, change)
+        if dotted in free and value == {}:
+            _at(merged, sections)[key] = {}
     return validate(Config, merged, where=where)
 
 
@@ -172,13 +175,19 @@ def _read(name: str | Path) -> dict[str, Any]:
     return values
 
 
+def _at(values: dict[str, Any], sections: Iterable[str]) -> dict[str, Any]:
+    """Return a section of nested `values`."""
+    for part in sections:
+        values = values[part]
+    return values
+
+
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` with `changes`, section by section; an empty section empties what `base` has there."""
+    """Return `base` with `changes`, section by section."""
     merged = dict(base)
     for key, value in changes.items():
-        if isinstance(value, Mapping) and value:
-            known = merged.get(key)
-            merged[key] = _merge(known if isinstance(known, Mapping) else {}, value)
-        else:
-            merged[key] = value
+        known = merged.get(key)
+        merged[key] = (
+            _merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
+        )
     return merged
