@@ -63,11 +63,11 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
             node = node.get(part, {})
             if not isinstance(node, Mapping):
                 raise ConfigError(f"{dotted}: '{part}' is a value, not a section")
+        if dotted in free and value == {}:
+            node.pop(key, None)
         for part in reversed(sections):
             change = {part: change}
         merged = _merge(merged, change)
-        if dotted in free and value == {}:
-            _at(merged, sections)[key] = {}
     return validate(Config, merged, where=where)
 
 
@@ -172,13 +172,6 @@ def _read(name: str | Path) -> dict[str, Any]:
         return {}
     if not isinstance(values, dict):
         raise ConfigError(f"{path} holds {type(values).__name__} where sections such as 'env:' are expected")
-    return values
-
-
-def _at(values: dict[str, Any], sections: Iterable[str]) -> dict[str, Any]:
-    """Return a section of nested `values`."""
-    for part in sections:
-        values = values[part]
     return values
 
 
