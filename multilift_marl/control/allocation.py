@@ -1,4 +1,9 @@
-"""Thrust allocation: from total thrust and body torque to the thrust of each rotor (report eqs 5-11)."""
+"""Thrust allocation: from total thrust and body torque to the thrust of each rotor (report eqs 5-11).
+
+Rotors that saturate cannot give both. The order of priority is roll and pitch torque, then total thrust, then yaw torque
+(Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude Control", TCST 2018; so does PX4's sequential
+desaturation): thrust is of no use to a drone that cannot turn it upward.
+"""
 
 from __future__ import annotations
 
@@ -8,32 +13,54 @@ from multilift_marl.math3d import clip
 
 @kernel
 def allocate(thrust, torque, inverse, low, high):
-    """Return the four rotor thrusts [N] for a thrust and a torque.
-
-    Thrust, roll and pitch go first: the yaw torque is scaled down until every rotor is within its limits, and only
-    what even then lies outside is clipped.
+    """Return the four rotor thrusts [N] for a thrust and a torque, by priority where rotors saturate.
 
     Args:
         thrust: total thrust [N].
         torque: body torque, a tuple of 3 [N m].
-        inverse: inverse of `Vehicle.allocation` (4, 4).
+        inverse: inverse of `Vehicle.allocation` (4, 4); its first column must be positive.
         low, high: limits of one rotor [N].
     """
+    # Roll and pitch: the largest share of them that some total thrust leaves within the limits of all rotors. Rotor k
+    # bounds that thrust by (low - share t_k)/a_k and (high - share t_k)/a_k; no lower bound may exceed an upper one.
     share = 1.0
     for k in range(4):
-        base = inverse[k, 0] * thrust + inverse[k, 1] * torque[0] + inverse[k, 2] * torque[1]
+        a = inverse[k, 0]
+        tilt = inverse[k, 1] * torque[0] + inverse[k, 2] * torque[1]
+        for j in range(4):
+            b = inverse[j, 0]
+            other = inverse[j, 1] * torque[0] + inverse[j, 2] * torque[1]
+            need = other / b - tilt / a
+            room = high / b - low / a
+            if need > room:
+                share = min(share, max(room, 0.0) / need)
+    roll, pitch = share * torque[0], share * torque[1]
+
+    # Thrust: as near to what is asked as that leaves.
+    least, most = -1e30, 1e30
+    for k in range(4):
+        tilt = inverse[k, 1] * roll + inverse[k, 2] * pitch
+        least = max(least, (low - tilt) / inverse[k, 0])
+        most = min(most, (high - tilt) / inverse[k, 0])
+    total = min(max(thrust, least), most)
+
+    # Yaw: as much as is left.
+    share = 1.0
+    for k in range(4):
+        base = inverse[k, 0] * total + inverse[k, 1] * roll + inverse[k, 2] * pitch
         yaw = inverse[k, 3] * torque[2]
         room = (high - base) if yaw > 0.0 else (low - base)
         if abs(yaw) > 1e-12:
             share = min(share, max(room / yaw, 0.0))
-    f0 = _rotor(0, thrust, torque, inverse, low, high, share)
-    f1 = _rotor(1, thrust, torque, inverse, low, high, share)
-    f2 = _rotor(2, thrust, torque, inverse, low, high, share)
-    f3 = _rotor(3, thrust, torque, inverse, low, high, share)
+    yaw = share * torque[2]
+    f0 = _rotor(0, total, roll, pitch, yaw, inverse, low, high)
+    f1 = _rotor(1, total, roll, pitch, yaw, inverse, low, high)
+    f2 = _rotor(2, total, roll, pitch, yaw, inverse, low, high)
+    f3 = _rotor(3, total, roll, pitch, yaw, inverse, low, high)
     return (f0, f1, f2, f3)
 
 
 @kernel
-def _rotor(k, thrust, torque, inverse, low, high, share):
-    base = inverse[k, 0] * thrust + inverse[k, 1] * torque[0] + inverse[k, 2] * torque[1]
-    return clip(base + share * inverse[k, 3] * torque[2], low, high)
+def _rotor(k, thrust, roll, pitch, yaw, inverse, low, high):
+    thrust = inverse[k, 0] * thrust + inverse[k, 1] * roll + inverse[k, 2] * pitch + inverse[k, 3] * yaw
+    return clip(thrust, low, high)  # it is within the limits, but for round-off
