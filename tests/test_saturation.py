@@ -44,7 +44,7 @@ def test_roll_and_pitch_come_first_then_thrust(name):
         wrench = vehicle.allocation @ allocate(thrust, floats(torque), inverse, 0.05 * high, high)
         np.testing.assert_allclose(wrench[1:3], share * torque[:2], atol=2e-4 * np.abs(torque).max())
         assert wrench[0] == pytest.approx(total, abs=2e-3 * high)
-        assert 0 <= wrench[3] / torque[2] <= 1 + 1e-9
+        assert -1e-9 <= wrench[3] / torque[2] <= 1 + 1e-9
 
 
 def test_at_full_thrust_and_beyond_all_of_a_small_torque_is_left():
@@ -69,8 +69,8 @@ def releases(count: int, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_from_any_attitude_at_rest_a_drone_comes_back(name):
-    count, seconds = 1000, 8.0
-    system = make_system(1, **{"vehicle.preset": name, "payload.mass": 0.01, "cable.angle": 10.0})
+    count, seconds = 1000, 16.0
+    system = make_system(1, **{"vehicle.preset": name, "payload.mass": 1e-3})
     world, gains = World(system, count, 1), make_gains(ControlConfig(), system)
     hover = np.tile([0.0, 0.0, 100.0], (count, 1, 1))
     world.state.payload_position[:] = [0, 50, 0]

@@ -127,8 +127,7 @@ class System:
     @property
     def resting_tension(self) -> np.ndarray:
         """Tension of each resting cable where it is measured, in its segment next to the drone (N,) [N]."""
-        last = self.cable_mass * (1 - 1 / self.cable_segments)
-        return np.linalg.norm(self.formation_force + GRAVITY * last[:, None] * [0, 0, 1], axis=1)
+        return np.linalg.norm(self.drone_pull, axis=1)
 
     @property
     def resting_rotation(self) -> np.ndarray:
@@ -179,16 +178,12 @@ def resolve_system(config: Config) -> System:
     chain = cable.model == "chain"
     segments = per_drone(cable.segments if chain else 1, n, "cable.segments").astype(int)
     rope = per_drone(cable.density, n, "cable.density") * length if chain else np.zeros(n)
-    ends, bending = anchors.copy(), np.zeros(n)
+    ends = anchors.copy()
     for i, links in enumerate(segments):
         forces = _segment_forces(force[i], rope[i], links)
         tension = np.linalg.norm(forces, axis=1)
         reach = length[i] / links + tension / (links * stiffness[i])
         ends[i] += (forces / tension[:, None] * reach[:, None]).sum(axis=0)
-        if chain:
-            bending[i] = _steady_bending(tension[-1], rope[i], length[i], links, config.sim.timestep)
-    if cable.bending_damping is not None:
-        bending[:] = cable.bending_damping
     hooks = vector_per_drone(cable.hook, n, "cable.hook")
     resting = _resting_rotations(vehicles, force + GRAVITY * rope[:, None] * [0, 0, 1])
     slots = ends - (resting * hooks[:, None, :]).sum(axis=-1)
@@ -214,7 +209,7 @@ def resolve_system(config: Config) -> System:
         cable_segments=segments,
         cable_mass=rope,
         bending_stiffness=np.full(n, cable.bending_stiffness),
-        bending_damping=bending,
+        bending_damping=np.full(n, cable.bending_damping),
         formation_force=force,
         hooks=hooks,
         cable_ends=ends,
@@ -243,21 +238,9 @@ def _resting_rotations(vehicles: tuple[Vehicle, ...], pulls: np.ndarray) -> np.n
 def _segment_forces(force: np.ndarray, mass: float, segments: int) -> np.ndarray:
     """Return the pulls (segments, 3) [N] of a cable of `mass` [kg] that pulls the payload by `force` (3,) [N].
 
-    The mass of each segment is at its upper end, so each carries one segment's weight more than that below it.
+    Its mass is that of the nodes between segments, so each segment carries one node's weight more than that below it.
     """
-    return force + GRAVITY * mass / segments * np.arange(segments)[:, None] * [0, 0, 1]
-
-
-def _steady_bending(tension: float, mass: float, length: float, n: int, h: float) -> float:
-    """Return the bending damping [N m s/rad] that keeps the sideways motion of a chain's nodes stable.
-
-    Tension T acts on it explicitly: mode λ = 2 - 2 cos(jπ/n) of nodes m on links l moves stably in steps h if
-    m + h d λ²/l² ≥ h² T λ/4l. T l h is enough unless the nodes are light; twice the tension at rest is allowed for.
-    """
-    modes = 2 - 2 * np.cos(np.pi * np.arange(1, n) / n)
-    node, link = mass / n, length / n
-    least = 2 * tension * link * h / (4 * modes) - node * link**2 / (h * modes**2)
-    return max(tension * link * h, float(least.max()))
+    return force + GRAVITY * mass / max(segments - 1, 1) * np.arange(segments)[:, None] * [0, 0, 1]
 
 
 def _check_ranges(ranges: RandomizationConfig, system: System) -> None:

@@ -18,12 +18,15 @@ def add_box(scene: mujoco.MjvScene, size: ArrayLike, position: ArrayLike, rgba: 
     _add(scene, _GEOM.mjGEOM_BOX, np.asarray(size, float), np.asarray(position, float), np.asarray(rgba, np.float32))
 
 
-def add_lines(scene: mujoco.MjvScene, starts: np.ndarray, ends: np.ndarray, radius: float, rgba: np.ndarray) -> None:
+def add_lines(
+    scene: mujoco.MjvScene, starts: np.ndarray, ends: np.ndarray, radius: float, rgba: np.ndarray, emission: float = 0.0
+) -> None:
     """Add straight lines from `starts` (K, 3) to `ends` (K, 3) [m] with colours `rgba` (K, 4)."""
     for start, end, colour in zip(starts, ends, rgba, strict=True):
         geom = _add(scene, _GEOM.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), colour)
         if geom is not None:
             mujoco.mjv_connector(geom, _GEOM.mjGEOM_CAPSULE, radius, start, end)
+            geom.emission = emission
 
 
 def _add(

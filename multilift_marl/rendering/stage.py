@@ -55,8 +55,7 @@ class Stage:
         self._trail, self._episode, self._time = Trail(trail), (-1, -1, -1), 0.0
         colours = [DRONE_COLOURS[n % len(DRONE_COLOURS)] for n in range(vec.num_drones)]
         self._trail_colours = np.array([PAYLOAD_COLOUR, *colours]) * [1, 1, 1, _TRAIL_STRENGTH]
-        self._links = [self._find_links(n) for n in range(vec.num_drones)]
-        self._chains = {geom for links in self._links for geom in links}
+        self._colours = np.zeros((vec.num_drones, 4), np.float32)
         fog = self.model.vis.map  # as far away as the camera may be
         far = max(1.0, self.camera.view.distance / 6.0)
         fog.fogstart, fog.fogend = far * fog.fogstart, far * fog.fogend
@@ -90,8 +89,6 @@ class Stage:
             elif geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
                 if self.model.geom_bodyid[geom.objid] in (0, self._target):
                     geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # casts no shadow
-                elif geom.objid in self._chains:
-                    geom.emission = _GLOW
         self._decorate(env, time, path)
 
     def _pose(self, env: int) -> None:
@@ -99,12 +96,10 @@ class Stage:
         if not world.diverged[env]:
             self.data.qpos[:] = world.qpos(env)
         colours = tension_colours(world.state.cable_tension[env], world.system.resting_tension)
-        radius = _CABLE * self.camera.view.distance
+        self._colours[:, :3], self._colours[:, 3] = colours, 1.0
         if self.model.ntendon:
-            self.model.tendon_width[:] = radius
+            self.model.tendon_width[:] = _CABLE * self.camera.view.distance
             self.model.tendon_rgba[:, :3], self.model.tendon_rgba[:, 3] = colours, ~world.state.cable_broken[env]
-        for links, colour in zip(self._links, colours, strict=True):
-            self.model.geom_rgba[links, :3], self.model.geom_size[links, 0] = colour, radius
         self.data.mocap_pos[0] = goal.position[env]
         self.data.mocap_quat[0] = mat_to_quat(tuple(goal.rotation[env].ravel()))
         mujoco.mj_fwdPosition(self.model, self.data)
@@ -112,6 +107,11 @@ class Stage:
     def _decorate(self, env: int, time: float, path: np.ndarray) -> None:
         task, state, scene = self._vec.task, self._vec.world.state, self.scene
         line, dash = _LINE * self.camera.view.distance, _DASH * self.camera.view.distance
+        if self._vec.world.nodes is not None and not self._vec.world.diverged[env]:
+            radius = _CABLE * self.camera.view.distance
+            for n, colour in enumerate(self._colours):
+                points = self._vec.world.cable_points(env, n)
+                add_lines(scene, points[:-1], points[1:], radius, np.tile(colour, (len(points) - 1, 1)), _GLOW)
         for box in task.scenery(env):
             add_box(scene, *box)
         if len(path):
@@ -121,8 +121,3 @@ class Stage:
             bodies = np.vstack([state.payload_position[env], state.drone_position[env]])
             self._trail.add(time, bodies)
             self._trail.draw(scene, time, bodies, line, self._trail_colours.astype(np.float32))
-
-    def _find_links(self, cable: int) -> list[int]:
-        """Return the geoms of a chain; none of a massless cable."""
-        names = [self.model.body(body).name for body in self.model.geom_bodyid]
-        return [geom for geom, name in enumerate(names) if name.startswith(f"cable_{cable}/")]

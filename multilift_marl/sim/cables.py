@@ -41,14 +41,14 @@ def cable_end(direction, tension, length, stiffness, segments, weight):
     Args:
         direction, tension: unit vector and magnitude [N] of the force in its middle.
         length, stiffness: of the whole cable [m], [N/m].
-        segments: of a chain, each with its mass at its upper end.
+        segments: of a chain, whose mass is that of the nodes between them.
         weight: of the whole cable [N]; 0 if massless.
     """
     if weight == 0.0:
         return scale(length + tension / stiffness, direction)
     end = (0.0, 0.0, 0.0)
     for j in range(segments):
-        force = add(scale(tension, direction), (0.0, 0.0, weight * (j / segments - 0.5)))
+        force = add(scale(tension, direction), (0.0, 0.0, weight * (j / (segments - 1) - 0.5)))
         size = norm(force)
         end = add(end, scale((length / size + 1.0 / stiffness) / segments, force))
     return end

@@ -1,7 +1,7 @@
 """What acts on the bodies between two physics steps: rotors with lag, drag, wind and the hidden force.
 
 Loads enter MuJoCo as generalised forces of the free joints, (force in the world frame, torque in the body frame),
-which needs no Jacobian. Drones on chains have no free joint: theirs are Cartesian, both in the world frame.
+which needs no Jacobian.
 """
 
 from __future__ import annotations
@@ -45,20 +45,15 @@ class Constants(NamedTuple):
     """(N, 3) linear drag of a drone along its axes [kg/s]."""
     force: int
     """Offset of the payload's force in a row of `batch.state`."""
+    payload_turns: bool
+    """Whether the payload has a torque beside it, which chains add to."""
     drone_loads: np.ndarray
     """(N,) offsets of the drones' forces and torques."""
-    world_torque: bool
-    """Whether those torques are in the world frame in place of the body frame."""
 
 
 def make_constants(system: System, layout: Layout, batch: Batch) -> Constants:
     """Return the constants of `system` and where its loads are in the rows of a batch."""
-    force, cartesian = field_offset(batch, "qfrc_applied"), field_offset(batch, "xfrc_applied")
-    chain = system.cable_model == "chain"
-    loads = [
-        cartesian + 6 * body if chain else force + layout.payload_nv + 6 * n
-        for n, body in enumerate(layout.drone_bodies)
-    ]
+    force = field_offset(batch, "qfrc_applied")
     vehicles, h = system.vehicles, system.timestep
     return Constants(
         timestep=system.timestep,
@@ -73,8 +68,8 @@ def make_constants(system: System, layout: Layout, batch: Batch) -> Constants:
         falling=np.array([lag_shares(h / vehicle.rotor_time_constant_down) for vehicle in vehicles]),
         drag=np.array([vehicle.drag for vehicle in vehicles], float),
         force=force,
-        drone_loads=np.array(loads),
-        world_torque=chain,
+        payload_turns=layout.payload_nv == 6,
+        drone_loads=force + layout.payload_nv + 6 * np.arange(system.num_drones),
     )
 
 
@@ -146,8 +141,6 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
                 through = scale(varied.drag[e, n], through)
             body = (-drag[0] * through[0], -drag[1] * through[1], total - drag[2] * through[2])
             torque = (mx, my, mz)
-            if c.world_torque:
-                torque = mul(attitude, torque)
             at = c.drone_loads[n]
             put(line[at : at + 3], mul(attitude, body))
             put(line[at + 3 : at + 6], torque)
@@ -160,3 +153,5 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
         if varied is not None:
             drag = scale(varied.payload_drag[e], drag)
         put(line[c.force : c.force + 3], add(drag, row(plant.payload_force, e)))
+        if c.payload_turns:
+            put(line[c.force + 3 : c.force + 6], (0.0, 0.0, 0.0))

@@ -14,7 +14,7 @@ from mujoco.batch import Batch
 
 from multilift_marl.config.system import System
 from multilift_marl.sim.cables import limit_solref
-from multilift_marl.sim.scene import LINK_INERTIA, Layout
+from multilift_marl.sim.scene import Layout
 
 
 class Parameters(NamedTuple):
@@ -174,11 +174,9 @@ def write_model(
             weights[chosen, layout.drone_bodies[n]] = own
             moments[chosen, layout.drone_bodies[n]] = np.array(vehicle.inertia) * (own / vehicle.mass)[:, None]
     massless, longer = system.cable_model == "massless", "cable_length" in names
-    if longer and not massless:
-        _stretch_chains(batch, layout, system, p.cable_length)
-    if longer or ("cable_stiffness" in names and not massless):
-        fit_cables(batch, model, system, p, broken)
-    heavier = bool(names & _MASSES) or (longer and not massless)
+    if longer:
+        fit_cables(batch, system, p, broken)
+    heavier = bool(names & _MASSES)
     if massless and (heavier or "cable_stiffness" in names):
         batch.expand("tendon_solref_lim")
     if heavier:
@@ -190,42 +188,7 @@ def write_model(
         batch.expand("tendon_solref_lim")[chosen] = solref
 
 
-def _stretch_chains(batch: Batch, layout: Layout, system: System, length: np.ndarray) -> None:
-    """Give the links of chains their share of the cables' lengths (n, N) [m], and of the mass of those."""
-    weights, moments = batch.expand("body_mass"), batch.expand("body_inertia")
-    center, place = batch.expand("body_ipos"), batch.expand("body_pos")
-    for i, links in enumerate(system.cable_segments):
-        share = length[:, i, None] / links
-        mass = share * (system.cable_mass[i] / system.cable_length[i])
-        drone = layout.drone_bodies[i]
-        chain = slice(drone - links, drone)  # the links come before their drone
-        weights[:, chain], center[:, chain, 2] = mass, share
-        moments[:, chain] = (LINK_INERTIA * mass * share**2)[..., None]
-        place[:, drone - links + 1 : drone + 1, 2] = share
-        place[:, drone, 2] -= system.hooks[i, 2]
-
-
-def fit_cables(batch: Batch, model: mujoco.MjModel, system: System, p: Parameters, broken: np.ndarray) -> None:
-    """Let the cables in `broken` (n, N) bool of a batch's n simulations pull no more, and all others be whole.
-
-    A chain breaks in its segment next to the drone, where its tension is largest: the spring, damper and bending of
-    that link go, and its ball and slide leave the drone free to move anywhere.
-
-    Args:
-        batch: of n simulations.
-        model, system: what they share.
-        p: of these n; the stiffness of massless cables is not set here.
-        broken: (n, N).
-    """
+def fit_cables(batch: Batch, system: System, p: Parameters, broken: np.ndarray) -> None:
+    """Let the massless cables in `broken` (n, N) bool of a batch's n simulations pull no more, and all others be whole."""
     if system.cable_model == "massless":
         batch.expand("tendon_range")[..., 1] = np.where(broken, _FAR, p.cable_length)
-        return
-    springs, dampers = batch.expand("jnt_stiffness"), batch.expand("dof_damping")
-    for i, links in enumerate(system.cable_segments):
-        slide = model.joint(f"cable_{i}/stretch_{links - 1}")
-        springs[:, slide.id - 2 * (links - 1) : slide.id + 1 : 2] = links * p.cable_stiffness[:, i, None]
-        whole = ~broken[:, i, None]
-        springs[:, slide.id, None] *= whole
-        springs[:, slide.id - 1, None] = whole * model.jnt_stiffness[slide.id - 1]  # the link's ball
-        dofs = slice(slide.dofadr[0] - 3, slide.dofadr[0] + 1)
-        dampers[:, dofs] = whole * model.dof_damping[dofs]

@@ -15,7 +15,6 @@ from multilift_marl.sim.cables import IMPEDANCE, limit_solref
 from multilift_marl.sim.looks import (
     DRONE_COLOURS,
     PAYLOAD_COLOUR,
-    VISUAL_GROUP,
     add_light,
     add_rotorcraft,
     add_surroundings,
@@ -23,14 +22,12 @@ from multilift_marl.sim.looks import (
 )
 
 _GEOM, _OBJECT = mujoco.mjtGeom, mujoco.mjtObj
-LINK_INERTIA = 0.01  # of a link about its node, over mass x length²: spin about its own axis must not be free
 
 
 class Layout(NamedTuple):
     """Where the bodies stand in MuJoCo's arrays: the payload first, then the drones, each a free joint.
 
-    A point payload has three slide joints in place of its free joint. With chains, each drone in turn is the leaf of a
-    branch of the payload: for each link a ball joint and a slide, then the drone's ball joint.
+    A point payload has three slide joints in place of its free joint. Chains are no part of the model.
     """
 
     payload_nq: int
@@ -53,26 +50,15 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "multilift"
     set_options(spec, system.timestep)
-    chain = system.cable_model == "chain"
-    if chain:
-        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        spec.option.solver, spec.option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 1e-8
-    else:  # massless cables are limits: there are no springs and dampers to look for
-        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
+    # cables are limits of tendons or act as loads: there are no springs and dampers to look for
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
     _add_world(spec, visuals)
     _add_payload(spec, system)
     for i in range(system.num_drones):
-        if chain:
-            link = _add_chain(spec.body("payload"), system, i, visuals)
-            end = np.array([0, 0, system.cable_length[i] / system.cable_segments[i]])
-            body = link.add_body(name=f"drone_{i}", pos=end - system.hooks[i])
-            body.add_joint(name=f"drone_{i}", type=mujoco.mjtJoint.mjJNT_BALL, pos=system.hooks[i])
-            _add_drone(body, system, i, visuals)
-            _add_drone_sensors(spec, i)
-        else:
-            body = spec.worldbody.add_body(name=f"drone_{i}", pos=system.slots[i] + [0, 0, 1.5])
-            body.add_freejoint(name=f"drone_{i}")
-            _add_drone(body, system, i, visuals)
+        body = spec.worldbody.add_body(name=f"drone_{i}", pos=system.slots[i] + [0, 0, 1.5])
+        body.add_freejoint(name=f"drone_{i}")
+        _add_drone(body, system, i, visuals)
+        if system.cable_model == "massless":
             _add_cable(spec, system, i)
     _pair_bodies(spec, system.num_drones)
     if visuals:
@@ -83,7 +69,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
 
 
 def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
-    """Set integrator, gravity, flags and, for all models but chains, solver and Jacobian."""
+    """Set integrator, gravity, flags, solver and Jacobian."""
     option, disable = spec.option, mujoco.mjtDisableBit
     option.timestep, option.gravity = timestep, [0, 0, -GRAVITY]
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
@@ -194,48 +180,3 @@ def _add_cable(spec: mujoco.MjSpec, system: System, i: int) -> None:
         name=f"cable_{i}/tension", type=mujoco.mjtSensor.mjSENS_TENDONLIMITFRC,
         objtype=_OBJECT.mjOBJ_TENDON, objname=f"cable_{i}",
     )  # fmt: skip
-
-
-def _add_chain(payload: mujoco.MjsBody, system: System, i: int, visuals: bool) -> mujoco.MjsBody:
-    """Hang the links of cable i on the payload, one on the other, and return the last; see sim/chain.py."""
-    n = int(system.cable_segments[i])
-    length = system.cable_length[i] / n
-    mass = system.cable_mass[i] / n
-    bending = {"stiffness": [system.bending_stiffness[i], 0, 0], "damping": [system.bending_damping[i], 0, 0]}
-    parent, place, turned = payload, system.anchors[i], np.zeros(4)
-    mujoco.mju_mat2Quat(turned, link_frame(system.formation_force[i]).ravel())
-    quat = turned.tolist()
-    joint = mujoco.mjtJoint
-    for j in range(n):
-        link = parent.add_body(name=f"cable_{i}/link_{j}", pos=place, quat=quat)
-        link.mass, link.explicitinertial, link.ipos = mass, True, [0, 0, length]
-        link.inertia = [LINK_INERTIA * mass * length**2] * 3
-        link.add_joint(type=joint.mjJNT_BALL, **(bending if j else {}))  # the anchor is a free pivot
-        link.add_joint(
-            name=f"cable_{i}/stretch_{j}", type=joint.mjJNT_SLIDE, axis=[0, 0, 1],
-            stiffness=[n * system.cable_stiffness[i], 0, 0], damping=[n * system.cable_damping[i], 0, 0],
-        )  # fmt: skip
-        if visuals:
-            link.add_geom(
-                type=_GEOM.mjGEOM_CAPSULE, fromto=[0, 0, 0, 0, 0, length], size=[0.006, 0, 0],
-                rgba=[0.08, 0.08, 0.1, 1], contype=0, conaffinity=0, group=VISUAL_GROUP, mass=0,
-            )  # fmt: skip
-        parent, place, quat = link, np.array([0, 0, length]), [1, 0, 0, 0]
-    return parent
-
-
-def link_frame(direction: np.ndarray) -> np.ndarray:
-    """Return a rotation (3, 3) that turns z into `direction` (3,), which must not be horizontal along y."""
-    z = np.asarray(direction, float) / np.linalg.norm(direction)
-    x = np.cross([0, 1, 0], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-def _add_drone_sensors(spec: mujoco.MjSpec, i: int) -> None:
-    """Measure what a free joint would tell: position, attitude, velocity (world frame) and body rates."""
-    sensor, drone = mujoco.mjtSensor, {"objtype": _OBJECT.mjOBJ_XBODY, "objname": f"drone_{i}"}
-    spec.add_sensor(type=sensor.mjSENS_FRAMEPOS, **drone)
-    spec.add_sensor(type=sensor.mjSENS_FRAMEQUAT, **drone)
-    spec.add_sensor(type=sensor.mjSENS_FRAMELINVEL, **drone)
-    spec.add_sensor(type=sensor.mjSENS_GYRO, objtype=_OBJECT.mjOBJ_SITE, objname=f"drone_{i}/hook")

@@ -29,7 +29,7 @@ class SystemState(NamedTuple):
     rotor_speed: np.ndarray
     """(E, N, 4) of each rotor, with its lag, never negative [rad/s]; times 30/π for revolutions per minute."""
     cable_tension: np.ndarray
-    """(E, N) [N]. Massless: in the last physics step, exactly 0 when slack. Chain: now, next to the drone."""
+    """(E, N) [N]. Massless: mean of the last physics step, exactly 0 when slack. Chain: now, next to the drone."""
     cable_broken: np.ndarray
     """(E, N) bool, once its tension has exceeded its breaking load, or by `World.break_cables`."""
 

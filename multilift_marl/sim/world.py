@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
 from collections.abc import Callable
@@ -16,7 +15,8 @@ from mujoco.batch import Batch, SimulationError
 from multilift_marl._jit import bind
 from multilift_marl.config.system import System
 from multilift_marl.sim.air import make_air
-from multilift_marl.sim.chain import divide_chains, make_chain, read_chains, write_chains
+from multilift_marl.sim.chain import make_chain, read_chains, update_chain, write_chains
+from multilift_marl.sim.chain_dynamics import Chain, Motion, Nodes, advance_chains
 from multilift_marl.sim.dynamics import apply_loads, make_constants
 from multilift_marl.sim.gusts import start_turbulence
 from multilift_marl.sim.parameters import (
@@ -44,14 +44,16 @@ class Shard:
     lo: int
     hi: int
     batch: Batch
-    step: Callable[[], None]
-    """Advances `batch` by one physics step."""
     apply: Callable[[], None]
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
+    pull: Callable[[], None] | None
+    """`advance_chains` of these environments; None with massless cables, which MuJoCo advances."""
     read: Callable[[], None]
     """`read_rows` or `read_chains` of these environments."""
     broken: np.ndarray
     """(hi - lo, N) cables that the batch's models lack."""
+    motion: Motion | None
+    """Working arrays of chains."""
 
 
 class World:
@@ -73,6 +75,7 @@ class World:
         air: what blows beside the mean wind.
         record: what accumulated since the reset.
         diverged: (E,) bool, until reset.
+        nodes: Nodes of the chains; None with massless cables.
         breakable: whether `state.cable_broken` is looked at after every physics step.
 
     Raises:
@@ -97,6 +100,10 @@ class World:
         self.air, self.seed = Air.zeros(num_envs, self.num_drones), seed
         self.record, self.diverged = Record.zeros(num_envs), np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
+        self.nodes = Nodes.zeros(num_envs, system) if system.cable_model == "chain" else None
+        self._chain: Chain | None = None
+        self._write: Callable[..., None] = write_rows
+        self._places: tuple[object, ...] = ()
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool: tuple[int, ThreadPoolExecutor] | None = None  # with its process
         self.reset()
@@ -129,7 +136,7 @@ class World:
             nstep: physics steps.
 
         Returns:
-            The live state. Tensions of massless cables are those of the last step, all else is current.
+            The live state. Tensions are those of the last step, of chains of its last substep; all else is current.
 
         Raises:
             ValueError: wrong shape, or a thrust that is not finite.
@@ -148,8 +155,10 @@ class World:
         """Advance one shard with the thrusts in `thrust`; see `step`."""
         for _ in range(nstep):
             shard.apply()
+            if shard.pull is not None:
+                shard.pull()
             try:
-                shard.step()
+                shard.batch.step()
             except SimulationError as error:
                 self.diverged[shard.lo + np.asarray(error.ids, int)] = True
             shard.read()
@@ -185,7 +194,7 @@ class World:
         if self._varied is not None and "vehicle_rotor_time_constant" in names:
             write_lags(self._varied, self.system, self.parameters, changed)
         if self._chain is not None:
-            divide_chains(self._chain, self.system, self.parameters)
+            update_chain(self._chain, self.system, self.parameters)
         for shard in self.shards:
             local = changed[shard.lo : shard.hi]
             if local.any():
@@ -231,6 +240,15 @@ class World:
         shard = next(shard for shard in self.shards if shard.lo <= env < shard.hi)
         return shard.batch.bind("qpos")[env - shard.lo]
 
+    def cable_points(self, env: int, cable: int) -> np.ndarray:
+        """Return the points of a cable from its anchor up to its hook (S + 1, 3) [m]; of a broken one without the hook."""
+        state, system = self.state, self.system
+        anchor = state.payload_position[env] + state.payload_rotation[env] @ system.anchors[cable]
+        hook = state.drone_position[env, cable] + state.drone_rotation[env, cable] @ system.hooks[cable]
+        count = system.cable_segments[cable] - 1
+        between = np.zeros((0, 3)) if self.nodes is None else self.nodes.position[env, cable, :count]
+        return np.vstack([anchor, between] if state.cable_broken[env, cable] else [anchor, between, hook])
+
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of all that the future of the simulations depends on, by dotted name, environment first."""
         saved = {
@@ -256,15 +274,15 @@ class World:
             self._cut(shard)
         self.diverged[:] = saved["diverged"]
 
-    def _groups(self) -> dict[str, SystemState | Plant | Parameters | Air | Record]:
-        names = ("state", "plant", "parameters", "air", "record")
+    def _groups(self) -> dict[str, SystemState | Plant | Parameters | Air | Record | Nodes]:
+        names = ("state", "plant", "parameters", "air", "record", *(("nodes",) if self.nodes is not None else ()))
         return {name: getattr(self, name) for name in names}
 
     def _cut(self, shard: Shard) -> None:
         """Bring the shard's models into line with `state.cable_broken`."""
         broken = self.state.cable_broken[shard.lo : shard.hi]
         if (broken != shard.broken).any():
-            fit_cables(shard.batch, self.model, self.system, self._own(shard), broken)
+            fit_cables(shard.batch, self.system, self._own(shard), broken)
             shard.broken[:] = broken
 
     def _own(self, shard: Shard) -> Parameters:
@@ -273,24 +291,29 @@ class World:
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int).tolist()
-        chain = self.system.cable_model == "chain"
-        read: Callable[..., None] = read_chains if chain else read_rows
-        self._write: Callable[..., None] = write_chains if chain else write_rows
-        self._chain = make_chain(self.system, self.parameters) if chain else None
         shards = []
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
-            batch = Batch(self.model, hi - lo, nthread=1, persistent=chain)
-            # drones on chains are read from sensors; persistent batches compute those of the new state anyway
-            step = functools.partial(batch.step, stage=mujoco.mjtStage.mjSTAGE_VEL) if chain else batch.step
+            batch = Batch(self.model, hi - lo, nthread=1)
             constants = make_constants(self.system, self.layout, batch)
             places = make_places(self.system, self.layout, self.parameters, batch)  # the same for every shard
-            self._places: tuple[object, ...] = (places, self._chain) if chain else (places,)
-            span, told, flow = (batch.state, lo, hi), batch.bind("sensordata"), make_air(self.system)
+            span, flow = (batch.state, lo, hi), make_air(self.system)
             air = (None, None) if flow.still else (self.air, flow)
             blown = (self.thrust, self.state, self.plant, self.record, constants, *air, self._varied)
-            apply = bind(apply_loads, *span, *blown)
-            follow = bind(read, *span, told, self.state, self.record, self.diverged, *self._places)
-            shards.append(Shard(lo, hi, batch, step, apply, follow, np.zeros((hi - lo, self.num_drones), bool)))
+            apply, seen = bind(apply_loads, *span, *blown), (self.state, self.record, self.diverged, places)
+            pull = motion = None
+            if self.nodes is None:
+                self._write, self._places = write_rows, (places,)
+                read = bind(read_rows, *span, batch.bind("sensordata"), *seen)
+            else:
+                if self._chain is None:
+                    self._chain = make_chain(self.system, self.layout, self.parameters, batch)
+                chains = self._chain, self.nodes
+                self._write, self._places = write_chains, (places, *chains)
+                motion = Motion.zeros(hi - lo, self.system)
+                pull = bind(advance_chains, *span, self.state, self.diverged, *chains, motion)
+                read = bind(read_chains, *span, batch.bind("qfrc_constraint"), *seen, *chains, motion)
+            broken = np.zeros((hi - lo, self.num_drones), bool)
+            shards.append(Shard(lo, hi, batch, apply, pull, read, broken, motion))
         return shards
 
 

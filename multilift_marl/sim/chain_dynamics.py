@@ -1,0 +1,589 @@
+"""How chains move, with the bodies that they tie together: substeps that conserve momentum.
+
+In a substep h, link j pulls along its direction d_j at the start of the substep, with the tension
+
+    T_j = k s_j' + c (s_j' - s_j)/h
+
+of its stretch s_j before and s_j' after it: springs and dampers are implicit along the links, and forces on nodes and
+bodies are equal, opposite and in one line. Every place then advances with its new velocity. For stiff links this is
+SHAKE (Ryckaert, Ciccotti and Berendsen 1977), a symplectic method: linear and angular momentum of payload, nodes and
+drones change by loads alone, to round-off, and energy does not drift.
+
+With the velocities u, w of the ends of a link after the substep, s_j' = s_j + h d_j · (u - w) + h r_j, where r_j is what
+the link's turning adds. Without r_j the tensions solve a linear system: one tridiagonal matrix a cable, eliminated from
+the drone down to its first link, and one dense matrix (N, N) of the first links, which meet at the payload. A few
+passes with the same factors bring r_j in.
+
+What a tension does across its link is explicit, and stable while T h² < m l. The substep is halved until that holds
+with a margin, so a cable may snatch at any speed.
+"""
+
+from __future__ import annotations
+
+from math import atan2, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.math3d import (
+    add,
+    axis_angle,
+    cross,
+    dot,
+    matmul,
+    matrow,
+    mul,
+    norm,
+    put,
+    putmat,
+    row,
+    scale,
+    sub,
+    tmul,
+    unit,
+)
+
+UNITS = 1024  # into which a physics step can be cut
+_SUBSTEP = 2.5e-4  # [s] the longest substep
+_PASSES = 2  # at most, over what the links' turning adds
+_SETTLED = 1e-6  # [m/s] change of that which needs no further pass
+_MARGIN = 0.3  # [-] T h²/(m l) of a substep that may be taken
+
+
+class Nodes(NamedTuple):
+    """State of the chains: E environments, N cables, S links of the longest one."""
+
+    position: np.ndarray
+    """(E, N, S - 1, 3) from the payload to the drone, world frame [m]."""
+    velocity: np.ndarray
+    """(E, N, S - 1, 3) [m/s]."""
+    contact: np.ndarray
+    """(E, 1 + N, 6) force (world frame) and torque (body frame) of contact on payload and drones in the last step."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, system: System) -> Nodes:
+        """Return chains at the origin."""
+        e, n, s = num_envs, system.num_drones, int(system.cable_segments.max())
+        return cls(np.zeros((e, n, s - 1, 3)), np.zeros((e, n, s - 1, 3)), np.zeros((e, 1 + n, 6)))
+
+
+class Chain(NamedTuple):
+    """Numbers of the chains and of the bodies that they tie together; body 0 is the payload, 1 + n drone n."""
+
+    segments: np.ndarray
+    """(N,) links."""
+    length: np.ndarray
+    """(E, N) of a link [m]."""
+    stiffness: np.ndarray
+    """(E, N) of a link [N/m]."""
+    damping: np.ndarray
+    """(N,) of a link [N s/m]."""
+    node_mass: np.ndarray
+    """(E, N) [kg]."""
+    bending_stiffness: np.ndarray
+    """(N,) between neighbouring links [N m/rad]."""
+    bending_damping: np.ndarray
+    """(N,) [N m s/rad]."""
+    anchors: np.ndarray
+    """(N, 3) on the payload, from its body frame's origin [m]."""
+    hooks: np.ndarray
+    """(N, 3) on the drones, from their centres of mass [m]."""
+    mass: np.ndarray
+    """(E, 1 + N) of the bodies [kg]."""
+    inertia: np.ndarray
+    """(E, 1 + N, 3, 3) about their centres of mass, body frame [kg m²]."""
+    inverse_inertia: np.ndarray
+    """(E, 1 + N, 3, 3) zero of a point payload, which does not turn."""
+    center: np.ndarray
+    """(E, 1 + N, 3) centre of mass from the body frame's origin [m]."""
+    breaking_load: np.ndarray
+    """(N,) [N]."""
+    loads: np.ndarray
+    """(1 + N,) offsets of the bodies' applied forces in a row of `batch.state`."""
+    timestep: float
+    """Of the physics [s]."""
+    largest: int
+    """Length of the longest substep, a physics step being `UNITS`."""
+    bends: bool
+    """Whether any cable resists bending."""
+
+
+class Motion(NamedTuple):
+    """Working arrays of a shard: its L environments, B = 1 + N bodies, S links of the longest chain."""
+
+    position: np.ndarray
+    """(L, B, 3) of the centres of mass [m]; after the step of the body frames' origins, like the next one."""
+    velocity: np.ndarray
+    """(L, B, 3) [m/s]."""
+    rotation: np.ndarray
+    """(L, B, 3, 3)."""
+    rates: np.ndarray
+    """(L, B, 3) body frame [rad/s]."""
+    stretch: np.ndarray
+    """(L, N, S) of the links [m]."""
+    tension: np.ndarray
+    """(L, N) next to the drone, in the last substep, at least 0 [N]."""
+    peak: np.ndarray
+    """(L, N) largest one in the physics step [N]."""
+    dissipated: np.ndarray
+    """(L,) energy that dampers, along the links and of bending, took in the physics step [J]."""
+    momentum: np.ndarray
+    """(B, 3) angular, about the centre of mass, world frame [N m s]; of one environment, like all below."""
+    force: np.ndarray
+    """(B, 3) gravity and loads, world frame [N]."""
+    torque: np.ndarray
+    """(B, 3) about the centre of mass, body frame [N m]."""
+    impulse: np.ndarray
+    """(B, 6) of the cables so far: linear in the world frame, angular about the origin in the body frame."""
+    free_velocity: np.ndarray
+    """(B, 3) at the end of the substep, were it not for the cables [m/s]."""
+    free_rates: np.ndarray
+    """(B, 3) likewise, world frame [rad/s]."""
+    ends: np.ndarray
+    """(N, 2, 3) anchor and hook from their bodies' centres of mass, world frame [m]."""
+    twist: np.ndarray
+    """(N, 3) angular velocity that a unit impulse of the first link gives the payload [1/(kg m)]."""
+    direction: np.ndarray
+    """(N, S, 3) of the links, from payload to drone."""
+    bending: np.ndarray
+    """(N, S - 1, 3) force of bending on the nodes [N]."""
+    bend_force: np.ndarray
+    """(B, 3) on the bodies, world frame [N], and its moment about their centres of mass, (B, 3) [N m]."""
+    bend_moment: np.ndarray
+    bend_power: np.ndarray
+    """(1,) that the dampers of bending take [W]."""
+    turning: np.ndarray
+    """(N, S) by how much a link stretches faster because it turns [m/s]."""
+    pull: np.ndarray
+    """(N, S) tension of each link [N]."""
+    diagonal: np.ndarray
+    """(N, S) of the tridiagonal matrices, and the elements beside it, (N, S) of links j - 1 and j [1/kg]."""
+    coupling: np.ndarray
+    right: np.ndarray
+    """(N, S) right-hand sides [m/s²]."""
+    matrix: np.ndarray
+    """(N, N) of the first links [1/kg]."""
+
+    @classmethod
+    def zeros(cls, size: int, system: System) -> Motion:
+        """Return arrays for `size` environments."""
+        e, n, s = size, system.num_drones, int(system.cable_segments.max())
+        b = 1 + n
+        shapes = (
+            (e, b, 3), (e, b, 3), (e, b, 3, 3), (e, b, 3), (e, n, s), (e, n), (e, n), (e,),
+            (b, 3), (b, 3), (b, 3), (b, 6), (b, 3), (b, 3), (n, 2, 3), (n, 3), (n, s, 3), (n, s - 1, 3),
+            (b, 3), (b, 3), (1,), (n, s), (n, s), (n, s), (n, s), (n, s), (n, n),
+        )  # fmt: skip
+        return cls(*(np.zeros(shape) for shape in shapes))
+
+
+def largest_substep(system: System) -> int:
+    """Return the longest substep that bending allows, in `UNITS` to a physics step: a power of two, 0 if there is none.
+
+    Springs and dampers along the links are implicit, bending is explicit: its fastest mode, of nodes m that move to and
+    fro across links l, has ω² = 16 κ/(m l²) and, by damping alone, the rate 16 β/(m l²).
+    """
+    inertia = system.cable_mass / (system.cable_segments - 1) * (system.cable_length / system.cable_segments) ** 2
+    fastest = max(
+        2 * float(np.sqrt(16 * system.bending_stiffness / inertia).max()),
+        float((16 * system.bending_damping / inertia).max()),
+    )
+    longest = min(_SUBSTEP, system.timestep, 1 / max(fastest, 1e-9)) * UNITS / system.timestep
+    return 2 ** int(np.log2(longest)) if longest >= 1 else 0
+
+
+@kernel
+def advance_chains(rows, lo, hi, state, diverged, chain, nodes, motion):
+    """Advance nodes and bodies of environments lo to hi by one physics step, and load MuJoCo's bodies with the cables.
+
+    Args:
+        rows: `batch.state`, with the loads of the step; the cables' mean forces are added to them.
+        lo, hi: the environments.
+        state: SystemState at the start of the step; `cable_broken` is written.
+        diverged: (E,) bool, environments that are left as they are.
+        chain: Chain.
+        nodes: Nodes, written.
+        motion: Motion of these environments, written.
+    """
+    for e in range(lo, hi):
+        if diverged[e]:
+            continue
+        i, line = e - lo, rows[e - lo]
+        _gather_bodies(e, i, line, state, chain, nodes, motion)
+        motion.dissipated[i] = 0.0
+        for n in range(chain.segments.shape[0]):
+            motion.peak[i, n] = 0.0
+        left, size = UNITS, chain.largest
+        while left > 0:
+            size = min(size, left)
+            h = size * chain.timestep / UNITS
+            if chain.bends:
+                _find_bending(e, i, state, chain, nodes, motion)
+            _find_links(e, i, h, state, chain, nodes, motion)
+            _factorize(e, state, chain, motion)
+            _solve_tensions(e, h, state, chain, motion)
+            while size > 1 and _steepness(e, h, state, chain, motion) > _MARGIN:
+                size //= 2
+                h = size * chain.timestep / UNITS
+                _find_links(e, i, h, state, chain, nodes, motion)
+                _factorize(e, state, chain, motion)
+                _solve_tensions(e, h, state, chain, motion)
+            for _ in range(_PASSES):
+                if _find_turning(e, i, h, chain, nodes, motion) < _SETTLED:
+                    break
+                _solve_tensions(e, h, state, chain, motion)
+            _move(e, i, h, state, chain, nodes, motion)
+            left -= size
+            if size < chain.largest and _steepness(e, 2.0 * h, state, chain, motion) < _MARGIN:
+                size *= 2
+        for b in range(chain.mass.shape[1]):
+            dofs = 6 if chain.inverse_inertia[e, b, 0, 0] > 0.0 else 3
+            for j in range(dofs):
+                line[chain.loads[b] + j] += motion.impulse[b, j] / chain.timestep
+
+
+@kernel
+def _gather_bodies(e, i, line, state, chain, nodes, motion):
+    """Take the bodies at the start of a physics step and what acts on them: gravity, loads, contact of the last step.
+
+    Contact is there so that cables do not have to hold for a moment what stands on the ground.
+    """
+    for b in range(chain.mass.shape[1]):
+        if b == 0:
+            position, velocity = row(state.payload_position, e), row(state.payload_velocity, e)
+            attitude, rates = matrow(state.payload_rotation, e), row(state.payload_body_rates, e)
+            if chain.inverse_inertia[e, 0, 0, 0] == 0.0:
+                attitude, rates = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+        else:
+            position, velocity = row(state.drone_position[e], b - 1), row(state.drone_velocity[e], b - 1)
+            attitude, rates = matrow(state.drone_rotation[e], b - 1), row(state.drone_body_rates[e], b - 1)
+        center = row(chain.center[e], b)
+        put(motion.position[i, b], add(position, mul(attitude, center)))
+        put(motion.velocity[i, b], add(velocity, mul(attitude, cross(rates, center))))
+        put(motion.rates[i, b], rates)
+        putmat(motion.rotation[i, b], attitude)
+        put(motion.momentum[b], mul(attitude, mul(matrow(chain.inertia[e], b), rates)))
+        at, mass, touch = chain.loads[b], chain.mass[e, b], nodes.contact[e, b]
+        force = (line[at] + touch[0], line[at + 1] + touch[1], line[at + 2] + touch[2])
+        put(motion.force[b], sub(force, (0.0, 0.0, mass * GRAVITY)))
+        if chain.inverse_inertia[e, b, 0, 0] > 0.0:
+            torque = (line[at + 3] + touch[3], line[at + 4] + touch[4], line[at + 5] + touch[5])
+            put(motion.torque[b], sub(torque, cross(center, tmul(attitude, force))))
+        for j in range(6):
+            motion.impulse[b, j] = 0.0
+
+
+@kernel
+def _find_links(e, i, h, state, chain, nodes, motion):
+    """Find direction and stretch of every link, the bodies' motion without cables, and the linear system of a substep.
+
+    Row j of a cable, over h (k h + c): (1/(h (k h + c)) + 1/m_upper + 1/m_lower) T_j less what its neighbours do to the
+    nodes that they share, equals (k s_j/(k h + c) + rate of stretch without cables)/h.
+    """
+    # Bodies without cables. The momentum is in the world frame, so the gyroscopic torque needs no term.
+    for b in range(chain.mass.shape[1]):
+        mass, attitude = chain.mass[e, b], matrow(motion.rotation[i], b)
+        force = add(row(motion.force, b), row(motion.bend_force, b))
+        put(motion.free_velocity[b], add(row(motion.velocity[i], b), scale(h / mass, force)))
+        torque = add(mul(attitude, row(motion.torque, b)), row(motion.bend_moment, b))
+        momentum = add(row(motion.momentum, b), scale(h, torque))
+        turning = mul(matrow(chain.inverse_inertia[e], b), tmul(attitude, momentum))
+        put(motion.free_rates[b], mul(attitude, turning))
+
+    payload, payload_inverse = matrow(motion.rotation[i], 0), matrow(chain.inverse_inertia[e], 0)
+    for n in range(chain.segments.shape[0]):
+        links = chain.segments[n]
+        k, c, length = chain.stiffness[e, n], chain.damping[n], chain.length[e, n]
+        gain = k * h + c
+        node = 1.0 / chain.node_mass[e, n]
+
+        # Along the cable, from the anchor on the payload up.
+        arm = mul(payload, sub(row(chain.anchors, n), row(chain.center[e], 0)))
+        put(motion.ends[n, 0], arm)
+        low = add(row(motion.position[i], 0), arm)
+        low_velocity = add(row(motion.free_velocity, 0), cross(row(motion.free_rates, 0), arm))
+        before, weight = (0.0, 0.0, 0.0), 0.0
+        for j in range(links):
+            if j < links - 1:
+                high, weight_up = row(nodes.position[e, n], j), node
+                high_velocity = _free_node(e, n, j, h, chain, nodes, motion)
+            else:
+                drone = matrow(motion.rotation[i], 1 + n)
+                arm = mul(drone, row(chain.hooks, n))
+                put(motion.ends[n, 1], arm)
+                high = add(row(motion.position[i], 1 + n), arm)
+                high_velocity = add(row(motion.free_velocity, 1 + n), cross(row(motion.free_rates, 1 + n), arm))
+                weight_up = 1.0 / chain.mass[e, 1 + n]
+            link = sub(high, low)
+            size = norm(link)
+            d = scale(1.0 / max(size, 1e-9), link)
+            if j == links - 1:  # a pull at the hook turns the drone, too
+                moment = tmul(drone, cross(arm, d))
+                weight_up += dot(moment, mul(matrow(chain.inverse_inertia[e], 1 + n), moment))
+            put(motion.direction[n, j], d)
+            motion.stretch[i, n, j] = size - length
+            opening = sub(high_velocity, low_velocity)
+            motion.turning[n, j] = _turning(d, size, opening, h)
+            rate = dot(d, opening)
+            motion.diagonal[n, j] = 1.0 / (h * gain) + weight_up + weight
+            motion.right[n, j] = (k * (size - length) / gain + rate) / h
+            motion.coupling[n, j] = -weight * dot(d, before)
+            if j == 0:
+                turning = mul(payload_inverse, tmul(payload, cross(row(motion.ends[n], 0), d)))
+                put(motion.twist[n], mul(payload, turning))
+            low, low_velocity, before, weight = high, high_velocity, d, weight_up
+
+
+@kernel
+def _find_bending(e, i, state, chain, nodes, motion):
+    """Find the forces of bending on nodes and bodies: of the moment κ θ + β θ̇ at the angle θ between two links.
+
+    The forces on the three points of a bend are the moment times the derivatives of θ by their places. They have
+    neither a sum nor a moment. Anchor and hook are free pivots.
+    """
+    motion.bend_power[0] = 0.0
+    motion.bend_force[:] = 0.0
+    motion.bend_moment[:] = 0.0
+    motion.bending[:] = 0.0
+    payload = matrow(motion.rotation[i], 0)
+    for n in range(chain.segments.shape[0]):
+        links = chain.segments[n]
+        arm = mul(payload, sub(row(chain.anchors, n), row(chain.center[e], 0)))
+        low, low_velocity = _end(i, 0, arm, motion)
+        middle, middle_velocity = row(nodes.position[e, n], 0), row(nodes.velocity[e, n], 0)
+        for j in range(links - 1):
+            if j < links - 2:
+                high, high_velocity = row(nodes.position[e, n], j + 1), row(nodes.velocity[e, n], j + 1)
+            elif state.cable_broken[e, n]:
+                break
+            else:
+                hook = mul(matrow(motion.rotation[i], 1 + n), row(chain.hooks, n))
+                high, high_velocity = _end(i, 1 + n, hook, motion)
+            first, second = sub(middle, low), sub(high, middle)
+            size1, size2 = norm(first), norm(second)
+            d1, d2 = scale(1.0 / size1, first), scale(1.0 / size2, second)
+            sine, cosine = norm(cross(d1, d2)), dot(d1, d2)
+            if sine > 1e-9:
+                # The angle shrinks as d1 moves along e1 and d2 along e2, unit vectors across the links in the bend.
+                e1 = scale(1.0 / (sine * size1), sub(d2, scale(cosine, d1)))
+                e2 = scale(1.0 / (sine * size2), sub(d1, scale(cosine, d2)))
+                closing = dot(e1, sub(middle_velocity, low_velocity)) + dot(e2, sub(high_velocity, middle_velocity))
+                motion.bend_power[0] += chain.bending_damping[n] * closing * closing
+                moment = chain.bending_stiffness[n] * atan2(sine, cosine) - chain.bending_damping[n] * closing
+                on_low, on_high = scale(-moment, e1), scale(moment, e2)
+                on_middle = sub((0.0, 0.0, 0.0), add(on_low, on_high))
+                put(motion.bending[n, j], add(row(motion.bending[n], j), on_middle))
+                if j > 0:
+                    put(motion.bending[n, j - 1], add(row(motion.bending[n], j - 1), on_low))
+                else:
+                    put(motion.bend_force[0], add(row(motion.bend_force, 0), on_low))
+                    put(motion.bend_moment[0], add(row(motion.bend_moment, 0), cross(arm, on_low)))
+                if j < links - 2:
+                    put(motion.bending[n, j + 1], add(row(motion.bending[n], j + 1), on_high))
+                else:
+                    put(motion.bend_force[1 + n], on_high)
+                    put(motion.bend_moment[1 + n], cross(hook, on_high))
+            low, low_velocity, middle, middle_velocity = middle, middle_velocity, high, high_velocity
+
+
+@kernel
+def _end(i, b, arm, motion):
+    """Return place and velocity of a point of body b, `arm` from its centre of mass in the world frame."""
+    rates = mul(matrow(motion.rotation[i], b), row(motion.rates[i], b))
+    return add(row(motion.position[i], b), arm), add(row(motion.velocity[i], b), cross(rates, arm))
+
+
+@kernel
+def _factorize(e, state, chain, motion):
+    """Factorize the system of a substep: eliminate each cable from its drone down, then Cholesky of the first links."""
+    count = chain.segments.shape[0]
+    for n in range(count):
+        for j in range(_top(e, n, state, chain), 0, -1):
+            share = motion.coupling[n, j] / motion.diagonal[n, j]
+            motion.diagonal[n, j - 1] -= share * motion.coupling[n, j]
+    for n in range(count):
+        d, arm = row(motion.direction[n], 0), row(motion.ends[n], 0)
+        for m in range(n + 1):
+            there = add(scale(1.0 / chain.mass[e, 0], row(motion.direction[m], 0)), cross(row(motion.twist, m), arm))
+            total = dot(d, there)
+            if m == n:
+                total += motion.diagonal[n, 0]
+            for k in range(m):
+                total -= motion.matrix[n, k] * motion.matrix[m, k]
+            motion.matrix[n, m] = sqrt(total) if m == n else total / motion.matrix[m, m]
+
+
+@kernel
+def _solve_tensions(e, h, state, chain, motion):
+    """Solve for the tensions of all links by the factors, with what the links' turning adds to their stretch."""
+    count = chain.segments.shape[0]
+    for n in range(count):
+        top = _top(e, n, state, chain)
+        for j in range(chain.segments[n]):
+            motion.pull[n, j] = motion.right[n, j] + motion.turning[n, j] / h
+        for j in range(top, 0, -1):
+            motion.pull[n, j - 1] -= motion.coupling[n, j] / motion.diagonal[n, j] * motion.pull[n, j]
+    for n in range(count):
+        total = motion.pull[n, 0]
+        for k in range(n):
+            total -= motion.matrix[n, k] * motion.pull[k, 0]
+        motion.pull[n, 0] = total / motion.matrix[n, n]
+    for n in range(count - 1, -1, -1):
+        total = motion.pull[n, 0]
+        for k in range(n + 1, count):
+            total -= motion.matrix[k, n] * motion.pull[k, 0]
+        motion.pull[n, 0] = total / motion.matrix[n, n]
+        top = _top(e, n, state, chain)
+        for j in range(1, top + 1):
+            known = motion.pull[n, j] - motion.coupling[n, j] * motion.pull[n, j - 1]
+            motion.pull[n, j] = known / motion.diagonal[n, j]
+        for j in range(top + 1, chain.segments[n]):
+            motion.pull[n, j] = 0.0
+
+
+@kernel
+def _top(e, n, state, chain):
+    """Return the last link of cable n that holds: a cable breaks next to its drone."""
+    return chain.segments[n] - (2 if state.cable_broken[e, n] else 1)
+
+
+@kernel
+def _find_turning(e, i, h, chain, nodes, motion):
+    """Find by how much faster than d · (u - w) the links stretch as they turn, by the last tensions; return its change."""
+    change = 0.0
+    for n in range(chain.segments.shape[0]):
+        links = chain.segments[n]
+        low_velocity = _pulled_end(e, i, 0, n, 0, h, chain, motion)
+        for j in range(links):
+            if j < links - 1:
+                force = scale(motion.pull[n, j + 1], row(motion.direction[n], j + 1))
+                force = sub(force, scale(motion.pull[n, j], row(motion.direction[n], j)))
+                high_velocity = _free_node(e, n, j, h, chain, nodes, motion)
+                high_velocity = add(high_velocity, scale(h / chain.node_mass[e, n], force))
+            else:
+                high_velocity = _pulled_end(e, i, 1 + n, n, 1, h, chain, motion)
+            d, size = row(motion.direction[n], j), chain.length[e, n] + motion.stretch[i, n, j]
+            turning = _turning(d, size, sub(high_velocity, low_velocity), h)
+            change = max(change, abs(turning - motion.turning[n, j]))
+            motion.turning[n, j] = turning
+            low_velocity = high_velocity
+    return change
+
+
+@kernel
+def _turning(d, size, opening, h):
+    """Return how much faster than d · opening a link of a given size along d stretches in time h [m/s]."""
+    rate = dot(d, opening)
+    along = size + h * rate
+    across = h * h * max(dot(opening, opening) - rate * rate, 0.0)
+    return across / (h * (sqrt(along * along + across) + along))
+
+
+@kernel
+def _pulled_end(e, i, b, n, end, h, chain, motion):
+    """Return the velocity of an end of cable n after a substep, on body b."""
+    arm, impulse, moment = row(motion.ends[n], end), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    if b == 0:
+        for m in range(chain.segments.shape[0]):
+            pull = scale(h * motion.pull[m, 0], row(motion.direction[m], 0))
+            impulse, moment = add(impulse, pull), add(moment, scale(h * motion.pull[m, 0], row(motion.twist, m)))
+    else:
+        last = chain.segments[n] - 1
+        impulse = scale(-h * motion.pull[n, last], row(motion.direction[n], last))
+        attitude = matrow(motion.rotation[i], b)
+        moment = mul(attitude, mul(matrow(chain.inverse_inertia[e], b), tmul(attitude, cross(arm, impulse))))
+    velocity = add(row(motion.free_velocity, b), scale(1.0 / chain.mass[e, b], impulse))
+    return add(velocity, cross(add(row(motion.free_rates, b), moment), arm))
+
+
+@kernel
+def _steepness(e, h, state, chain, motion):
+    """Return the largest |T| h²/(m l) of all links: at 1 their motion across becomes unstable."""
+    worst = 0.0
+    for n in range(chain.segments.shape[0]):
+        inertia = chain.node_mass[e, n] * chain.length[e, n]
+        for j in range(chain.segments[n]):
+            worst = max(worst, abs(motion.pull[n, j]) / inertia)
+    return worst * h * h
+
+
+@kernel
+def _free_node(e, n, j, h, chain, nodes, motion):
+    """Return the velocity of a node after a substep, were it not for the tensions."""
+    change = scale(h / chain.node_mass[e, n], row(motion.bending[n], j))
+    return sub(add(row(nodes.velocity[e, n], j), change), (0.0, 0.0, h * GRAVITY))
+
+
+@kernel
+def _move(e, i, h, state, chain, nodes, motion):
+    """Give nodes and bodies the velocities that follow from the tensions, and move them."""
+    motion.dissipated[i] += h * motion.bend_power[0]
+    for b in range(chain.mass.shape[1]):
+        put(motion.velocity[i, b], row(motion.free_velocity, b))
+        torque = add(mul(matrow(motion.rotation[i], b), row(motion.torque, b)), row(motion.bend_moment, b))
+        put(motion.momentum[b], add(row(motion.momentum, b), scale(h, torque)))
+        if chain.bends:
+            _note_impulse(b, i, scale(h, row(motion.bend_force, b)), scale(h, row(motion.bend_moment, b)), e, chain, motion)
+
+    for n in range(chain.segments.shape[0]):
+        links, top = chain.segments[n], chain.segments[n] - 1
+        share = h / chain.node_mass[e, n]
+        k, c = chain.stiffness[e, n], chain.damping[n]
+        for j in range(links - (1 if state.cable_broken[e, n] else 0)):
+            rate = (motion.pull[n, j] - k * motion.stretch[i, n, j]) / (k * h + c)
+            motion.dissipated[i] += h * c * rate * rate
+        for j in range(links - 1):
+            below, above = motion.pull[n, j], motion.pull[n, j + 1]
+            force = sub(scale(above, row(motion.direction[n], j + 1)), scale(below, row(motion.direction[n], j)))
+            velocity = add(_free_node(e, n, j, h, chain, nodes, motion), scale(share, force))
+            put(nodes.velocity[e, n, j], velocity)
+            put(nodes.position[e, n, j], add(row(nodes.position[e, n], j), scale(h, velocity)))
+        first = scale(h * motion.pull[n, 0], row(motion.direction[n], 0))
+        last = scale(-h * motion.pull[n, top], row(motion.direction[n], top))
+        _push(e, i, 0, first, row(motion.ends[n], 0), chain, motion)
+        _push(e, i, 1 + n, last, row(motion.ends[n], 1), chain, motion)
+        tension = max(0.0, motion.pull[n, top])
+        motion.tension[i, n] = tension
+        motion.peak[i, n] = max(motion.peak[i, n], tension)
+        if tension > chain.breaking_load[n]:
+            state.cable_broken[e, n] = True
+
+    # The attitude follows the momentum by the midpoint rule.
+    for b in range(chain.mass.shape[1]):
+        put(motion.position[i, b], add(row(motion.position[i], b), scale(h, row(motion.velocity[i], b))))
+        if chain.inverse_inertia[e, b, 0, 0] > 0.0:
+            attitude, inverse = matrow(motion.rotation[i], b), matrow(chain.inverse_inertia[e], b)
+            momentum = row(motion.momentum, b)
+            rates = mul(inverse, tmul(attitude, momentum))
+            rates = mul(inverse, tmul(turned(attitude, scale(0.5 * h, rates)), momentum))
+            attitude = turned(attitude, scale(h, rates))
+            putmat(motion.rotation[i, b], attitude)
+            put(motion.rates[i, b], mul(inverse, tmul(attitude, momentum)))
+
+
+@kernel
+def _push(e, i, b, impulse, arm, chain, motion):
+    """Give body b an impulse [N s] at `arm` from its centre of mass, world frame."""
+    put(motion.velocity[i, b], add(row(motion.velocity[i], b), scale(1.0 / chain.mass[e, b], impulse)))
+    moment = cross(arm, impulse)
+    put(motion.momentum[b], add(row(motion.momentum, b), moment))
+    _note_impulse(b, i, impulse, moment, e, chain, motion)
+
+
+@kernel
+def _note_impulse(b, i, impulse, moment, e, chain, motion):
+    """Add an impulse and its moment about the centre of mass to those that MuJoCo's body is to feel."""
+    attitude = matrow(motion.rotation[i], b)
+    turning = add(tmul(attitude, moment), cross(row(chain.center[e], b), tmul(attitude, impulse)))
+    for j in range(3):
+        motion.impulse[b, j] += impulse[j]
+        motion.impulse[b, 3 + j] += turning[j]
+
+
+@kernel
+def turned(attitude, vector):
+    """Return an attitude turned by a rotation vector in the body frame."""
+    return matmul(attitude, axis_angle(unit(vector), norm(vector)))
