@@ -330,7 +330,7 @@ def ring(sides, outer, inner, height):
     faces = []
     for k in range(sides):
         a, b = k, (k + 1) % sides
-        for p, q, r, s in ((0, 1, 1, 0), (1, 3, 3, 1), (3, 2, 2, 3), (2, 0, 0, 2)):  # below, outside, above, inside
+        for p, q, _, s in ((0, 1, 1, 0), (1, 3, 3, 1), (3, 2, 2, 3), (2, 0, 0, 2)):  # below, outside, above, inside
             faces += [(p * sides + a, q * sides + b, q * sides + a), (p * sides + a, s * sides + b, q * sides + b)]
     area, polar = 0.0, 0.0
     for radius, sign in ((outer, 1), (inner, -1)):
