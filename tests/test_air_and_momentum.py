@@ -13,11 +13,13 @@ from multilift_marl.sim import World
 
 
 def momenta(world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Return the momentum (E, 3) and the angular momentum about the origin (E, 3) of payload and drones."""
+    """Return the momentum (E, 3) and the angular momentum about the origin (E, 3) of payload, drones and rotors."""
     system, state, mass = world.system, world.state, world.plant.payload_mass[:, None]
     inertia = system.payload_inertia * mass / system.payload_mass
     spin = np.einsum("eij,ej->ei", state.payload_rotation, inertia * state.payload_body_rates)
-    spins = np.einsum("enij,enj->ei", state.drone_rotation, np.asarray(system.vehicle.inertia) * state.drone_body_rates)
+    own = np.asarray(system.vehicle.inertia) * state.drone_body_rates
+    own[..., 2] -= system.vehicle.rotor_inertia * state.rotor_speed @ np.array(system.vehicle.rotor_spin)
+    spins = np.einsum("enij,enj->ei", state.drone_rotation, own)
     linear, linears = mass * state.payload_velocity, system.vehicle.mass * state.drone_velocity
     orbits = np.cross(state.payload_position, linear) + np.cross(state.drone_position, linears).sum(axis=1)
     return linear + linears.sum(axis=1), orbits + spin + spins

@@ -18,6 +18,7 @@ from conftest import (
     zeros,
 )
 
+from multilift_marl.math3d import axis_angle
 from multilift_marl.sim import World
 from multilift_marl.sim.parameters import nominal_parameters
 
@@ -253,16 +254,54 @@ def test_a_payload_falls_and_turns_about_its_own_centre_of_mass_with_its_own_ine
     world.load(EVERYONE)
     start = world.state.payload_position[1] + shift
     speed = np.cross(rates, shift)  # of the centre of mass
-    world.plant.payload_force[:] = [0.0, 1.0, 0.0]  # at the nominal centre
-    world.step(np.zeros((2, 1, 4)), 1)
-    gained = world.state.payload_body_rates[1, 2] - 2.0
-    assert gained == pytest.approx(-0.001 * shift[0] * 1.0 / (1.5 * system.payload_inertia[2]), rel=2e-3)
-    world.plant.payload_force[:] = 0.0
-    world.step(np.zeros((2, 1, 4)), 99)
+    world.step(np.zeros((2, 1, 4)), 100)
     middle = world.state.payload_position[1] + world.state.payload_rotation[1] @ shift
     fallen = start + 0.1 * speed + [0, 0, -0.5 * GRAVITY * 0.1**2]
     np.testing.assert_allclose(middle, fallen, atol=1e-3)
     np.testing.assert_allclose(world.state.payload_position[0], [0, 0, 100 - 0.5 * GRAVITY * 0.01], atol=1e-3)
+
+
+@MODELS
+@pytest.mark.parametrize("load", ["force", "wind"])
+def test_force_and_wind_act_at_the_true_centre_of_mass(model, load):
+    """The payload does not start to turn, and its centre of mass accelerates by force over mass."""
+    shift, h = np.array([0.08, -0.05, 0.03]), 1e-3
+    system = make_system(1, **{"cable.model": model, "cable.length": 20.0, "cable.density": 1e-9, "sim.timestep": h,
+                               "payload.drag_area": 0.1 if load == "wind" else 0.0,
+                               "randomization.payload_center_of_mass": (0.1, 0.1, 0.1)})  # fmt: skip
+    world = World(system, 1, 1)
+    one, turn = np.ones(1, bool), np.reshape(axis_angle((0.6, 0.0, 0.8), 0.7), (3, 3))
+    world.set_parameters(one, payload_center_of_mass=shift[None])
+    world.state.payload_position[:], world.state.drone_position[:] = [0, 0, 100], [0, 0, 102]
+    world.state.payload_rotation[:] = turn
+    world.load(one)
+    force = np.array([0.0, 4.0, 1.0])
+    if load == "force":
+        world.plant.payload_force[:] = force
+    else:
+        world.plant.wind[:] = np.sqrt(2 / (1.225 * system.payload_drag_area * np.linalg.norm(force))) * force
+    world.step(np.zeros((1, 1, 4)), 20)
+    state = world.state
+    middle = state.payload_velocity[0] + state.payload_rotation[0] @ np.cross(state.payload_body_rates[0], shift)
+    expected = 20 * h * (force / system.payload_mass - [0, 0, GRAVITY])
+    loose = 0.08 * np.abs(expected).max() if load == "wind" else 1e-5  # drag changes as the payload gains speed
+    np.testing.assert_allclose(middle, expected, atol=loose)
+    np.testing.assert_allclose(state.payload_body_rates[0], 0, atol=2e-5)  # about the origin: 0.3
+
+
+def test_drag_of_a_turning_payload_is_that_of_its_true_centre_of_mass():
+    shift, rates = np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 3.0])
+    overrides = {"randomization.payload_center_of_mass": (0.1, 0.1, 0.1), "cable.length": 20.0, "sim.timestep": 5e-4}
+    world = World(make_system(1, **overrides), 1, 1)
+    world.set_parameters(np.ones(1, bool), payload_center_of_mass=shift[None])
+    world.state.payload_position[:], world.state.drone_position[:] = [0, 0, 100], [0, 0, 102]
+    world.state.payload_body_rates[:], world.state.payload_velocity[:] = rates, [0, 2.0, 0]
+    world.load(np.ones(1, bool))
+    world.step(np.zeros((1, 1, 4)))
+    gained = world.state.payload_velocity[0, 1] + rates[2] * shift[0] - 2.3
+    drag = 0.5 * 1.225 * world.system.payload_drag_area * 2.3**2 / world.system.payload_mass
+    assert gained == pytest.approx(-5e-4 * drag, rel=2e-2)
+    assert world.state.payload_body_rates[0, 2] == pytest.approx(3.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(

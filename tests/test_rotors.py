@@ -101,3 +101,77 @@ def test_energy_is_the_integral_of_rotor_torque_times_speed():
     world.step(hover_thrust(world), 100)
     power = (vehicle.torque_ratio * vehicle.thrust_coefficient * speed**3).sum()
     assert world.record.energy[0] == pytest.approx(0.4 * power, rel=1e-9)
+
+
+# The rotors' own inertia
+
+OWN_INERTIA = {"vehicle.rotor_inertia": 2e-5}
+
+
+def spinning(vehicle, rotor_speed: np.ndarray) -> float:
+    """Return the rotors' angular momentum about body z [kg m²/s]: each turns against its reaction torque."""
+    return -vehicle.rotor_inertia * float(np.dot(vehicle.rotor_spin, rotor_speed))
+
+
+@pytest.mark.parametrize("timestep", TIMESTEPS)
+@pytest.mark.parametrize("torque_ratio", [1e-12, 0.022], ids=["no drag of the blades", "drag of the blades"])
+def test_rotors_that_speed_up_turn_the_drone_the_other_way(torque_ratio, timestep):
+    world = free_world(**OWN_INERTIA, **{"vehicle.torque_ratio": torque_ratio, "sim.timestep": timestep})
+    vehicle, rotors = world.system.vehicle, world.state.rotor_speed[0, 0]
+    rotors[:] = 800.0
+    before = spinning(vehicle, rotors)
+    rising = np.array(vehicle.rotor_spin) > 0
+    world.step(np.where(rising, 3.0, 1.0)[None, None], round(0.1 / timestep))
+    yaw = vehicle.inertia[2] * world.state.drone_body_rates[0, 0, 2]
+    assert rotors[rising].min() > 1300 and rotors[~rising].max() < 850
+    gained = yaw + spinning(vehicle, rotors) - before
+    # what the air gives to the whole is κ times the impulse of the thrusts
+    t, tau, b, impulse = 0.1, vehicle.rotor_time_constant, vehicle.thrust_coefficient, 0.0
+    for spin, thrust in ((1, 3.0), (-1, 1.0)):
+        target = sqrt(thrust / b)
+        gap = 800.0 - target
+        square = target**2 * t + 2 * target * gap * tau * (1 - exp(-t / tau))
+        impulse += 2 * spin * torque_ratio * b * (square + gap**2 * tau / 2 * (1 - exp(-2 * t / tau)))
+    assert gained == pytest.approx(impulse, rel=1e-6, abs=1e-9)
+    assert yaw > 0.01 * torque_ratio / 0.022
+
+
+def test_a_turning_drone_feels_the_precession_of_unbalanced_rotors():
+    world = free_world(**OWN_INERTIA)
+    vehicle = world.system.vehicle
+    speeds = np.where(np.array(vehicle.rotor_spin) > 0, 1200.0, 700.0)
+    world.state.rotor_speed[:] = speeds
+    rates = np.array([0.3, 0.5, 0.0])
+    world.state.drone_body_rates[:] = rates
+    load(world)
+    world.step((vehicle.thrust_coefficient * speeds**2)[None, None])
+    momentum = np.array([0, 0, spinning(vehicle, speeds)])
+    assert momentum[2] == pytest.approx(-2e-5 * 1000)
+    inertia = np.array(vehicle.inertia)
+    torque = -np.cross(rates, inertia * rates + momentum)
+    torque[2] += vehicle.torque_ratio * vehicle.thrust_coefficient * np.dot(vehicle.rotor_spin, speeds**2)
+    gained = world.state.drone_body_rates[0, 0] - rates
+    np.testing.assert_allclose(gained, world.system.timestep * torque / inertia, rtol=1e-2, atol=1e-6)
+
+
+def test_a_spinning_top_precesses_at_the_rate_of_its_gyroscope():
+    """The transverse rates of a free drone turn at h / I where its inertia is the same about x and y."""
+    overrides = {"vehicle.inertia": (2e-3, 2e-3, 3e-3), "vehicle.torque_ratio": 1e-12, "sim.timestep": 5e-4}
+    world = free_world(**OWN_INERTIA, **overrides)
+    vehicle = world.system.vehicle
+    speeds = np.where(np.array(vehicle.rotor_spin) > 0, 1400.0, 400.0)
+    world.state.rotor_speed[:] = speeds
+    world.state.drone_body_rates[:] = [0.5, 0.0, 0.0]
+    load(world)
+    world.step((vehicle.thrust_coefficient * speeds**2)[None, None], 400)
+    angle = -spinning(vehicle, speeds) / 2e-3 * 0.2  # dΩ/dt = -h e3 × ... / I: clockwise for rotors with h > 0
+    expected = 0.5 * np.array([cos(angle), -np.sin(angle)])
+    np.testing.assert_allclose(world.state.drone_body_rates[0, 0, :2], expected, atol=0.01)
+
+
+def test_rotors_without_inertia_exert_neither():
+    world = free_world(**{"vehicle.rotor_inertia": 0.0, "vehicle.torque_ratio": 1e-12})
+    world.state.drone_body_rates[:] = [0.0, 1.0, 0.0]
+    load(world)
+    world.step(np.where(np.array(world.system.vehicle.rotor_spin) > 0, 3.0, 1.0)[None, None], 25)
+    np.testing.assert_allclose(world.state.drone_body_rates[0, 0], [0.0, 1.0, 0.0], atol=1e-9)

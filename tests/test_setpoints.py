@@ -24,7 +24,7 @@ from multilift_marl.math3d import axis_angle
 from multilift_marl.sim import World
 
 DT = 1e-3
-QUICK = {"rotor_time_constant_up": 1e-4, "rotor_time_constant_down": 1e-4}
+QUICK = {"rotor_time_constant_up": 1e-4, "rotor_time_constant_down": 1e-4, "rotor_inertia": 0.0}
 NO_PULL = np.zeros((1, 1, 3))
 SEEDS = range(3)
 

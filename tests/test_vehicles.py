@@ -94,6 +94,7 @@ OWN = {
     "drag": (0.1, 0.2, 0.3),
     "rotor_radius": 0.05,
     "rolling_moment": 1e-6,
+    "rotor_inertia": 1e-5,
 }
 
 
@@ -124,6 +125,7 @@ def test_every_field_of_a_vehicle_can_be_configured():
         ({"mass": -1.0}, r"vehicle\.mass must be greater than 0, but is -1"),
         ({"arm": 0}, r"vehicle\.arm must be greater than 0"),
         ({"rotor_time_constant_up": 0}, r"vehicle\.rotor_time_constant_up must be greater than 0"),
+        ({"rotor_inertia": -1e-6}, r"vehicle\.rotor_inertia must be greater than or equal to 0"),
         ({"drag": (0.1, -0.1, 0)}, r"vehicle\.drag must be greater than or equal to 0"),
         ({"rotor_spin": (1, -1, 1)}, r"vehicle\.rotor_spin must be a list of 4 numbers"),
     ],

@@ -72,6 +72,9 @@ class VehicleConfig(Section):
     rolling_moment: NotNegativePerDrone | None = Field(
         None, description="[kg m] moment of a rotor over its speed and that of the air across it"
     )
+    rotor_inertia: NotNegativePerDrone | None = Field(
+        None, description="[kg m²] of one rotor about its axis; 0: no spin-up and no precession torque"
+    )
 
 
 class PayloadConfig(Section):

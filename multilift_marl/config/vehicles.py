@@ -29,6 +29,7 @@ class Vehicle:
         drag: linear drag along the body axes [kg/s].
         rotor_radius: [m].
         rolling_moment: of a rotor, over its speed and that of the air across it [kg m].
+        rotor_inertia: of one rotor and what turns with it, about its axis [kg m²]; 0: as if it had none.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Vehicle:
     rotor_azimuth: tuple[float, ...] = tuple(np.pi / 4 + np.pi / 2 * np.arange(4))
     rotor_spin: tuple[float, ...] = (1.0, -1.0, 1.0, -1.0)
     rolling_moment: float = 0.0
+    rotor_inertia: float = 0.0
 
     @property
     def rotor_positions(self) -> np.ndarray:
@@ -80,10 +82,12 @@ class Vehicle:
         return float(np.sqrt(self.rotor_thrust_max / self.thrust_coefficient))
 
 
-# Mass, inertia, arm, rotor and motor constants: TU Delft multi-lift simulation (arXiv 2508.01522), flycrane.urdf and
-# motor_model.py: 0.6 kg body and four rotors of 4.2 g, 20 N in all (5 N a rotor; its speed limit of 2800 rad/s lies
-# beyond that). Drag per unit mass: Faessler et al., RA-L 3(2), 2018, table of identified coefficients. Rotor radius:
-# not stated, assumed that of the largest common propellers that fit the arm, 5 inches across.
+# TU Delft multi-lift simulation (arXiv 2508.01522; Aerial-Manipulation-Lab/MARL_mav_ext). Mass, inertia and arm:
+# assets/data/AMR/flycrane_data/flycrane.urdf, 0.6 kg body and four rotors of 4.2 g at (0.075, 0.075) m; its controllers
+# take 0.6017 kg. Thrust, torque, lag, idle speed and rotor inertia: controllers/motor_model.py, whose speed limit of
+# 2800 rad/s lies beyond any limit of thrust. Thrust limit: 5 N a rotor, 20 N in all; its controllers/indi.py and the
+# environments clamp at 6.25 N. Drag per unit mass: Faessler et al., RA-L 3(2), 2018, table of identified coefficients.
+# Rotor radius: half of the 0.127 m (5 inches) that the urdf calls a radius, since rotors 0.15 m apart would overlap.
 _FALCON_MASS = 0.6 + 4 * 0.0042
 _FALCON = Vehicle(
     name="falcon",
@@ -98,14 +102,18 @@ _FALCON = Vehicle(
     rotor_thrust_max=5.0,
     drag=(0.54 * _FALCON_MASS, 0.39 * _FALCON_MASS, 0.0),
     rotor_radius=0.0635,
+    rotor_inertia=9.3575e-6,
 )
 
 # Mass, inertia, arm, torque ratio, no drag: IMRCLab/col-trans, sim/config/initialize.yaml. Its inertia is that of
 # Förster, "System identification of the Crazyflie 2.0", ETH Zurich 2015, which is also where the thrust coefficient
 # comes from (as quoted by gsilano/CrazyS, rotors_description/urdf/crazyflie2.xacro). Thrust limit: CrazyMARL (arXiv
-# 2509.14126). Motor lag: viktorlorentz/crazyMARL, crazymarl/configs/multi_quad_config.py, motor_tau 0.15 with "time
-# constant is T/4" beside it. Idle speed: stated by none of them, assumed zero. Rotor radius:
-# utiasDSL/gym-pybullet-drones, gym_pybullet_drones/assets/cf2x.urdf, prop_radius; likewise below.
+# 2509.14126), whose episodes draw 0.105 to 0.15 N. Motor lag: assumed. 0.15/4 s is a value that
+# viktorlorentz/crazyMARL keeps as a comment (crazymarl/configs/multi_quad_config.py); it lies between CrazyS, 0.0125 s
+# up and 0.025 s down, the numbers of RotorS' hummingbird, and those for which this controller is too slow: 0.15 s, with
+# which CrazyMARL and arplaboratory/learning-to-fly train, and 0.145 s of `crazyflie_id`, identified. docs/vehicles.md
+# says what the choice does. Idle speed: stated by none of them, assumed zero. Rotor radius: utiasDSL/gym-pybullet-
+# drones, gym_pybullet_drones/assets/cf2x.urdf; likewise below. Rotor inertia: drone-models (see below), cf2x_P250.
 _CRAZYFLIE = Vehicle(
     name="crazyflie",
     mass=0.034,
@@ -119,11 +127,14 @@ _CRAZYFLIE = Vehicle(
     rotor_thrust_max=0.14,
     drag=(0.0, 0.0, 0.0),
     rotor_radius=2.31348e-2,
+    rotor_inertia=26.97e-9,
 )
 
 # Identified from flights of a Crazyflie 2.x with L250 propellers: learnsyslab/drone-models,
 # drone_models/data/params.toml, section cf2x_L250 (read in the copy Synetic-Labs/drone-models): mass, J, L (per axis),
-# thrust2torque, rotor_dyn_coef_simple 6.8867 s⁻¹ for either direction, thrust_min, thrust_max, drag_matrix. Its thrust
+# thrust2torque, rotor_dyn_coef_simple 6.8867 s⁻¹ for either direction, thrust_min, thrust_max, drag_matrix,
+# prop_inertia (of which it says "seems off"; its other propellers have 27 and 39e-9). Its prop_radius is 0.02355 m,
+# marked to be checked. Its thrust
 # 2.45829e-10 r² - 5.3822e-7 r newtons at r rev/min has a linear part that b ω² has not: b is chosen such that both
 # agree at hover, 1986 rad/s.
 _CRAZYFLIE_ID_THRUST = 1.982941e-8
@@ -140,6 +151,7 @@ _CRAZYFLIE_ID = Vehicle(
     rotor_thrust_max=0.12,
     drag=(0.01471782, 0.01471782, 0.01277641),
     rotor_radius=2.31348e-2,
+    rotor_inertia=34.52e-9,
 )
 
 
@@ -151,8 +163,9 @@ def _rotor_drag(mass: float, thrust_coefficient: float, coefficient: float) -> t
 
 # ethz-asl/rotors_simulator, rotors_description/urdf/hummingbird.xacro: body and rotors, + layout, the front rotor turns
 # clockwise (its reaction torque is counter-clockwise). Inertia as its controller takes it for all of 0.716 kg. No idle
-# speed. Drag of the rotors linear in their speed, taken at hover; the rolling moment (1e-6) is
-# off: its sign there does not follow the rotor's, see docs/air.md.
+# speed. Drag of the rotors linear in their speed, taken at hover; the rolling moment (1e-6) is off: its sign there does
+# not follow the rotor's, see docs/air.md. Rotor inertia: of its cuboid, 9 g and 15 mm wide, but 2 R long; there it is
+# R long, which makes it a quarter of that (and ten times as heavy, because Gazebo turns it at a tenth of its speed).
 _HUMMINGBIRD_MASS = 0.68 + 4 * 0.009
 _HUMMINGBIRD = Vehicle(
     name="hummingbird",
@@ -167,13 +180,15 @@ _HUMMINGBIRD = Vehicle(
     rotor_thrust_max=8.54858e-6 * 838.0**2,
     drag=_rotor_drag(_HUMMINGBIRD_MASS, 8.54858e-6, 8.06428e-5),
     rotor_radius=0.1,
+    rotor_inertia=0.009 * (0.2**2 + 0.015**2) / 12,
     rotor_azimuth=(0.0, float(np.pi / 2), float(np.pi), float(3 * np.pi / 2)),
 )
 
 # PX4/PX4-SITL_gazebo-classic, models/iris/iris.sdf.jinja: body 1.5 kg, rotors 5 g each, IMU 15 g, GPS 10 g. Its front
 # rotors stand at (0.13, ± 0.22) m, its back ones at (-0.13, ± 0.20) m; symmetric here, at 0.21 m, so that equal thrusts
 # balance. Pegasus' iris has the same b and speed limit (PegasusSimulator, .../thrusters/quadratic_thrust_curve.py), no
-# lag and another torque ratio. No idle speed. Drag as above.
+# lag and another torque, 1e-6 ω² N m, three times as large. No idle speed. Drag as above. Rotor inertia: a tenth of its
+# izz, which is ten times too large because Gazebo turns it at a tenth of its speed.
 _IRIS_MASS = 1.5 + 4 * 0.005 + 0.015 + 0.01
 _IRIS_FRONT = float(np.arctan2(0.21, 0.13))
 _IRIS = Vehicle(
@@ -189,6 +204,7 @@ _IRIS = Vehicle(
     rotor_thrust_max=5.84e-6 * 1100.0**2,
     drag=_rotor_drag(_IRIS_MASS, 5.84e-6, 1.75e-4),
     rotor_radius=0.128,
+    rotor_inertia=2.74004e-4 / 10,
     rotor_azimuth=(_IRIS_FRONT, float(np.pi) - _IRIS_FRONT, float(np.pi) + _IRIS_FRONT, float(2 * np.pi) - _IRIS_FRONT),
 )
 

@@ -14,7 +14,7 @@ from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
-from multilift_marl.math3d import add, clip, mat, mul, norm, put, row, scale, sub, tmul, vec
+from multilift_marl.math3d import add, clip, cross, mat, matrow, mul, norm, put, row, scale, sub, tmul, vec
 from multilift_marl.sim.air import AIR_DENSITY, air_moment, ground_gain, spread_wash
 from multilift_marl.sim.gusts import blow
 from multilift_marl.sim.parameters import lag_shares
@@ -35,6 +35,7 @@ class Constants(NamedTuple):
     thrust_coefficient: np.ndarray
     """(N,), likewise the next ones."""
     torque_ratio: np.ndarray
+    rotor_inertia: np.ndarray
     speed_min: np.ndarray
     speed_max: np.ndarray
     rising: np.ndarray
@@ -49,6 +50,8 @@ class Constants(NamedTuple):
     """Whether the payload has a torque beside it, which chains add to."""
     drone_loads: np.ndarray
     """(N,) offsets of the drones' forces and torques."""
+    center_varies: bool
+    """Whether the payload's centre of mass may be off the origin of its free joint."""
 
 
 def make_constants(system: System, layout: Layout, batch: Batch) -> Constants:
@@ -62,6 +65,7 @@ def make_constants(system: System, layout: Layout, batch: Batch) -> Constants:
         rotor_spin=np.array([vehicle.rotor_spin for vehicle in vehicles], float),
         thrust_coefficient=np.array([vehicle.thrust_coefficient for vehicle in vehicles]),
         torque_ratio=np.array([vehicle.torque_ratio for vehicle in vehicles]),
+        rotor_inertia=np.array([vehicle.rotor_inertia for vehicle in vehicles], float),
         speed_min=np.array([vehicle.rotor_speed_min for vehicle in vehicles], float),
         speed_max=np.array([vehicle.rotor_speed_max for vehicle in vehicles]),
         rising=np.array([lag_shares(h / vehicle.rotor_time_constant_up) for vehicle in vehicles]),
@@ -70,6 +74,7 @@ def make_constants(system: System, layout: Layout, batch: Batch) -> Constants:
         force=force,
         payload_turns=layout.payload_nv == 6,
         drone_loads=force + layout.payload_nv + 6 * np.arange(system.num_drones),
+        center_varies="payload_center_of_mass" in system.varied,
     )
 
 
@@ -78,9 +83,10 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
     """Advance the rotors by one physics step and write the loads of that step into `batch.state`.
 
     The rotor speed follows its command with a first-order lag, one for rising and one for falling. The thrust applied
-    is the exact mean of b ω² over the step, so the impulse is exact. Reaction torque is κ f (report eqs 5-8), drag of
-    a drone is linear in its velocity through the air along its body axes (Faessler 2018), drag of the payload
-    quadratic. What else the air does, if switched on, is in `air.py`.
+    is the exact mean of b ω² over the step, so the impulse is exact. Reaction torque is κ f (report eqs 5-8). Rotors
+    with `rotor_inertia` also exert the torque that changes their speed and that which turns their axes. Drag of a
+    drone is linear in its velocity through the air along its body axes (Faessler 2018), drag of the payload quadratic.
+    What else the air does, if switched on, is in `air.py`.
 
     Args:
         rows: `batch.state` of environments lo to hi.
@@ -90,7 +96,7 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
         c: Constants.
         air, flow: Air of all environments and AirConstants; both None where all of it is off, for which Numba compiles
             a version without it.
-        varied: Varied of all environments; None where rotors and drag are nominal.
+        varied: Varied of all environments; None where the payload's centre of mass, rotors and drag are nominal.
     """
     for e in range(lo, hi):
         line = rows[e - lo]
@@ -102,6 +108,7 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
                 spread_wash(e, state, air, flow)
         for n in range(thrust.shape[1]):
             total, mx, my, mz, power = 0.0, 0.0, 0.0, 0.0, 0.0
+            turning, change = 0.0, 0.0  # sums over the rotors, against body z: mean speed, and its growth in the step
             b, kappa = c.thrust_coefficient[n], c.torque_ratio[n]
             slowest, fastest = c.speed_min[n], c.speed_max[n]
             rising, falling, drag = row(c.rising, n), row(c.falling, n), row(c.drag, n)
@@ -124,6 +131,8 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
                 mx += c.rotor_positions[n, k, 1] * f
                 my -= c.rotor_positions[n, k, 0] * f
                 mz += c.rotor_spin[n, k] * kappa * f
+                turning += c.rotor_spin[n, k] * (target + gap * mean_first)
+                change += c.rotor_spin[n, k] * (after - before)
                 power += kappa * f * 0.5 * (before + after)
             attitude = mat(state.drone_rotation, e, n)
             here = wind
@@ -140,7 +149,10 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
             if varied is not None:
                 through = scale(varied.drag[e, n], through)
             body = (-drag[0] * through[0], -drag[1] * through[1], total - drag[2] * through[2])
-            torque = (mx, my, mz)
+            # The rotors' angular momentum is h = -J turning e3; the drone feels -dh/dt - Ω × h, the mean over the step.
+            p, q, _ = vec(state.drone_body_rates, e, n)
+            spin = c.rotor_inertia[n] * turning
+            torque = (mx + spin * q, my - spin * p, mz + c.rotor_inertia[n] * change / c.timestep)
             at = c.drone_loads[n]
             put(line[at : at + 3], mul(attitude, body))
             put(line[at + 3 : at + 6], torque)
@@ -148,10 +160,19 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
         here = wind
         if flow is not None:
             here = add(wind, vec(air.wash, e, thrust.shape[1]))
-        through = sub(row(state.payload_velocity, e), here)
+        velocity = row(state.payload_velocity, e)
+        if varied is not None and c.center_varies:
+            # The true centre of mass is at `center` from the origin of the free joint, where the state is counted.
+            attitude, center = matrow(state.payload_rotation, e), row(varied.payload_center_of_mass, e)
+            velocity = add(velocity, mul(attitude, cross(row(state.payload_body_rates, e), center)))
+        through = sub(velocity, here)
         drag = scale(-c.payload_drag * norm(through), through)
         if varied is not None:
             drag = scale(varied.payload_drag[e], drag)
-        put(line[c.force : c.force + 3], add(drag, row(plant.payload_force, e)))
-        if c.payload_turns:
+        force = add(drag, row(plant.payload_force, e))
+        put(line[c.force : c.force + 3], force)
+        if varied is not None and c.center_varies:
+            # Drag and hidden force act at the centre of mass: about the origin that is a torque, too (body frame).
+            put(line[c.force + 3 : c.force + 6], cross(center, tmul(attitude, force)))
+        elif c.payload_turns:
             put(line[c.force + 3 : c.force + 6], (0.0, 0.0, 0.0))

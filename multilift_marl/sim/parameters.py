@@ -48,13 +48,14 @@ CONFIGURED = (  # cost something in every step, so they may only differ where th
     "payload_center_of_mass", "payload_drag", "vehicle_thrust_coefficient", "vehicle_rotor_time_constant",
     "vehicle_drag",
 )  # fmt: skip
-_ROTORS = frozenset(CONFIGURED[1:])
 _MASSES = frozenset(("payload_mass", "payload_inertia", "payload_center_of_mass", "vehicle_mass"))
 
 
 class Varied(NamedTuple):
-    """What the loops over physics steps need of them, where rotors or drag vary at all."""
+    """What the loops over physics steps need of them, where centres of mass, rotors or drag vary at all."""
 
+    payload_center_of_mass: np.ndarray
+    """(E, 3) from the nominal one, payload frame [m]."""
     payload_drag: np.ndarray
     """(E,) [-] over nominal."""
     thrust: np.ndarray
@@ -90,12 +91,18 @@ def lag_shares(h: float) -> tuple[float, float, float]:
 
 
 def make_varied(system: System, parameters: Parameters) -> Varied | None:
-    """Return what the loops need, None where neither rotors nor drag vary."""
-    if not _ROTORS & system.varied:
+    """Return what the loops need, None where neither the payload's centre of mass nor rotors nor drag vary."""
+    if not system.varied.intersection(CONFIGURED):
         return None
     e, n = parameters.vehicle_mass.shape
-    drag, thrust = parameters.vehicle_drag, parameters.vehicle_thrust_coefficient
-    varied = Varied(parameters.payload_drag, thrust, drag, np.zeros((e, n, 3)), np.zeros((e, n, 3)))
+    varied = Varied(
+        payload_center_of_mass=parameters.payload_center_of_mass,
+        payload_drag=parameters.payload_drag,
+        thrust=parameters.vehicle_thrust_coefficient,
+        drag=parameters.vehicle_drag,
+        rising=np.zeros((e, n, 3)),
+        falling=np.zeros((e, n, 3)),
+    )
     write_lags(varied, system, parameters, np.ones(e, bool))
     return varied
 

@@ -11,11 +11,11 @@ class SystemState(NamedTuple):
     """The physical state (float64, SI units; world z up, body x forward, y left, z up)."""
 
     payload_position: np.ndarray
-    """(E, 3) centre of mass, world frame [m]."""
+    """(E, 3) centre of mass as configured, a fixed point of the payload, world frame [m]."""
     payload_rotation: np.ndarray
     """(E, 3, 3) body to world; of a point payload what a task has set, without effect."""
     payload_velocity: np.ndarray
-    """(E, 3) world frame [m/s]."""
+    """(E, 3) of that point, world frame [m/s]."""
     payload_body_rates: np.ndarray
     """(E, 3) body frame [rad/s]."""
     drone_position: np.ndarray
@@ -51,7 +51,7 @@ class Plant(NamedTuple):
     payload_mass: np.ndarray
     """(E,) [kg]."""
     payload_force: np.ndarray
-    """(E, 3) constant external force on the payload's centre of mass, world frame [N]."""
+    """(E, 3) constant external force on the payload's true centre of mass, world frame [N]."""
     wind: np.ndarray
     """(E, 3) air velocity, world frame [m/s]."""
     motors_off: np.ndarray
