@@ -61,7 +61,9 @@ def sample_spline(table: np.ndarray, t: np.ndarray) -> np.ndarray:
     )
 
 
-def _quintic(p0, v0, a0, p1, v1, a1, h):
+def _quintic(
+    p0: np.ndarray, v0: np.ndarray, a0: np.ndarray, p1: np.ndarray, v1: np.ndarray, a1: np.ndarray, h: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the coefficients of the third to fifth power of a quintic, from its values at both ends of a time h."""
     gap = p1 - p0 - v0 * h - 0.5 * a0 * h * h
     speed = (v1 - v0 - a0 * h) * h
@@ -69,7 +71,7 @@ def _quintic(p0, v0, a0, p1, v1, a1, h):
     return 10.0 * gap - 4.0 * speed + 0.5 * bend, -15.0 * gap + 7.0 * speed - bend, 6.0 * gap - 3.0 * speed + 0.5 * bend
 
 
-_compiled_quintic = kernel(_quintic)
+_compiled_quintic = kernel(_quintic)  # the same of numbers
 
 
 @kernel
