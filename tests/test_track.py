@@ -108,11 +108,12 @@ def test_a_path_forgets_the_form_of_the_last_episode():
 
 def test_rmse_counts_from_a_chosen_time():
     flown = {}
-    for begin in (0.0, 2.0):
+    for begin in (0.0, 2.0, 3.0):
         options = {"env.num_threads": 1, "env.episode_seconds": 3.0, "task_options.rmse_from": begin}
         config = load_config("track", options)
         flown[begin] = fly_episodes(config, partial(make_scripted, "formation_lead"), 2, seed=0)["payload_rmse_m"]
     assert (flown[0.0] > 1.5 * flown[2.0]).all()  # teams start up to 10 cm off
+    assert (flown[0.0] == flown[3.0]).all()  # an episode that is no longer counts as a whole
 
 
 def test_a_range_that_falls_is_refused():

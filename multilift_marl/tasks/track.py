@@ -102,7 +102,8 @@ class Track(Task):
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
-        self.seconds, self.rmse_after = config.env.episode_seconds, self.options.rmse_from
+        self.seconds = config.env.episode_seconds
+        self.rmse_after = self.options.rmse_from if self.options.rmse_from < self.seconds else 0.0
         file, spacing = self._file(), self.options.file_spacing
         table = load_path(file, spacing, world.system, config.randomization) if file else NO_FILE
         self.path, self.worst = Path.zeros(world.num_envs, table), np.zeros(world.num_envs)
