@@ -161,7 +161,7 @@ def test_commands_of_documents_run_in_order(tmp_path):
             continue  # other module commands, such as pytest itself; what would rewrite what tests compare
         if not script.startswith("-"):
             command = command.replace(script, str(ROOT / script), 1)
-        command = command.replace("python", sys.executable, 1)
+        command = command.replace("python", sys.executable, 1).replace("=examples/", f"={ROOT}/examples/")
         if script == "train.py" and "resume" not in command:
             command += f" {short}"
         if script == "evaluate.py":

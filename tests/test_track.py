@@ -12,7 +12,7 @@ from multilift_marl.control.scripted import make_scripted
 from multilift_marl.evaluation.rollout import fly_episodes
 from multilift_marl.tasks.paths import PATHS, RAMP, motion, own_time
 
-KINDS = pytest.mark.parametrize("kind", PATHS)
+KINDS = pytest.mark.parametrize("kind", [path for path in PATHS if path != "file"])  # that one: test_path_file.py
 
 
 def track(kind: str | list[str] = "figure8", num_envs: int = 2, **keywords):
@@ -91,6 +91,29 @@ def test_each_episode_draws_from_ranges_and_forms():
     ):  # fmt: skip
         span = high - low
         assert low * 0.999 <= drawn.min() < low + 0.2 * span and high - 0.2 * span < drawn.max() <= high * 1.001
+
+
+def test_a_path_forgets_the_form_of_the_last_episode():
+    vec = track(["figure8", "circle"], num_envs=8)
+    for _ in range(20):
+        for _ in range(150):
+            vec.step(zeros(vec))
+        vec.reset()
+        eights = vec.task.path.kind == PATHS.index("figure8")
+        assert (vec.task.goal.drone_yaw_rate[eights] == 0).all()
+        if eights.any() and not eights.all():
+            return
+    raise AssertionError("no episode changed its form")
+
+
+def test_rmse_counts_from_a_chosen_time():
+    flown = {}
+    for begin in (0.0, 2.0, 3.0):
+        options = {"env.num_threads": 1, "env.episode_seconds": 3.0, "task_options.rmse_from": begin}
+        config = load_config("track", options)
+        flown[begin] = fly_episodes(config, partial(make_scripted, "formation_lead"), 2, seed=0)["payload_rmse_m"]
+    assert (flown[0.0] > 1.5 * flown[2.0]).all()  # teams start up to 10 cm off
+    assert (flown[0.0] == flown[3.0]).all()  # an episode that is no longer counts as a whole
 
 
 def test_a_range_that_falls_is_refused():

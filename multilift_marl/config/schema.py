@@ -5,8 +5,9 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from multilift_marl.config.files import pin_files
 from multilift_marl.config.values import (
     Delays,
     Drag,
@@ -224,7 +225,9 @@ class TrainConfig(Section):
     target_kl: Float = Field(0.03, gt=0, description="[-] approximate KL that ends an update early")
     hidden: tuple[Annotated[Int, Field(ge=1)], ...] = Field((64, 64), description="[-] widths of the hidden layers")
     initial_std: Float = Field(0.12, gt=0, description="[-] of the action distribution at the start")
-    overrides: dict[str, Any] = Field({}, description="of the environment that it trains in, by dotted name")
+    overrides: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field(
+        {}, description="of the environment that it trains in, by dotted name"
+    )
     threads: Int = Field(2, ge=1, description="threads of the update; weights are bit-equal for the same number")
     checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
 
@@ -250,7 +253,7 @@ class Config(Section):
     randomization: RandomizationConfig = RandomizationConfig()
     wind: WindConfig = WindConfig()
     reward: dict[str, Float] = Field({}, description="weights of the task's reward terms")
-    task_options: dict[str, Any] = Field({}, description="options of the task")
+    task_options: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field({}, description="options of the task")
     train: TrainConfig = TrainConfig()
     eval: EvalConfig = EvalConfig()
 

@@ -96,7 +96,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
         total += running * reward.mean(axis=1, dtype=np.float64)
         length += running
         change += running * ((np.clip(action, -1, 1) - previous) ** 2).mean(axis=(1, 2))
-        if (step + 1) * dt > vec.task.RMSE_AFTER:
+        if (step + 1) * dt > vec.task.rmse_after:
             square += running * _along_axes(vec) ** 2
             counted += running
         settling = np.where(running & (errors.distance > SETTLED), (step + 1) * dt, settling)

@@ -58,7 +58,6 @@ class Task:
         REWARD: default weight of every reward term; `reward.<term>` overrides.
         EXTRA: what its observations have beside the common components.
         EXTRA_STATE: how many numbers it adds to the global state.
-        RMSE_AFTER: time from which `payload_rmse_m` counts [s].
         LEAST_DRONES: with fewer it makes no sense.
         KEPT: names of further arrays, environment first, that outlive a step.
 
@@ -82,6 +81,7 @@ class Task:
         min_separation: smallest distance between drones in the episode (E,) [m].
         watch: failures that do not count for now.
         time: since the start, for tasks with a plan (E,) [s].
+        rmse_after: time from which errors count for `payload_rmse_m` [s].
         seen: the state as the drones are told it, for observers; live arrays.
         hanging: numbers of a hanging team; in `start`, the true ones of the environment, else nominal.
         nominal_hanging: always nominal, for goals.
@@ -96,7 +96,6 @@ class Task:
     REWARD: ClassVar[dict[str, float]] = {}
     EXTRA: ClassVar[tuple[Component, ...]] = ()
     EXTRA_STATE: ClassVar[int] = 0
-    RMSE_AFTER: ClassVar[float] = 0.0
     LEAST_DRONES: ClassVar[int] = 1
     KEPT: ClassVar[tuple[str, ...]] = ()
 
@@ -121,6 +120,7 @@ class Task:
         self.cause, self.good_time = np.zeros(e, np.int64), np.zeros(e)
         self.min_separation, self.time = np.zeros(e), np.zeros(e)
         self.watch = Watch.zeros(e, n)
+        self.rmse_after = 0.0
         self.terms = np.zeros((e, len(self.REWARD)))
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:

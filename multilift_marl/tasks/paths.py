@@ -1,7 +1,8 @@
-"""Paths that a payload is to follow: circle, figure-eight, lemniscate, helix, and smooth random ones.
+"""Paths that a payload is to follow: circle, figure-eight, lemniscate, helix, smooth random ones, and those of files.
 
 A path is a curve over its own time τ, turned by a heading and moved to a centre; it starts at rest: τ runs slower than
-time at first, smoothly to the third derivative. Velocity, acceleration and jerk are central differences of five points.
+time at first, smoothly to the third derivative. The path of a file is flown as it is written, in its own time, neither
+turned nor moved. Velocity, acceleration and jerk are central differences of five points.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.math3d import add, put, row, scale, sub, turn
+from multilift_marl.tasks.spline import NO_FILE, spline_place
 
-PATHS = ("circle", "figure8", "lemniscate", "helix", "random")
-CIRCLE, FIGURE8, LEMNISCATE, HELIX, RANDOM = range(len(PATHS))
+PATHS = ("circle", "figure8", "lemniscate", "helix", "random", "file")
+CIRCLE, FIGURE8, LEMNISCATE, HELIX, RANDOM, FILE = range(len(PATHS))
 RAMP = 2.0  # [s] from rest to full speed
 WAYPOINTS = 12  # of a random path, with the first and the last
 STEP = 0.01  # [s] between the places that are differentiated
@@ -38,13 +40,16 @@ class Path(NamedTuple):
     """(E,) half the height that a helix goes up and down [m]."""
     curve: np.ndarray
     """(E, WAYPOINTS, 2, 3) way-points of a random path and the second derivatives of its spline there."""
+    table: np.ndarray
+    """(K, 13) spline through the rows of a file, the same for all environments; see `spline.fit_spline`."""
 
     @classmethod
-    def zeros(cls, num_envs: int) -> Path:
-        """Return paths that stay where they are."""
+    def zeros(cls, num_envs: int, table: np.ndarray = NO_FILE) -> Path:
+        """Return paths that stay where they are, and the spline of a file."""
         e = num_envs
         shapes = ((e, 3), (e,), (e,), (e,), (e,), (e, WAYPOINTS, 2, 3))
-        return cls(np.zeros(e, np.int64), *(np.zeros(shape) for shape in shapes))
+        arrays = [np.zeros(shape) for shape in shapes]
+        return cls(np.zeros(e, np.int64), *[*arrays, table])
 
 
 @kernel
@@ -57,7 +62,10 @@ def own_time(t):
 @kernel
 def place(e, t, path):
     """Return where the path of environment e is t seconds after the start [m]."""
-    kind, a, angle = path.kind[e], path.size[e], path.rate[e] * own_time(t)
+    kind = path.kind[e]
+    if kind == FILE:
+        return spline_place(path.table, t)
+    a, angle = path.size[e], path.rate[e] * own_time(t)
     if kind == CIRCLE:
         at = (a * cos(angle), a * sin(angle), 0.0)
     elif kind == FIGURE8:

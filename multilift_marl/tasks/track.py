@@ -13,19 +13,24 @@ from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config
 from multilift_marl.config.values import Choice, Float, Section, Span, Vector
 from multilift_marl.control.formation import Reference, face, place_formation
-from multilift_marl.math3d import add, matrow, norm, put, putmat, rot_z, row, sub, turn
+from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import add, matrow, norm, put, putmat, rot_z, row, scale, sub, turn, vec
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.path_file import load_path
 from multilift_marl.tasks.paths import (
     CIRCLE,
     FIGURE8,
+    FILE,
     HELIX,
     LEMNISCATE,
     PATHS,
     RAMP,
     RANDOM,
+    STEP,
     Path,
+    differences,
     draw_curve,
     largest_rates,
     motion,
@@ -33,6 +38,7 @@ from multilift_marl.tasks.paths import (
     place,
     set_goal,
 )  # fmt: skip
+from multilift_marl.tasks.spline import NO_FILE, spline_yaw
 from multilift_marl.tasks.starts import hang_team, in_ball
 from multilift_marl.tasks.terms import mean_change, tolerance
 
@@ -40,14 +46,20 @@ AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
 _DRAWN = 400  # points of a path that is drawn
 
 
-Form = Literal["circle", "figure8", "lemniscate", "helix", "random"]
+Form = Literal["circle", "figure8", "lemniscate", "helix", "random", "file"]
 
 
 class TrackOptions(Section):
     """The path, drawn for each episode where it is given as a list of forms or a range, and what counts as success."""
 
     path: Annotated[tuple[Form, ...], Choice] = Field(
-        ("figure8",), min_length=1, description="its form: circle, figure8, lemniscate, helix, random, or some to draw"
+        ("figure8",),
+        min_length=1,
+        description="its form: circle, figure8, lemniscate, helix, random, file, or some to draw from",
+    )
+    file: str | None = Field(None, description="of path=file: CSV, .npy or .npz with t [s], x, y, z [m], yaw [rad]")
+    file_spacing: Float = Field(
+        0.1, ge=0, description="[s] closer rows of a file are smoothed and thinned out to this; 0: none are"
     )
     speed: Span = Field((1.0, 1.0), description="[m/s] peak speed v of figure8, lemniscate and random, or its range")
     acceleration: Span = Field((0.5, 0.5), description="[m/s²] their peak acceleration a, or its range")
@@ -58,6 +70,7 @@ class TrackOptions(Section):
     height: Float = Field(2.0, gt=0, description="[m] of the path's centre")
     start_radius: Float = Field(0.1, ge=0, description="[m] start within a ball of this radius about the path's start")
     success_distance: Float = Field(0.5, gt=0, description="[m] payload never farther than this from its target")
+    rmse_from: Float = Field(5.0, ge=0, description="[s] errors count for payload_rmse_m from this time on")
 
 
 class Track(Task):
@@ -85,16 +98,33 @@ class Track(Task):
         ),
     )
     EXTRA_STATE: ClassVar[int] = 6 + 3 * len(AHEAD)
-    KEPT: ClassVar[tuple[str, ...]] = ("worst", *(f"path.{name}" for name in Path._fields))
-    RMSE_AFTER: ClassVar[float] = 5.0
+    KEPT: ClassVar[tuple[str, ...]] = ("worst", *(f"path.{name}" for name in Path._fields if name != "table"))
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
         self.seconds = config.env.episode_seconds
-        self.path, self.worst = Path.zeros(world.num_envs), np.zeros(world.num_envs)
+        self.rmse_after = self.options.rmse_from if self.options.rmse_from < self.seconds else 0.0
+        file, spacing = self._file(), self.options.file_spacing
+        table = load_path(file, spacing, world.system, config.randomization) if file else NO_FILE
+        self.path, self.worst = Path.zeros(world.num_envs, table), np.zeros(world.num_envs)
+
+    def _file(self) -> str:
+        """Return the reference to the file that is flown, "" if none is; a ConfigError if the options disagree."""
+        forms, file = self.options.path, self.options.file
+        if "file" in forms and not file:
+            raise ConfigError("task_options.path=file needs the path of one; set task_options.file=<path>")
+        if file and "file" not in forms:
+            raise ConfigError(
+                f"task_options.file is given, but task_options.path={','.join(forms)} does not fly it; set "
+                "task_options.path=file, or task_options.file=null"
+            )
+        return file or ""
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
-        """Draw heading, form and figures of the path; the team hangs at its start. See `Task.start`."""
+        """Draw heading, form and figures of the path; the team hangs at its start. See `Task.start`.
+
+        The path of a file has its own heading and place.
+        """
         option, path = self.options, self.path
         heading = rng.uniform(-pi, pi)
         form = option.path[rng.integers(len(option.path))] if len(option.path) > 1 else option.path[0]
@@ -107,7 +137,7 @@ class Track(Task):
             path.size[env], path.rate[env] = 1.0625 * v**2 / a, 0.6655 * a / v
         elif kind == LEMNISCATE:  # Bernoulli's: peak speed A ω and acceleration 3 A ω² at the ends
             path.size[env], path.rate[env] = 3 * v**2 / a, a / (3 * v)
-        else:
+        elif kind == RANDOM:
             path.curve[env] = draw_curve(rng, np.array(option.room))
             fastest, hardest = largest_rates(path.curve[env])
             path.rate[env] = min(v / fastest, sqrt(a / hardest))
@@ -127,7 +157,10 @@ class Track(Task):
         """Return the path, one round of it if it repeats; see `Task.route`."""
         points, kind = np.zeros((_DRAWN, 3)), self.path.kind[env]
         turns = 4 if kind == HELIX else 1
-        lap = np.inf if kind == RANDOM else turns * 2 * pi / self.path.rate[env] + RAMP / 2  # half the ramp is lost
+        if kind == FILE:
+            lap = float(self.path.table[-1, 0])
+        else:
+            lap = np.inf if kind == RANDOM else turns * 2 * pi / self.path.rate[env] + RAMP / 2  # half the ramp is lost
         _trace(env, min(self.seconds, lap), self.path, points)
         return points
 
@@ -152,8 +185,12 @@ def _draw(rng: np.random.Generator, span: tuple[float, float]) -> float:
 def _start(e, rng, state, goal, rig, hanging, mass, path, height, radius):
     put(path.centre[e], (0.0, 0.0, 0.0))
     begin = place(e, 0.0, path)
-    put(path.centre[e], (-begin[0], -begin[1], height - begin[2]))  # every path starts above the origin
+    put(path.centre[e], (-begin[0], -begin[1], height - begin[2]))  # every path but a file's starts above the origin
     putmat(goal.rotation[e], rot_z(path.heading[e]))
+    goal.drone_yaw_rate[e] = 0.0  # the last episode may have been on a path of another form
+    for turning in (goal.slot_velocity, goal.slot_acceleration, goal.slot_jerk):
+        turning[e] = 0.0
+    goal.angular_velocity[e] = 0.0
     _aim(e, 0.0, path, goal, rig)
     moved = in_ball(rng, radius)
     payload = add(row(goal.position, e), moved)
@@ -164,10 +201,32 @@ def _start(e, rng, state, goal, rig, hanging, mass, path, height, radius):
 def _aim(e, t, path, goal, rig):
     """Write the goal of environment e at a time."""
     set_goal(e, motion(e, t, path), goal)
+    if path.kind[e] == FILE:
+        _turn_target(e, t, path.table, goal, rig)
+        return
     place_formation(e, goal, rig)
     if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
         face(e, path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi, goal, rig)
         goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
+
+
+@kernel
+def _turn_target(e, t, table, goal, rig):
+    """Write heading of the target of environment e by a file, and how its formation moves as it turns with it."""
+    before, after = spline_yaw(table, t - STEP), spline_yaw(table, t + STEP)
+    outer, last = spline_yaw(table, t - 2.0 * STEP), spline_yaw(table, t + 2.0 * STEP)
+    yaw, rate, change, jerk = differences(outer, before, spline_yaw(table, t), after, last)
+    w, dw, ddw = rate[0], change[0], jerk[0]
+    putmat(goal.rotation[e], rot_z(yaw[0]))
+    place_formation(e, goal, rig)
+    put(goal.angular_velocity[e], (0.0, 0.0, w))
+    goal.drone_yaw_rate[e] = w
+    for n in range(rig.slots.shape[0]):  # derivatives of a level arm that turns about the vertical
+        arm = sub(vec(goal.slots, e, n), row(goal.position, e))
+        level, across = (arm[0], arm[1], 0.0), (-arm[1], arm[0], 0.0)
+        put(goal.slot_velocity[e, n], scale(w, across))
+        put(goal.slot_acceleration[e, n], sub(scale(dw, across), scale(w * w, level)))
+        put(goal.slot_jerk[e, n], sub(scale(ddw - w**3, across), scale(3.0 * w * dw, level)))
 
 
 @kernel

@@ -1,0 +1,61 @@
+"""Files that a configuration refers to: absolute paths, with a hash of what they hold."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from multilift_marl.errors import ConfigError
+
+_MARK = "#sha256="
+_DIGITS = 16  # of the hash
+
+
+def pin_files(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return task options, or overrides of them, in which `file` is pinned; see `pin_file`."""
+    pinned = dict(values)
+    for key in ("file", "task_options.file"):
+        if isinstance(pinned.get(key), str):
+            pinned[key] = pin_file(pinned[key])
+    return pinned
+
+
+def pin_file(reference: str) -> str:
+    """Return the absolute path of a file with the hash of its content: "/home/me/path.csv#sha256=1f3a…".
+
+    A run folder or a checkpoint then names what was flown, wherever it is read. A reference that has a hash is returned
+    as it is; one of a file that is missing has none.
+    """
+    if _MARK in reference:
+        return reference
+    path = Path(reference).expanduser().resolve()
+    return f"{path}{_MARK}{_hash(path.read_bytes())}" if path.is_file() else str(path)
+
+
+def read_pinned(key: str, reference: str) -> tuple[Path, bytes]:
+    """Return the path and the content of a file that `pin_file` referred to.
+
+    Args:
+        key: of the configuration, for messages.
+        reference: what `pin_file` returned.
+
+    Raises:
+        ConfigError: the file is missing, or no longer holds what it held.
+    """
+    name, _, expected = reference.partition(_MARK)
+    path = Path(name)
+    if not path.is_file():
+        raise ConfigError(f"{key}={name} is missing; put the file back, or give the path of another by {key}=<path>")
+    content = path.read_bytes()
+    if expected and _hash(content) != expected:
+        raise ConfigError(
+            f"{key}={name} has changed since this configuration was made (its sha256 began with {expected}); put the "
+            f"old file back, or give {key}={name} anew to fly the new one"
+        )
+    return path, content
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:_DIGITS]
