@@ -61,6 +61,34 @@ def test_a_wide_gap_lets_the_formation_pass_and_succeed():
         _, _, terminated, _, info = vec.step(zeros(vec))
         assert not terminated.any()
     assert info["success"].all()
+    assert (1 < vec.task.peak_tension).all() and (vec.task.peak_tension < 1.5).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "option"),
+    [
+        ("payload_rotation", [[0, -1, 0], [1, 0, 0], [0, 0, 1]], {"success_angle": 91.0}),
+        ("payload_velocity", [0.15, 0, 0], {"success_speed": 0.2}),
+        ("payload_body_rates", [0, 0, 0.3], {"success_body_rate": 0.4}),
+        ("cable_tension", [20.0] * 4, {"success_tension": 6.0}),
+    ],
+    ids=["attitude", "speed", "body rate", "tension"],
+)
+def test_success_asks_for_rest_in_the_target_attitude(field, value, option):
+    for given, options in ((None, {}), (value, {}), (value, option)):
+        vec = reset(num_envs=1, start_radius=0.0, **options)
+        state, task = vec.world.state, vec.task
+        state.payload_rotation[0] = task.goal.rotation[0] = np.eye(3)
+        if given is not None:
+            getattr(state, field)[0] = given
+        task.planner(0, 1)()
+        task.time[0], task.goal.position[0] = 14.0, state.payload_position[0]
+        task.goal.rotation[0] = np.eye(3)
+        task.check(0, 1, 0.0)
+        score = task.scorer(0, 1, vec._action, vec._action)
+        for _ in range(51):
+            score()
+        assert task.succeeded()[0] == (given is None or bool(options))
 
 
 @pytest.mark.parametrize(
