@@ -24,7 +24,8 @@ SCRIPTS = {  # those of every task
     "formation", "formation_integral", "formation_feedback", "formation_gusts", "payload_geometric",
 }  # fmt: skip
 CONTRACT = {
-    "success_rate", "precise_rate", "payload_tilt_deg", "payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s",
+    "success_rate", "precise_rate", "payload_tilt_deg",
+    "payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s",
     "return", "cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j",
     "action_rate", "failure_ground_rate", "failure_diverged_rate",
 }  # fmt: skip

@@ -1,8 +1,14 @@
 """Task gate: the way through, what touches, and what drones are told."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from conftest import make, zeros
+
+from multilift_marl.config.load import load_config
+from multilift_marl.control.scripted import fitting_scripts, make_scripted
+from multilift_marl.evaluation.rollout import fly_episodes
 
 
 def reset(num_envs: int = 4, **options):
@@ -137,3 +143,10 @@ def test_drones_are_told_the_gap_and_their_room():
     room = 0.5 - np.abs(state.drone_position[..., 1] - task.gap_y) - reach
     np.testing.assert_allclose(observation[..., names.index("clearance_0")], room.clip(-0.5, 0.5), atol=1e-5)
     assert (room.min(axis=1) < -0.1).all()
+
+
+def test_a_formation_drawn_in_passes_level():
+    flown = fly_episodes(load_config("gate"), partial(make_scripted, "formation_narrow"), 16, seed=3)
+    assert flown["success_rate"].all()
+    assert flown["payload_position_error_m"].max() < 0.01 and flown["payload_attitude_error_deg"].max() < 0.5
+    assert "formation_narrow" not in fitting_scripts(make("hover", num_envs=1))

@@ -83,7 +83,7 @@ def test_drones_are_told_who_is_lost():
 def judge_held(degrees=0.0, speed=0.0, body_rate=0.0, tension=1.0, **options):
     """Return success of a payload that is held for 2 s after a loss, at its target, tilted and moving like this."""
     still = {"start_radius": 0.0, "start_speed": 0.0} | options
-    vec = make("loss", num_envs=1, num_drones=6, **{f"task_options.{key}": value for key, value in still.items()})
+    vec = make("loss_6", num_envs=1, **{f"task_options.{key}": value for key, value in still.items()})
     vec.reset(seed=0)
     state, task, angle = vec.world.state, vec.task, np.radians(degrees)
     turned = [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]

@@ -33,7 +33,7 @@ class LossOptions(StartOptions):
     success_body_rate: Float = Field(0.5, gt=0, description="[rad/s] ... and turning no faster than this ...")
     success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds, and ...")
     success_tension: Float = Field(
-        30.0, gt=1,
+        40.0, gt=1,
         description="[-] no cable's tension at any time, mean of a physics step, over its resting tension; the lost "
         "drone's does not count",
     )  # fmt: skip
