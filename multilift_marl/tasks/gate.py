@@ -95,6 +95,8 @@ class Gate(Task):
         "precision": 0.2,
         "clearance": 0.8,
         "velocity": 0.2,
+        "attitude": 0.2,
+        "stillness": 0.1,
         "action_rate": -0.05,
     }
     EXTRA: ClassVar[tuple[Component, ...]] = (
@@ -299,7 +301,9 @@ def _score(
         terms[e, 1] = weights[1] * tolerance(distance, 0.05)
         terms[e, 2] = weights[2] * passing
         terms[e, 3] = weights[3] * tolerance(slip, 0.2)
-        terms[e, 4] = weights[4] * mean_change(e, action, previous)
+        terms[e, 4] = weights[4] * tolerance(errors.angle[e], radians(6.0))
+        terms[e, 5] = weights[5] * tolerance(norm(row(state.payload_body_rates, e)), 0.3)
+        terms[e, 6] = weights[6] * mean_change(e, action, previous)
         good = time[e] >= arrival and is_at_rest(e, state, errors, bounds)
         good_time[e] = good_time[e] + dt if good else 0.0
         if cause[e] == 0 and _least_room(e, state, gates, bodies) < 0.0:
