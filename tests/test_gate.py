@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from conftest import make, zeros
+from conftest import make, refusal, zeros
 
 from multilift_marl.config.load import load_config
 from multilift_marl.control.scripted import fitting_scripts, make_scripted
@@ -149,4 +149,6 @@ def test_a_formation_drawn_in_passes_level():
     flown = fly_episodes(load_config("gate"), partial(make_scripted, "formation_narrow"), 16, seed=3)
     assert flown["success_rate"].all()
     assert flown["payload_position_error_m"].max() < 0.01 and flown["payload_attitude_error_deg"].max() < 0.5
-    assert "formation_narrow" not in fitting_scripts(make("hover", num_envs=1))
+    vec = make("hover", num_envs=1)
+    assert "formation_narrow" not in fitting_scripts(vec)
+    assert "formation_narrow is for gaps" in refusal(make_scripted, "formation_narrow", vec)

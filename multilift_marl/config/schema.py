@@ -205,9 +205,7 @@ class TrainConfig(Section):
         "formation_gusts",
         "formation_lead",
         "formation_narrow",
-    ] = Field(  # fmt: skip
-        "formation", description="script that an untrained policy flies and the learned one corrects"
-    )
+    ] = Field("formation", description="script that an untrained policy flies and the learned one corrects")
     frames: Int = Field(5_000_000, ge=1, description="environment steps in all")
     horizon: Int = Field(128, ge=1, description="steps of each environment between updates")
     epochs: Int = Field(4, ge=1, description="passes over each batch")

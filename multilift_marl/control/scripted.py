@@ -26,7 +26,7 @@ LEAD_TIME = 0.4  # [s] that a payload's acceleration follows a moved slot: the l
 LEAD_GAIN = 0.87  # [-] of what the acceleration asks for; RMSE is least at 0.81 for (2, 2), at 1 for (2, 4)
 
 
-NARROWING = 0.7  # [m] inward from the slots, of the 0.65 to 0.75 m that pass a gap of 1 m
+NARROWING = 0.7  # [m] inward from the slots; 0.5 to 0.7 m pass a gap of 1 m, at 0.8 m drones collide
 THRUST_SHARE = 0.8  # of its largest thrust, which a drone may need at rest after a loss
 RAMP = (1.0, 3.0)  # [s] after a loss until the slots set off, and that they take
 
@@ -180,6 +180,9 @@ class FormationNarrow(Formation):
 
     The constant is `NARROWING` times the cosine of the drone's own heading, which is 1 but for the noise. Velocity
     counts relative to the target's.
+
+    Raises:
+        ConfigError: the task tells of no gap.
     """
 
     GAINS = (
@@ -188,6 +191,13 @@ class FormationNarrow(Formation):
         ("payload_velocity", 0, 0, -0.3),
         ("payload_velocity", 1, 1, -0.3),
     )
+
+    def __init__(self, vec: MultiliftVec):
+        if not self.fits(vec):
+            raise ConfigError(
+                f"formation_narrow is for gaps, and task {vec.config.task} tells of none; take formation_feedback"
+            )
+        super().__init__(vec)
 
     @classmethod
     def fits(cls, vec: MultiliftVec) -> bool:
