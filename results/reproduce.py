@@ -2,31 +2,40 @@
 
   python results/reproduce.py train gate [seed ...]     train configs/gate.yaml; keep curve and weights in results/gate/
   python results/reproduce.py keep gate runs/<run>      the same of a run that is there already
-  python results/reproduce.py judge [flight ...]        1000 episodes of every learned team, the first 200 of them of
-                                                        every script -> results/<flight>/<team>.json
+  python results/reproduce.py judge [flight ...]        the same 1000 episodes of every learned team and every script
+                                                        -> results/<flight>/<team>.json, .npz; also <flight>/<team>
+                                                        for one team, workers=<processes> (as many as there are CPUs)
   python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
   python results/reproduce.py table                     the tables of README.md and docs/tasks.md
 
-Every number in those tables comes from these files; `judge` skips files that are there already.
+Every number in those tables comes from these files. `judge` skips teams whose files are there already, so it can be
+stopped and started again; delete the files of what has changed.
 """
 
 from __future__ import annotations
 
 import csv
 import json
+import multiprocessing
+import os
 import re
 import sys
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.control.scripted import SCRIPTED, fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.evaluation.metrics import summarize
+from multilift_marl.evaluation.metrics import bootstrap, summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
-EPISODES, SEED = {"learned": 1000, "script": 200}, 1000
+EPISODES, SEED = 1000, 1000
 FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
 AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
 FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
@@ -110,31 +119,73 @@ def keep(recipe: str, run: Path) -> None:
     strip_checkpoint(run / "checkpoints" / "best.pt", folder / "policy.pt")
 
 
-def judge(flights: list[str]) -> None:
-    """Fly what has not been flown yet."""
+class Job(NamedTuple):
+    """A team and what it flies."""
+
+    flight: str
+    team: str
+    weights: str
+    """Path of a learned team's; "" for a script."""
+
+    @property
+    def files(self) -> tuple[Path, Path]:
+        """Metrics, and success and error of each episode."""
+        folder = HERE / self.flight
+        return folder / f"{self.team}.json", folder / f"{self.team}.npz"
+
+    @property
+    def done(self) -> bool:
+        """Whether both files are there, for as many episodes."""
+        told, episodes = self.files
+        return episodes.is_file() and told.is_file() and json.loads(told.read_text("utf-8"))["episodes"] == EPISODES
+
+
+def judge(asked: list[str], workers: int) -> None:
+    """Fly what has not been flown yet, one team in each process at a time."""
+    jobs = [job for each in asked for job in list_jobs(*each.split("/", 1)) if not job.done]
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for told in as_completed([pool.submit(fly, job) for job in jobs]):
+            print(told.result(), flush=True)
+
+
+def list_jobs(flight: str, only: str = "") -> list[Job]:
+    """Return the teams that fly a flight, or the one called `only`."""
+    config = load_config(FLIGHTS[flight].config, FLIGHTS[flight].overrides)
+    scripts = fitting_scripts(MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1})))
+    weights = sorted((HERE / FLIGHTS[flight].recipe).glob("seed*/policy.pt"))
+    jobs = [*(Job(flight, name, "") for name in scripts), *(Job(flight, w.parent.name, str(w)) for w in weights)]
+    return [job for job in jobs if only in ("", job.team)]
+
+
+def fly(job: Job) -> str:
+    """Fly a team, write what it did, and return a line about it."""
     import torch
 
     from multilift_marl.agents.policy import load_policy
 
     torch.set_num_threads(1)  # for networks this small, more of them only wait for each other
-    for name in flights:
-        flight, folder = FLIGHTS[name], HERE / name
-        config = load_config(flight.config, flight.overrides)
-        probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
-        scripts = fitting_scripts(probe)
-        teams = {script: (lambda vec, script=script: make_scripted(script, vec)) for script in scripts}
-        for weights in sorted((HERE / flight.recipe).glob("seed*/policy.pt")):
-            policy = load_policy(weights)
-            teams[weights.parent.name] = policy.bind
-        for team, maker in teams.items():
-            path, episodes = folder / f"{team}.json", EPISODES["script" if team in scripts else "learned"]
-            if path.is_file() and json.loads(path.read_text(encoding="utf-8"))["episodes"] == episodes:
-                continue
-            told = summarize(fly_episodes(config, maker, episodes, SEED))
-            folder.mkdir(parents=True, exist_ok=True)
-            content = {"episodes": episodes, "seed": SEED, "config": flight.config, "overrides": flight.overrides}
-            path.write_text(json.dumps(content | {"metrics": told}, indent=1) + "\n", encoding="utf-8")
-            print(f"{name}, {team}: success {told['success_rate']['mean']:.1%}", flush=True)
+    flight = FLIGHTS[job.flight]
+    overrides = flight.overrides | {"env.num_threads": 1}
+    maker: Callable[[MultiliftVec], Any] = partial(make_scripted, job.team)
+    if job.weights:
+        policy = load_policy(job.weights)
+        scales = {f"control.{key}": getattr(policy.config.control, key) for key in ("max_offset", "max_yaw")}
+        maker, overrides = policy.bind, overrides | scales  # a full action means what it did in training
+    flown = fly_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
+    metrics, error = summarize(flown), flown[error_metric(flight)]
+    content = {"episodes": EPISODES, "seed": SEED, "config": flight.config, "overrides": flight.overrides}
+    told, episodes = job.files
+    told.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = episodes.with_suffix(".part.npz")  # a stopped process leaves no file that looks whole
+    np.savez_compressed(unfinished, success=flown["success_rate"], error=error.astype(np.float32))
+    told.write_text(json.dumps(content | {"metrics": metrics}, indent=1) + "\n", encoding="utf-8")
+    unfinished.replace(episodes)
+    return f"{job.flight}, {job.team}: success {metrics['success_rate']['mean']:.1%}, {100 * error.mean():.2f} cm"
+
+
+def error_metric(flight: Flight) -> str:
+    """Return the metric by which the teams of a flight are compared."""
+    return "payload_rmse_m" if flight.config.startswith("track") else "payload_position_error_m"
 
 
 def ship(recipes: list[str]) -> None:
@@ -146,18 +197,42 @@ def ship(recipes: list[str]) -> None:
 
 def table() -> str:
     """Return all flights as a Markdown table: success and error of each team, of learned ones the mean of all seeds."""
-    columns = ("learned", "training seeds", *SCRIPTED)
+    columns = ("learned", "training seeds", "learned - best script", *SCRIPTED)
     lines = [
         f"| | {' | '.join(columns)} | published |",
         f"|---|{'---|' * (len(columns) + 1)}",
     ]
     for name, flight in FLIGHTS.items():
-        error = "payload_rmse_m" if flight.config.startswith("track") else "payload_position_error_m"
         seeds = sorted((HERE / name).glob("seed*.json"))
-        scripts = [_cell([HERE / name / f"{script}.json"], error) for script in SCRIPTED]
-        cells = [_cell(seeds, error), str(len(seeds)), *scripts, flight.published]
+        scripts = [_cell([HERE / name / f"{script}.json"], error_metric(flight)) for script in SCRIPTED]
+        cells = [_cell(seeds, error_metric(flight)), str(len(seeds)), gain(name), *scripts, flight.published]
         lines.append(f"| {flight.title} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def gain(flight: str) -> str:
+    """Return what learned teams do better than the best script: success and error, paired by episode.
+
+    Of several training seeds each episode counts by its mean. The best script is that with the most successes, of
+    several the one with the least error. Learning gains if it succeeds more often, or errs less and succeeds no less
+    often, both beyond the 95 % intervals.
+    """
+    told = {path.stem: np.load(path) for path in sorted((HERE / flight).glob("*.npz")) if "." not in path.stem}
+    learned = [each for name, each in told.items() if name.startswith("seed")]
+    scripts = {name: each for name, each in told.items() if name in SCRIPTED}
+    if not learned or not scripts:
+        return "-"
+    best = min(scripts, key=lambda name: (-scripts[name]["success"].mean(), scripts[name]["error"].mean()))
+    parts, intervals = [], []
+    for key, unit, digits in (("success", "points", 1), ("error", "cm", 2)):
+        mean = np.mean([each[key].astype(float) for each in learned], axis=0)
+        difference = 100 * (mean - scripts[best][key].astype(float))
+        intervals.append(bootstrap(difference))
+        low, high = (f"{bound:+.{digits}f}" for bound in intervals[-1])
+        parts.append(f"{difference.mean():+.{digits}f} ({low} to {high}) {unit}")
+    (worse, better), (_, most) = intervals
+    gains = worse > 0 or (better >= 0 and most < 0)
+    return f"{', '.join(parts)}, {best}" + ("" if gains else "; **learning gains nothing**")
 
 
 def _cell(paths: list[Path], error: str) -> str:
@@ -190,7 +265,9 @@ def main(arguments: list[str]) -> None:
     elif what == "keep" and len(rest) == 2:
         keep(rest[0], Path(rest[1]))
     elif what == "judge":
-        judge(rest or list(FLIGHTS))
+        workers = [int(each.partition("=")[2]) for each in rest if each.startswith("workers=")]
+        flights = [each for each in rest if not each.startswith("workers=")]
+        judge(flights or list(FLIGHTS), workers[-1] if workers else len(os.sched_getaffinity(0)))
     elif what == "ship" and rest:
         ship(rest)
     elif what == "table":

@@ -24,7 +24,8 @@ SCRIPTS = {  # those of every task
     "formation", "formation_integral", "formation_feedback", "formation_gusts", "payload_geometric",
 }  # fmt: skip
 CONTRACT = {
-    "success_rate", "payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s",
+    "success_rate", "precise_rate", "payload_tilt_deg",
+    "payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s",
     "return", "cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j",
     "action_rate", "failure_ground_rate", "failure_diverged_rate",
 }  # fmt: skip
@@ -69,6 +70,24 @@ def test_summary_counts_failures_at_the_bound(flown):
     good = worse["payload_position_error_m"][3:].mean()
     assert summary["payload_position_error_m_successful"]["mean"] == pytest.approx(good)
     assert summary["payload_position_error_m"]["mean"] == pytest.approx((3 * 3.0 + 9 * good) / 12)
+
+
+def test_errors_without_failures_and_of_successes_stand_apart(flown):
+    mixed = {name: values.copy() for name, values in flown.items()}
+    mixed["success_rate"][:] = True
+    mixed["success_rate"][:4], mixed["failure_cause"][:3] = False, 1
+    summary, tilt = summarize(mixed), mixed["payload_tilt_deg"]
+    assert summary["payload_tilt_deg_held"]["mean"] == pytest.approx(tilt[3:].mean())
+    assert summary["payload_tilt_deg_successful"]["mean"] == pytest.approx(tilt[4:].mean())
+    mixed["failure_cause"][:] = 1
+    assert "payload_tilt_deg_held" not in summarize(mixed)
+
+
+def test_precise_episodes_err_by_a_centimetre_and_a_degree_at_most(flown):
+    near = (flown["payload_position_error_m"] <= 0.01) & (flown["payload_attitude_error_deg"] <= 1.0)
+    np.testing.assert_array_equal(flown["precise_rate"], near)
+    assert 0 < near.mean() < 1 and (flown["payload_tilt_deg"] <= flown["payload_attitude_error_deg"] + 1e-9).all()
+    assert summarize(flown)["precise_rate"] == {"mean": near.mean(), "ci95": list(wilson(int(near.sum()), 12))}
 
 
 def test_no_success_leaves_out_what_has_no_mean(flown):

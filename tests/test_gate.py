@@ -1,8 +1,14 @@
 """Task gate: the way through, what touches, and what drones are told."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from conftest import make, zeros
+from conftest import make, refusal, zeros
+
+from multilift_marl.config.load import load_config
+from multilift_marl.control.scripted import fitting_scripts, make_scripted
+from multilift_marl.evaluation.rollout import fly_episodes
 
 
 def reset(num_envs: int = 4, **options):
@@ -61,6 +67,34 @@ def test_a_wide_gap_lets_the_formation_pass_and_succeed():
         _, _, terminated, _, info = vec.step(zeros(vec))
         assert not terminated.any()
     assert info["success"].all()
+    assert (1 < vec.task.peak_tension).all() and (vec.task.peak_tension < 1.5).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "option"),
+    [
+        ("payload_rotation", [[0, -1, 0], [1, 0, 0], [0, 0, 1]], {"success_angle": 91.0}),
+        ("payload_velocity", [0.15, 0, 0], {"success_speed": 0.2}),
+        ("payload_body_rates", [0, 0, 0.3], {"success_body_rate": 0.4}),
+        ("cable_tension", [20.0] * 4, {"success_tension": 6.0}),
+    ],
+    ids=["attitude", "speed", "body rate", "tension"],
+)
+def test_success_asks_for_rest_in_the_target_attitude(field, value, option):
+    for given, options in ((None, {}), (value, {}), (value, option)):
+        vec = reset(num_envs=1, start_radius=0.0, **options)
+        state, task = vec.world.state, vec.task
+        state.payload_rotation[0] = task.goal.rotation[0] = np.eye(3)
+        if given is not None:
+            getattr(state, field)[0] = given
+        task.planner(0, 1)()
+        task.time[0], task.goal.position[0] = 14.0, state.payload_position[0]
+        task.goal.rotation[0] = np.eye(3)
+        task.check(0, 1, 0.0)
+        score = task.scorer(0, 1, vec._action, vec._action)
+        for _ in range(51):
+            score()
+        assert task.succeeded()[0] == (given is None or bool(options))
 
 
 @pytest.mark.parametrize(
@@ -109,3 +143,12 @@ def test_drones_are_told_the_gap_and_their_room():
     room = 0.5 - np.abs(state.drone_position[..., 1] - task.gap_y) - reach
     np.testing.assert_allclose(observation[..., names.index("clearance_0")], room.clip(-0.5, 0.5), atol=1e-5)
     assert (room.min(axis=1) < -0.1).all()
+
+
+def test_a_formation_drawn_in_passes_level():
+    flown = fly_episodes(load_config("gate"), partial(make_scripted, "formation_narrow"), 16, seed=3)
+    assert flown["success_rate"].all()
+    assert flown["payload_position_error_m"].max() < 0.01 and flown["payload_attitude_error_deg"].max() < 0.5
+    vec = make("hover", num_envs=1)
+    assert "formation_narrow" not in fitting_scripts(vec)
+    assert "formation_narrow is for gaps" in refusal(make_scripted, "formation_narrow", vec)

@@ -80,23 +80,53 @@ def test_drones_are_told_who_is_lost():
     assert not observation[..., names.index("lost_0") :].any()
 
 
-def test_success_needs_the_angle_with_six_drones_alone():
-    for num_drones, expected in ((4, True), (6, False)):
-        vec = make(
-            "loss",
-            num_envs=1,
-            num_drones=num_drones,
-            **{"task_options.start_radius": 0.0, "task_options.start_speed": 0.0},
-        )
-        vec.reset(seed=0)
-        vec.world.state.payload_rotation[0] = [[1, 0, 0], [0, np.cos(0.3), -np.sin(0.3)], [0, np.sin(0.3), np.cos(0.3)]]
-        vec.task.goal.rotation[0] = np.eye(3)
-        vec.task.check(0, 1, 0.0)
-        score = vec.task.scorer(0, 1, vec._action, vec._action)
-        for _ in range(101):
-            score()
-        vec.task.watch.lost[0, 0] = True
-        assert vec.task.succeeded()[0] == expected
+def judge_held(degrees=0.0, speed=0.0, body_rate=0.0, tension=1.0, **options):
+    """Return success of a payload that is held for 2 s after a loss, at its target, tilted and moving like this."""
+    still = {"start_radius": 0.0, "start_speed": 0.0} | options
+    vec = make("loss_6", num_envs=1, **{f"task_options.{key}": value for key, value in still.items()})
+    vec.reset(seed=0)
+    state, task, angle = vec.world.state, vec.task, np.radians(degrees)
+    turned = [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
+    state.payload_rotation[0], task.goal.rotation[0] = turned, np.eye(3)
+    state.payload_velocity[0], state.payload_body_rates[0] = [speed, 0, 0], [0, body_rate, 0]
+    state.cable_tension[0] = tension * vec.world.system.resting_tension
+    task.check(0, 1, 0.0)
+    task.planner(0, 1)()
+    score = task.scorer(0, 1, vec._action, vec._action)
+    for _ in range(101):
+        score()
+    task.watch.lost[0, 0] = True
+    return bool(task.succeeded()[0])
+
+
+@pytest.mark.parametrize(
+    ("held", "option"),
+    [
+        ({"degrees": 17.0}, {"success_angle": 50.0}),
+        ({"speed": 0.3}, {"success_speed": 0.4}),
+        ({"body_rate": 1.0}, {"success_body_rate": 1.5}),
+        ({"tension": 90.0}, {"success_tension": 100.0}),
+    ],
+    ids=["attitude", "speed", "body rate", "tension"],
+)
+def test_success_asks_for(held, option):
+    assert judge_held()
+    assert not judge_held(**held)
+    assert judge_held(**held, **option)
+
+
+def test_the_snatch_of_the_lost_drone_itself_does_not_count():
+    vec, _ = fly_past_the_loss()
+    resting = vec.world.system.resting_tension
+    vec.world.state.cable_tension[np.arange(4), vec.task.who] = 1e6
+    before = vec.task.peak_tension.copy()
+    vec.task.planner(0, 4)()
+    assert (vec.task.peak_tension == before).all() and (before > 2).all()
+    vec.world.state.cable_tension[:, :] = 500 * resting
+    vec.task.planner(0, 4)()
+    np.testing.assert_allclose(vec.task.peak_tension, 500)
+    vec.reset()
+    assert not vec.task.peak_tension.any()
 
 
 def test_one_drone_cannot_lose_itself():

@@ -28,7 +28,7 @@ _USAGE = """Judge a team on fixed seeds, beside the scripted ones on the same ep
 
   run         a run folder, its name, "latest", or the name of a shipped policy ("hover")     (latest)
   policy      script in place of a run: formation, formation_integral, formation_feedback, formation_gusts,
-              formation_lead, payload_geometric                                               (none)
+              formation_lead, formation_narrow, formation_redistributed, payload_geometric    (none)
   config      environment of that script, a configuration's name or path                      (hover)
   checkpoint  best, last, or a file                                                           (best)
   episodes    how many                                                                        (200)

@@ -200,9 +200,14 @@ class TrainConfig(Section):
     critic: Literal["flat", "set", "attention"] = Field(
         "flat", description="of mappo; set, attention: the same value in whatever order the drones stand"
     )
-    residual: Literal["formation", "formation_integral", "formation_feedback", "formation_gusts", "formation_lead"] = (
-        Field("formation", description="script that an untrained policy flies and the learned one corrects")
-    )
+    residual: Literal[
+        "formation",
+        "formation_integral",
+        "formation_feedback",
+        "formation_gusts",
+        "formation_lead",
+        "formation_narrow",
+    ] = Field("formation", description="script that an untrained policy flies and the learned one corrects")
     frames: Int = Field(5_000_000, ge=1, description="environment steps in all")
     horizon: Int = Field(128, ge=1, description="steps of each environment between updates")
     epochs: Int = Field(4, ge=1, description="passes over each batch")

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.control.gains import make_gains
 from multilift_marl.control.payload_geometric import PayloadGeometric
+from multilift_marl.control.redistribution import redistribute
 from multilift_marl.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -22,6 +24,11 @@ WANTED = {  # what the payload is meant to do meanwhile, where a task tells
 }
 LEAD_TIME = 0.4  # [s] that a payload's acceleration follows a moved slot: the lags of reference and drone
 LEAD_GAIN = 0.87  # [-] of what the acceleration asks for; RMSE is least at 0.81 for (2, 2), at 1 for (2, 4)
+
+
+NARROWING = 0.7  # [m] inward from the slots; 0.5 to 0.7 m pass a gap of 1 m, at 0.8 m drones collide
+THRUST_SHARE = 0.8  # of its largest thrust, which a drone may need at rest after a loss
+RAMP = (1.0, 3.0)  # [s] after a loss until the slots set off, and that they take
 
 
 class Formation:
@@ -58,6 +65,11 @@ class Formation:
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget nothing: the integral is part of the observation."""
+
+    @classmethod
+    def fits(cls, vec: MultiliftVec) -> bool:
+        """Return whether the environments tell what the script needs."""
+        return True
 
 
 class FormationIntegral(Formation):
@@ -163,22 +175,109 @@ class FormationLead(Formation):
         return all(f"{name}_0" in vec.observation_names for name in cls.TOLD)
 
 
+class FormationNarrow(Formation):
+    """The formation drawn in by a constant, so that it passes a gap, with integral and velocity feedback.
+
+    The constant is `NARROWING` times the cosine of the drone's own heading, which is 1 but for the noise. Velocity
+    counts relative to the target's.
+
+    Raises:
+        ConfigError: the task tells of no gap.
+    """
+
+    GAINS = (
+        ("heading", 0, 0, -NARROWING),
+        *FormationIntegral.GAINS,
+        ("payload_velocity", 0, 0, -0.3),
+        ("payload_velocity", 1, 1, -0.3),
+    )
+
+    def __init__(self, vec: MultiliftVec):
+        if not self.fits(vec):
+            raise ConfigError(
+                f"formation_narrow is for gaps, and task {vec.config.task} tells of none; take formation_feedback"
+            )
+        super().__init__(vec)
+
+    @classmethod
+    def fits(cls, vec: MultiliftVec) -> bool:
+        """Return whether there is a gap to pass."""
+        return "clearance_0" in vec.observation_names
+
+
+class FormationRedistributed(FormationIntegral):
+    """The formation with its integral; once a drone is lost, the slots move to where the others hold the payload.
+
+    Where that is follows from statics, see `redistribute`; each drone looks it up for the azimuth in which it is told
+    that the lost one is. The slots set off `RAMP[0]` after the loss, when the falling drone has snatched at its cable,
+    and take `RAMP[1]`. It remembers the time since the loss, so it is no linear map: `matrix` is that of the integral.
+
+    Raises:
+        ConfigError: the task tells of no loss.
+    """
+
+    def __init__(self, vec: MultiliftVec):
+        if not self.fits(vec):
+            raise ConfigError(
+                f"formation_redistributed needs to know which drone is lost, and task {vec.config.task} does not tell; "
+                "take formation_integral"
+            )
+        super().__init__(vec)
+        system, gains = vec.world.system, make_gains(vec.config.control, vec.world.system)
+        hangs = not getattr(vec.task.options, "snap", False)
+        self._offsets = np.zeros((system.num_drones, system.num_drones, 3))  # lost, own
+        for lost in range(system.num_drones):
+            found = redistribute(system, gains, lost, hangs, THRUST_SHARE, self._max_offset)
+            if found is not None:
+                self._offsets[lost] = found.offset
+        self._azimuth, self._dt = system.slot_azimuth, vec.task.dt
+        self._told = [self._names.index(name) for name in ("team_lost_0", "lost_direction_0", "lost_direction_1")]
+        self._since = np.zeros((vec.num_envs, system.num_drones))
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """See `Formation.act`; of all environments, step by step."""
+        is_lost, cosine, sine = (np.asarray(observation)[..., i] for i in self._told)
+        self._since = np.where(is_lost > 0.5, self._since + self._dt, 0.0)
+        there = np.arctan2(sine, cosine) + self._azimuth
+        lost = np.cos(there[..., None] - self._azimuth).argmax(axis=-1)
+        share = np.clip((self._since - RAMP[0]) / RAMP[1], 0.0, 1.0)
+        share = share**2 * (3 - 2 * share)
+        action = np.einsum("...d,ad->...a", np.asarray(observation, np.float32), self._matrix)
+        offset = self._offsets[lost, np.arange(len(self._azimuth))]
+        action[..., :3] += share[..., None] * offset / self._max_offset
+        return np.clip(action, -1, 1)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Forget the losses in the environments of the mask (E,) bool (None: all)."""
+        self._since[slice(None) if mask is None else mask] = 0.0
+
+    @classmethod
+    def fits(cls, vec: MultiliftVec) -> bool:
+        """Return whether the task tells who is lost."""
+        return "lost_direction_0" in vec.observation_names
+
+
 LINEAR: dict[str, type[Formation]] = {
     "formation": Formation,
     "formation_integral": FormationIntegral,
     "formation_feedback": FormationFeedback,
     "formation_gusts": FormationGusts,
     "formation_lead": FormationLead,
+    "formation_narrow": FormationNarrow,
 }
 """Scripts that are maps of the observation."""
-SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {**LINEAR, "payload_geometric": PayloadGeometric}
+SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {
+    **LINEAR,
+    "formation_redistributed": FormationRedistributed,
+    "payload_geometric": PayloadGeometric,
+}
 
 
 def fitting_scripts(vec: MultiliftVec) -> list[str]:
     """Return the names of the scripts that can fly the environments `vec`."""
     if vec.config.control.action != "reference":
         return []
-    return [name for name in SCRIPTED if name != "formation_lead" or FormationLead.fits(vec)]
+    return [name for name, script in SCRIPTED.items() if not issubclass(script, Formation) or script.fits(vec)]
 
 
 def make_scripted(name: str, vec: MultiliftVec) -> Formation | PayloadGeometric:

@@ -11,7 +11,9 @@ from multilift_marl.tasks.failures import CAUSES
 
 _Z = 1.959964  # two-sided 95 %
 _RESAMPLES = 2000
-_SUCCESSFUL = ("payload_position_error_m", "payload_attitude_error_deg", "payload_rmse_m", "settling_time_s")
+_APART = (  # also over the episodes without failure, and over the successful ones
+    "payload_position_error_m", "payload_attitude_error_deg", "payload_tilt_deg", "payload_rmse_m", "settling_time_s",
+)  # fmt: skip
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
@@ -33,8 +35,8 @@ def bootstrap(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
 def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     """Return {metric: {"mean", "ci95": [low, high]}} of what `fly_episodes` measured.
 
-    Errors include failed episodes at the failure bound; "<metric>_successful" takes successful episodes alone and is
-    missing where there are none.
+    Errors include failed episodes at the failure bound; "<metric>_held" takes the episodes without failure alone,
+    "<metric>_successful" the successful ones; they are missing where there are none.
     """
     success, cause = episodes["success_rate"], episodes["failure_cause"]
     count = len(success)
@@ -42,9 +44,10 @@ def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     for name, values in episodes.items():
         if name in ("success_rate", "failure_cause"):
             continue
-        result[name] = _mean(values)
-        if name in _SUCCESSFUL and success.any():
-            result[f"{name}_successful"] = _mean(values[success])
+        result[name] = _rate(int(values.sum()), count) if values.dtype == bool else _mean(values)
+        for kind, chosen in (("held", cause == 0), ("successful", success)):
+            if name in _APART and chosen.any():
+                result[f"{name}_{kind}"] = _mean(values[chosen])
     for index, name in enumerate(CAUSES):
         if index > 0:
             result[f"failure_{name}_rate"] = _rate(int((cause == index).sum()), count)

@@ -14,8 +14,11 @@ from multilift_marl.evaluation.metrics import compare, summarize
 
 _ROWS = (  # metric, heading, factor, digits
     ("success_rate", "success [%]", 100, 1),
+    ("precise_rate", "within 1 cm and 1 deg [%]", 100, 1),
     ("payload_position_error_m", "position error [cm]", 100, 2),
+    ("payload_position_error_m_held", "... without failure [cm]", 100, 2),
     ("payload_attitude_error_deg", "attitude error [deg]", 1, 2),
+    ("payload_tilt_deg_held", "tilt without failure [deg]", 1, 2),
     ("settling_time_s", "settling time [s]", 1, 2),
     ("return", "return", 1, 1),
     ("payload_rmse_m", "RMSE [cm]", 100, 1),

@@ -13,6 +13,7 @@ from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.tasks.failures import MAX_DISTANCE
 
 SETTLED = 0.05  # [m] settling time counts until the payload stays within this
+PRECISE = (0.01, 1.0)  # [m], [deg] mean errors of an episode that counts as precise
 _BATCH = 256
 
 
@@ -85,7 +86,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
     running = np.ones(e, bool)
     total, length, settling = np.zeros(e), np.zeros(e), np.zeros(e)
     square, counted, change = np.zeros((6, e)), np.zeros(e), np.zeros(e)
-    final_distance, final_angle, final_steps = np.zeros(e), np.zeros(e), np.zeros(e)
+    final_distance, final_angle, final_tilt, final_steps = np.zeros((4, e))
     result = {name: np.zeros(e) for name in _AT_END}
     result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
     previous = np.zeros((e, vec.num_drones, vec.action_size))
@@ -103,6 +104,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
         if vec.task.counts((step + 1) * dt, vec.max_steps * dt):
             final_distance += running * errors.distance
             final_angle += running * np.rad2deg(errors.angle)
+            final_tilt += running * _tilt(vec)
             final_steps += running
         previous = np.clip(action, -1, 1)
         ended = running & (terminated | truncated)
@@ -122,15 +124,23 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
     limit, rms = vec.max_steps * dt, np.sqrt(square / np.maximum(counted, 1))
     if vec.num_drones == 1:
         del result["min_separation_m"]
+    distance, angle = final_distance / steps, final_angle / steps
     return result | {
-        "payload_position_error_m": np.where(failed, MAX_DISTANCE, final_distance / steps),
-        "payload_attitude_error_deg": np.where(failed, 180.0, final_angle / steps),
+        "precise_rate": ~failed & (distance <= PRECISE[0]) & (angle <= PRECISE[1]),
+        "payload_position_error_m": np.where(failed, MAX_DISTANCE, distance),
+        "payload_attitude_error_deg": np.where(failed, 180.0, angle),
+        "payload_tilt_deg": np.where(failed, 180.0, final_tilt / steps),
         "payload_rmse_m": np.where(failed, MAX_DISTANCE, np.sqrt((rms[:3] ** 2).sum(axis=0))),
         **{name: np.where(failed, bound, part) for (name, bound), part in zip(_AXES.items(), rms, strict=True)},
         "settling_time_s": np.where(failed, limit, settling),
         "return": total,
         "action_rate": np.sqrt(change / np.maximum(length, 1)),
     }
+
+
+def _tilt(vec: MultiliftVec) -> np.ndarray:
+    """Return the angle between the payload's vertical axis and that of the world (E,) [deg]."""
+    return np.rad2deg(np.arccos(np.clip(vec.world.state.payload_rotation[:, 2, 2], -1, 1)))
 
 
 _AXES = {  # metric: what a failed episode counts

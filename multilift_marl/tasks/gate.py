@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import pi
+from math import pi, radians
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from multilift_marl.tasks.failures import WALL
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.paths import STEP, differences, set_goal
 from multilift_marl.tasks.starts import hang_team, in_ball
-from multilift_marl.tasks.terms import mean_change, tolerance
+from multilift_marl.tasks.terms import RestBounds, is_at_rest, mean_change, tolerance, update_peak_tension
 
 THICKNESS = 0.1  # [m] of the walls
 PASSED = 0.8  # [m] that a payload is past a wall when its last drone is, too
@@ -41,7 +41,13 @@ class GateOptions(Section):
     set_off: Float = Field(1.0, ge=0, description="[s] when the target sets off ...")
     arrival: Float = Field(11.0, gt=0, description="[s] ... and when it arrives at x = 2 m")
     success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of the goal ...")
-    success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout the last seconds")
+    success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, heading included ...")
+    success_speed: Float = Field(0.1, gt=0, description="[m/s] ... no faster than this ...")
+    success_body_rate: Float = Field(0.2, gt=0, description="[rad/s] ... and turning no faster than this ...")
+    success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout the last seconds, and ...")
+    success_tension: Float = Field(
+        3.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
+    )
 
 
 class Gates(NamedTuple):
@@ -89,6 +95,8 @@ class Gate(Task):
         "precision": 0.2,
         "clearance": 0.8,
         "velocity": 0.2,
+        "attitude": 0.2,
+        "stillness": 0.1,
         "action_rate": -0.05,
     }
     EXTRA: ClassVar[tuple[Component, ...]] = (
@@ -97,13 +105,13 @@ class Gate(Task):
         Component("clearance", 1, "-", "m", "own room to the next wall's edges, within ± 0.5"),
     )
     EXTRA_STATE: ClassVar[int] = 6
-    KEPT: ClassVar[tuple[str, ...]] = ("gap_y",)
+    KEPT: ClassVar[tuple[str, ...]] = ("gap_y", "peak_tension")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
         option, system = self.options, world.system
         x = np.array([0.0] if option.gates == 1 else [-0.75, 0.75])
-        self.gap_y = np.zeros((world.num_envs, len(x)))
+        self.gap_y, self.peak_tension = np.zeros((world.num_envs, len(x))), np.zeros(world.num_envs)
         self.gates = Gates(
             x, self.gap_y, option.gap_width / 2, option.gap_height, option.set_off,
             option.arrival - option.set_off, option.height,
@@ -117,12 +125,14 @@ class Gate(Task):
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw the gaps and where the team starts; see `Task.start`."""
         option = self.options
+        self.peak_tension[env] = 0.0
         self.gap_y[env] = rng.uniform(-option.gap_offset, option.gap_offset, option.gates)
         _start(env, rng, self.world.state, self.goal, self.rig, self.hanging, mass, self.gates, option.start_radius)
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
         """Move the goals through the gaps; see `Task.planner`."""
-        return bind(_plan, lo, hi, self.time, self.control_dt, self.gates, self.goal, self.rig)
+        tensions = (self.world.state, self.watch, self.world.system.resting_tension, self.peak_tension)
+        return bind(_plan, lo, hi, self.time, self.control_dt, self.gates, self.goal, self.rig, tensions)
 
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell where the next gap is; see `Task.observer`."""
@@ -132,15 +142,18 @@ class Gate(Task):
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness to the moving target and for room; a touched wall is a failure. See `Task.scorer`."""
         option = self.options
-        success = (option.success_distance, option.arrival)
+        bounds = RestBounds(
+            option.success_distance, radians(option.success_angle), option.success_speed, option.success_body_rate
+        )
         return bind(
             _score, lo, hi, self.time, self.world.state, self.goal, self.errors, self.gates, self.bodies, action,
-            previous, self.weights, success, self.dt, self.terms, self.good_time, self.cause,
+            previous, self.weights, bounds, option.arrival, self.dt, self.terms, self.good_time, self.cause,
         )  # fmt: skip
 
     def succeeded(self) -> np.ndarray:
-        """Close to the goal throughout the last moments."""
-        return self.good_time >= self.options.success_seconds - 1e-9
+        """At rest at the goal throughout the last moments, and never too large a tension."""
+        rested = self.good_time >= self.options.success_seconds - 1e-9
+        return rested & (self.peak_tension <= self.options.success_tension)
 
     def route(self, env: int) -> np.ndarray:
         """Return points of the way through the gaps; see `Task.route`."""
@@ -186,8 +199,10 @@ def _start(e, rng, state, goal, rig, hanging, mass, gates, radius):
 
 
 @kernel
-def _plan(lo, hi, time, dt, gates, goal, rig):
+def _plan(lo, hi, time, dt, gates, goal, rig, tensions):
+    state, watch, resting, peak = tensions
     for e in range(lo, hi):
+        update_peak_tension(e, state, watch, resting, peak)
         time[e] += dt
         _aim(e, time[e], gates, goal, rig)
 
@@ -270,7 +285,8 @@ def _tell(lo, hi, state, seen, goal, gates, bodies, observation, critic):
 
 @kernel
 def _score(
-    lo, hi, time, state, goal, errors, gates, bodies, action, previous, weights, success, dt, terms, good_time, cause
+    lo, hi, time, state, goal, errors, gates, bodies, action, previous, weights, bounds, arrival, dt, terms, good_time,
+    cause,
 ):  # fmt: skip
     for e in range(lo, hi):
         distance = errors.distance[e]
@@ -285,8 +301,10 @@ def _score(
         terms[e, 1] = weights[1] * tolerance(distance, 0.05)
         terms[e, 2] = weights[2] * passing
         terms[e, 3] = weights[3] * tolerance(slip, 0.2)
-        terms[e, 4] = weights[4] * mean_change(e, action, previous)
-        arrived = time[e] >= success[1] and distance <= success[0]
-        good_time[e] = good_time[e] + dt if arrived else 0.0
+        terms[e, 4] = weights[4] * tolerance(errors.angle[e], radians(6.0))
+        terms[e, 5] = weights[5] * tolerance(norm(row(state.payload_body_rates, e)), 0.3)
+        terms[e, 6] = weights[6] * mean_change(e, action, previous)
+        good = time[e] >= arrival and is_at_rest(e, state, errors, bounds)
+        good_time[e] = good_time[e] + dt if good else 0.0
         if cause[e] == 0 and _least_room(e, state, gates, bodies) < 0.0:
             cause[e] = WALL

@@ -19,9 +19,7 @@ from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
-from multilift_marl.tasks.terms import mean_change, tolerance
-
-LEVEL_FROM = 6  # drones with which the rest can hold a payload level wherever one is lost
+from multilift_marl.tasks.terms import RestBounds, is_at_rest, mean_change, tolerance, update_peak_tension
 
 
 class LossOptions(StartOptions):
@@ -30,8 +28,15 @@ class LossOptions(StartOptions):
     loss_time: tuple[Float, Float] = Field((2.0, 4.0), description="[s] earliest and latest stop of the motors")
     snap: bool = Field(False, description="whether the lost drone's cable breaks, so that it is gone")
     success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of its target ...")
-    success_angle: Float = Field(10.0, gt=0, description="[deg] ... and, with six drones or more, of its attitude ...")
-    success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds")
+    success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, as level as can be held ...")
+    success_speed: Float = Field(0.2, gt=0, description="[m/s] ... no faster than this ...")
+    success_body_rate: Float = Field(0.5, gt=0, description="[rad/s] ... and turning no faster than this ...")
+    success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds, and ...")
+    success_tension: Float = Field(
+        40.0, gt=1,
+        description="[-] no cable's tension at any time, mean of a physics step, over its resting tension; the lost "
+        "drone's does not count",
+    )  # fmt: skip
 
 
 class Loss(Task):
@@ -54,7 +59,7 @@ class Loss(Task):
     )
     EXTRA_STATE: ClassVar[int] = 3
     LEAST_DRONES: ClassVar[int] = 2
-    KEPT: ClassVar[tuple[str, ...]] = ("when", "who")
+    KEPT: ClassVar[tuple[str, ...]] = ("when", "who", "peak_tension")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
@@ -64,19 +69,22 @@ class Loss(Task):
         self._ranges = make_ranges(self.options)
         self.when, self.who = np.zeros(world.num_envs), np.zeros(world.num_envs, np.int64)
         world.breakable = world.breakable or self.options.snap
-        self._angle = radians(self.options.success_angle) if world.num_drones >= LEVEL_FROM else np.inf
+        self.peak_tension = np.zeros(world.num_envs)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, start, drone and time; see `Task.start`."""
         start_near_target(env, rng, self.world.state, self.goal, self.rig, self._ranges, self.hanging, mass)
         self.who[env], self.when[env] = rng.integers(self.world.num_drones), rng.uniform(*self.options.loss_time)
-        self.watch.lost[env] = False
+        self.watch.lost[env], self.peak_tension[env] = False, 0.0
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
         """Stop the motors when their time has come; see `Task.planner`."""
         state, plant = self.world.state, self.world.plant
-        snap = self.options.snap
-        return bind(_lose, lo, hi, self.time, self.control_dt, self.when, self.who, snap, state, plant, self.watch)
+        tensions = (self.world.system.resting_tension, self.peak_tension)
+        return bind(
+            _lose, lo, hi, self.time, self.control_dt, self.when, self.who, self.options.snap, state, plant, self.watch,
+            tensions,
+        )  # fmt: skip
 
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell who is lost; see `Task.observer`."""
@@ -84,19 +92,24 @@ class Loss(Task):
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
-        success = (self.options.success_distance, self._angle)
+        option = self.options
+        bounds = RestBounds(
+            option.success_distance, radians(option.success_angle), option.success_speed, option.success_body_rate
+        )
         return bind(
-            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights, success, self.dt,
+            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights, bounds, self.dt,
             self.terms, self.good_time,
         )  # fmt: skip
 
     def succeeded(self) -> np.ndarray:
-        """Within the success region throughout the last seconds, with a drone less."""
-        return (self.good_time >= self.options.success_seconds - 1e-9) & self.watch.lost.any(axis=1)
+        """At rest throughout the last seconds, with a drone less, and never too large a tension."""
+        rested = (self.good_time >= self.options.success_seconds - 1e-9) & self.watch.lost.any(axis=1)
+        return rested & (self.peak_tension <= self.options.success_tension)
 
 
 @kernel
-def _lose(lo, hi, time, dt, when, who, snap, state, plant, watch):
+def _lose(lo, hi, time, dt, when, who, snap, state, plant, watch, tensions):
+    resting, peak = tensions
     for e in range(lo, hi):
         time[e] += dt
         if time[e] >= when[e] and not watch.lost[e, who[e]]:
@@ -104,6 +117,7 @@ def _lose(lo, hi, time, dt, when, who, snap, state, plant, watch):
             plant.motors_off[e, who[e]] = True
             if snap:
                 state.cable_broken[e, who[e]] = True
+        update_peak_tension(e, state, watch, resting, peak)
 
 
 @kernel
@@ -121,7 +135,7 @@ def _tell(lo, hi, who, watch, rig, observation, critic):
 
 
 @kernel
-def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms, good_time):
+def _score(lo, hi, state, errors, action, previous, weights, bounds, dt, terms, good_time):
     for e in range(lo, hi):
         distance, angle = errors.distance[e], errors.angle[e]
         speed, spin = norm(row(state.payload_velocity, e)), norm(row(state.payload_body_rates, e))
@@ -130,4 +144,4 @@ def _score(lo, hi, state, errors, action, previous, weights, success, dt, terms,
         terms[e, 2] = weights[2] * tolerance(angle, radians(20.0))
         terms[e, 3] = weights[3] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
         terms[e, 4] = weights[4] * mean_change(e, action, previous)
-        good_time[e] = good_time[e] + dt if distance <= success[0] and angle <= success[1] else 0.0
+        good_time[e] = good_time[e] + dt if is_at_rest(e, state, errors, bounds) else 0.0

@@ -1,4 +1,4 @@
-"""The one shaped reward primitive, and what every task measures: errors against the goal and their integrals."""
+"""The one shaped reward primitive; errors against the goal and their integrals; a payload at rest, cables that hold."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from multilift_marl._jit import kernel
 from multilift_marl.control.formation import Goal
 from multilift_marl.math3d import clip, matmul, matrow, norm, put, rotation_vector, row, sub, transpose
 from multilift_marl.sim.state import SystemState
+from multilift_marl.tasks.failures import Watch
 
 
 @kernel
@@ -50,6 +51,43 @@ class Errors(NamedTuple):
         """Return zero errors."""
         e = num_envs
         return cls(*(np.zeros(shape) for shape in ((e, 3), (e, 3), (e,), (e,), (e, 3), (e, 3))))
+
+
+class RestBounds(NamedTuple):
+    """What counts as a payload at rest at its target."""
+
+    distance: float
+    """[m]."""
+    angle: float
+    """Of the rotation from the target attitude [rad]."""
+    speed: float
+    """[m/s]."""
+    body_rate: float
+    """[rad/s]."""
+
+
+@kernel
+def is_at_rest(e: int, state: SystemState, errors: Errors, bounds: RestBounds) -> bool:
+    """Return whether the payload of environment e is at its target, in its attitude, and does not move."""
+    placed = errors.distance[e] <= bounds.distance and errors.angle[e] <= bounds.angle
+    speed, body_rate = norm(row(state.payload_velocity, e)), norm(row(state.payload_body_rates, e))
+    return placed and speed <= bounds.speed and body_rate <= bounds.body_rate
+
+
+@kernel
+def update_peak_tension(e: int, state: SystemState, watch: Watch, resting: np.ndarray, peak: np.ndarray) -> None:
+    """Raise `peak` (E,) to the largest tension of environment e over the resting tension of its cable [-].
+
+    The tension is `state.cable_tension`, the mean over the last physics step. The cables of lost drones do not count.
+
+    Args:
+        e, state, watch: see their types.
+        resting: tensions of the resting formation (N,) [N].
+        peak: written.
+    """
+    for n in range(resting.shape[0]):
+        if not watch.lost[e, n]:
+            peak[e] = max(peak[e], state.cable_tension[e, n] / resting[n])
 
 
 @kernel

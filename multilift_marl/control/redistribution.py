@@ -1,0 +1,103 @@
+"""Cable forces that hold the payload after a drone is lost, and where the remaining drones are that exert them.
+
+Statics alone: the payload's weight, the lost drone's that hangs from its anchor, and the remaining cables balance in
+force and moment. The payload is tilted as little as thrust and the range of the slots' offsets allow.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.control.gains import Gains
+
+TILTS = np.radians(np.arange(0.0, 71.0))  # tried in this order
+AXES = np.radians(np.arange(0.0, 360.0, 5.0))  # horizontal axes of the tilt
+LEAST_HEIGHT = 0.2  # [m] of a drone above the payload; lower ones are a failure
+
+
+class Redistribution(NamedTuple):
+    """How the remaining drones hold the payload."""
+
+    tilt: float
+    """Of the payload [rad]."""
+    force: np.ndarray
+    """(N, 3) of each cable on the payload, in the target's heading frame [N]; 0 of the lost one's."""
+    thrust: np.ndarray
+    """(N,) of each drone over its largest [-]."""
+    offset: np.ndarray
+    """(N, 3) of each slot, in its slot frame [m]."""
+
+
+def redistribute(
+    system: System, gains: Gains, lost: int, hangs: bool, thrust_share: float, max_offset: float
+) -> Redistribution | None:
+    """Return the least tilted equilibrium without drone `lost`; None if there is none.
+
+    At each attitude the cable forces are those nearest to the formation's that balance.
+
+    Args:
+        system, gains: of the team.
+        lost: the drone.
+        hangs: whether it hangs on its cable; else both are gone.
+        thrust_share: of its largest thrust that a drone may use.
+        max_offset: largest offset of a slot along each axis [m].
+    """
+    keep = np.delete(np.arange(system.num_drones), lost)
+    weight = GRAVITY * (gains.mass[lost] + system.cable_mass[lost]) if hangs else 0.0
+    for tilt in TILTS:
+        attitude = _tilted(tilt, AXES if tilt else AXES[:1])
+        # 1. Least change of the formation's forces that balances weights and moments.
+        arms = np.einsum("aij,nj->ani", attitude, system.anchors)
+        balance = _balance_matrix(arms[:, keep])
+        wrench = np.zeros((len(attitude), 6))
+        wrench[:, 2] = GRAVITY * system.payload_mass + weight
+        wrench[:, 3:] = np.cross(arms[:, lost], [0.0, 0.0, weight])
+        nominal = system.formation_force[keep].ravel()
+        change = np.einsum("aij,aj->ai", np.linalg.pinv(balance, rcond=1e-9), wrench - balance @ nominal)
+        force = (nominal + change).reshape(len(attitude), -1, 3)
+        balanced = np.abs(np.einsum("aij,aj->ai", balance, nominal + change) - wrench).max(axis=1) < 1e-6
+        # 2. Where the drones are that pull so, each held by the spring that its position gain is.
+        size = np.linalg.norm(force, axis=2, keepdims=True)
+        stretched = system.cable_length[keep, None] + size / system.cable_stiffness[keep, None]
+        moved = arms[:, keep] + stretched * force / size - system.slots[keep]
+        stiffness = (gains.mass * gains.k_p)[keep, None]
+        offset = _to_slots(moved + (force - system.formation_force[keep]) / stiffness, system.slot_azimuth[keep])
+        # 3. What is possible.
+        lifted = force + GRAVITY * (gains.mass + system.cable_mass)[keep, None] * [0.0, 0.0, 1.0]
+        thrust = np.linalg.norm(lifted, axis=2) / (4 * gains.thrust_max[keep])
+        height = (moved + system.slots[keep])[..., 2].min(axis=1)
+        possible = balanced & (thrust.max(axis=1) <= thrust_share) & (height >= LEAST_HEIGHT)
+        possible &= np.abs(offset).max(axis=(1, 2)) <= max_offset
+        if possible.any():
+            best = np.where(possible, thrust.max(axis=1), np.inf).argmin()
+            found = Redistribution(float(tilt), *(np.zeros((system.num_drones, *shape)) for shape in ((3,), (), (3,))))
+            found.force[keep], found.thrust[keep], found.offset[keep] = force[best], thrust[best], offset[best]
+            return found
+    return None
+
+
+def _tilted(tilt: float, axes: np.ndarray) -> np.ndarray:
+    """Return attitudes (A, 3, 3) tilted about horizontal axes at these azimuths (A,)."""
+    x, y, zero = np.cos(axes), np.sin(axes), np.zeros_like(axes)
+    k = np.moveaxis(np.array([[zero, zero, y], [zero, zero, -x], [-y, x, zero]]), 2, 0)
+    return np.eye(3) + np.sin(tilt) * k + (1 - np.cos(tilt)) * k @ k
+
+
+def _balance_matrix(arms: np.ndarray) -> np.ndarray:
+    """Return G (A, 6, 3 N) by which forces (3 N,) at `arms` (A, N, 3) exert force and moment."""
+    x, y, z = np.moveaxis(arms, 2, 0)
+    zero = np.zeros_like(x)
+    moments = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 3, 1).reshape(len(arms), 3, -1)
+    forces = np.broadcast_to(np.tile(np.eye(3), arms.shape[1]), moments.shape)
+    return np.concatenate([forces, moments], axis=1)
+
+
+def _to_slots(vectors: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Return vectors (A, N, 3) in the slot frames at these azimuths (N,)."""
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    x, y, z = np.moveaxis(vectors, 2, 0)
+    return np.stack([c * x + s * y, c * y - s * x, z], axis=2)
