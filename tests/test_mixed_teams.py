@@ -17,7 +17,8 @@ from multilift_marl.control.gains import drone_gains, make_gains
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.sim import World
 from multilift_marl.sim.air import make_air, wash_at
-from multilift_marl.sim.scene import build_model, drone_half_size
+from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.sim.scene import build_model
 
 MIX = ["falcon", "falcon", "hummingbird", "iris"]
 ALL = sorted(PRESETS)

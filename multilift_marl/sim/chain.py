@@ -162,7 +162,8 @@ def _add_contact(e, i, line, constraint, c, chain, nodes, motion):
         velocity = sub(velocity, mul(attitude, cross(rates, center)))
         touched = False
         for j in range(6 if turns else 3):
-            nodes.contact[e, b, j] = constraint[v - c.qvel + j]
+            nodes.contact[e, b, 1, j] = nodes.contact[e, b, 0, j]
+            nodes.contact[e, b, 0, j] = constraint[v - c.qvel + j]
             touched = touched or constraint[v - c.qvel + j] != 0.0
         if touched:
             changed = (line[v], line[v + 1], line[v + 2])

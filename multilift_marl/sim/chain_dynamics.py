@@ -61,13 +61,13 @@ class Nodes(NamedTuple):
     velocity: np.ndarray
     """(E, N, S - 1, 3) [m/s]."""
     contact: np.ndarray
-    """(E, 1 + N, 6) force (world frame) and torque (body frame) of contact on payload and drones in the last step."""
+    """(E, 1 + N, 2, 6) force (world frame) and torque (body frame) of contact in the last step and in that before."""
 
     @classmethod
     def zeros(cls, num_envs: int, system: System) -> Nodes:
         """Return chains at the origin."""
         e, n, s = num_envs, system.num_drones, int(system.cable_segments.max())
-        return cls(np.zeros((e, n, s - 1, 3)), np.zeros((e, n, s - 1, 3)), np.zeros((e, 1 + n, 6)))
+        return cls(np.zeros((e, n, s - 1, 3)), np.zeros((e, n, s - 1, 3)), np.zeros((e, 1 + n, 2, 6)))
 
 
 class Chain(NamedTuple):
@@ -247,9 +247,10 @@ def advance_chains(rows, lo, hi, state, diverged, chain, nodes, motion):
 
 @kernel
 def _gather_bodies(e, i, line, state, chain, nodes, motion):
-    """Take the bodies at the start of a physics step and what acts on them: gravity, loads, contact of the last step.
+    """Take the bodies at the start of a physics step and what acts on them: gravity, loads, lasting contact.
 
-    Contact is there so that cables do not have to hold for a moment what stands on the ground.
+    Contact is there so that cables do not have to hold for a moment what stands on the ground: as much of it as the
+    last two steps had in common, since the impulse of an impact is over.
     """
     for b in range(chain.mass.shape[1]):
         if b == 0:
@@ -267,13 +268,24 @@ def _gather_bodies(e, i, line, state, chain, nodes, motion):
         putmat(motion.rotation[i, b], attitude)
         put(motion.momentum[b], mul(attitude, mul(matrow(chain.inertia[e], b), rates)))
         at, mass, touch = chain.loads[b], chain.mass[e, b], nodes.contact[e, b]
-        force = (line[at] + touch[0], line[at + 1] + touch[1], line[at + 2] + touch[2])
+        force = (line[at], line[at + 1], line[at + 2])
+        force = add(force, (_common(touch, 0), _common(touch, 1), _common(touch, 2)))
         put(motion.force[b], sub(force, (0.0, 0.0, mass * GRAVITY)))
         if chain.inverse_inertia[e, b, 0, 0] > 0.0:
-            torque = (line[at + 3] + touch[3], line[at + 4] + touch[4], line[at + 5] + touch[5])
+            torque = (line[at + 3], line[at + 4], line[at + 5])
+            torque = add(torque, (_common(touch, 3), _common(touch, 4), _common(touch, 5)))
             put(motion.torque[b], sub(torque, cross(center, tmul(attitude, force))))
         for j in range(6):
             motion.impulse[b, j] = 0.0
+
+
+@kernel
+def _common(touch, j):
+    """Return the smaller one of a contact's two last values, 0 where their signs differ."""
+    last, before = touch[0, j], touch[1, j]
+    if last * before <= 0.0:
+        return 0.0
+    return last if abs(last) < abs(before) else before
 
 
 @kernel

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import mujoco
@@ -10,8 +9,9 @@ import numpy as np
 
 from multilift_marl.config.mesh import add_mesh
 from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY, Vehicle
+from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.sim.cables import IMPEDANCE, limit_solref
+from multilift_marl.sim.contact import add_contact, drone_half_size
 from multilift_marl.sim.looks import (
     DRONE_COLOURS,
     PAYLOAD_COLOUR,
@@ -60,7 +60,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
         _add_drone(body, system, i, visuals)
         if system.cable_model == "massless":
             _add_cable(spec, system, i)
-    _pair_bodies(spec, system.num_drones)
+    add_contact(spec, system.num_drones)
     if visuals:
         add_light(spec.body("payload"))
         margin = 0.04 * system.payload_size.min()
@@ -101,18 +101,6 @@ def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
         world.add_camera(name=name, pos=pos, quat=quat, fovy=45)
     if visuals:
         add_surroundings(spec, floor)
-
-
-def _pair_bodies(spec: mujoco.MjSpec, num_drones: int) -> None:
-    """Let ground, payload and drones touch each other, by pairs: cheaper than MuJoCo's sweep over all bodies.
-
-    What contacts are like stands in the `pair_*` fields of the compiled model, not in those of its geoms.
-    """
-    names = ("floor", "payload", *(f"drone_{i}" for i in range(num_drones)))
-    for name in names:
-        spec.geom(name).contype = spec.geom(name).conaffinity = 0
-    for one, other in combinations(names, 2):
-        spec.add_pair(geomname1=one, geomname2=other)
 
 
 def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
@@ -163,11 +151,6 @@ def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> N
         body.add_site(name=f"{name}/rotor_{r}", pos=position, size=[0.008, 0, 0], group=4)
     if visuals:
         add_rotorcraft(body, vehicle, colour)
-
-
-def drone_half_size(vehicle: Vehicle) -> np.ndarray:
-    """Return the half edges (3,) of a drone's collision box [m]."""
-    return vehicle.arm * np.array([0.7, 0.7, 0.3])
 
 
 def _add_cable(spec: mujoco.MjSpec, system: System, i: int) -> None:

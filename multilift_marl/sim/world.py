@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +18,7 @@ from multilift_marl.config.system import System
 from multilift_marl.sim.air import make_air
 from multilift_marl.sim.chain import make_chain, read_chains, update_chain, write_chains
 from multilift_marl.sim.chain_dynamics import Chain, Motion, Nodes, advance_chains
+from multilift_marl.sim.contact import find_fast, make_bodies, set_speculative
 from multilift_marl.sim.dynamics import apply_loads, make_constants
 from multilift_marl.sim.gusts import start_turbulence
 from multilift_marl.sim.parameters import (
@@ -54,6 +56,10 @@ class Shard:
     """(hi - lo, N) cables that the batch's models lack."""
     motion: Motion | None
     """Working arrays of chains."""
+    find_fast: Callable[[], bool]
+    """`contact.find_fast` of these environments."""
+    fast: np.ndarray
+    """(hi - lo,) bool, environments in which bodies approach each other fast."""
 
 
 class World:
@@ -155,6 +161,8 @@ class World:
         """Advance one shard with the thrusts in `thrust`; see `step`."""
         for _ in range(nstep):
             shard.apply()
+            if shard.find_fast():
+                set_speculative(shard.batch, shard.fast)
             if shard.pull is not None:
                 shard.pull()
             try:
@@ -291,7 +299,7 @@ class World:
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int).tolist()
-        shards = []
+        shards, bodies = [], make_bodies(self.system)
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
             batch = Batch(self.model, hi - lo, nthread=1)
             constants = make_constants(self.system, self.layout, batch)
@@ -313,7 +321,9 @@ class World:
                 pull = bind(advance_chains, *span, self.state, self.diverged, *chains, motion)
                 read = bind(read_chains, *span, batch.bind("qfrc_constraint"), *seen, *chains, motion)
             broken = np.zeros((hi - lo, self.num_drones), bool)
-            shards.append(Shard(lo, hi, batch, apply, pull, read, broken, motion))
+            fast = np.zeros(hi - lo, bool)
+            watch: Any = bind(find_fast, lo, hi, self.state, fast, bodies)
+            shards.append(Shard(lo, hi, batch, apply, pull, read, broken, motion, watch, fast))
         return shards
 
 

@@ -24,7 +24,7 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-from multilift_marl.sim.scene import drone_half_size
+from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.standing import hook_place
 
 CAUSES = (

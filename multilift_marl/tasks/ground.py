@@ -12,7 +12,7 @@ from multilift_marl.config.system import MIN_SEPARATION, System
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
-from multilift_marl.sim.scene import drone_half_size
+from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.tasks.terms import tolerance
 
 _SLACK_REACH = 0.9  # of its cable: the farthest that a drone stands from its anchor

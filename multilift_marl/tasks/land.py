@@ -14,7 +14,7 @@ from multilift_marl.config.schema import Config
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import add, ease, matrow, norm, put, putmat, rot_z, row, scale, sub, tmul, turn, vec
-from multilift_marl.sim.scene import drone_half_size
+from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.failures import LOAD_GROUND, TOUCH, forgive, payload_height

@@ -11,7 +11,7 @@ from multilift_marl.config.load import load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.sim.air import AIR_DENSITY
-from multilift_marl.sim.scene import drone_half_size
+from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.world import World
 from multilift_marl.validation.cables import hanging_load
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row, ms, order_row, relative

@@ -8,7 +8,7 @@ import numpy as np
 
 from multilift_marl.config.system import System
 from multilift_marl.sim.air import AIR_DENSITY
-from multilift_marl.sim.scene import drone_half_size
+from multilift_marl.sim.contact import drone_half_size
 
 RADIUS, HEIGHT = 5.0, 1.5  # [m] of the circle
 ASIDE = 0.6  # [m] from its anchor to a drone on the ground
