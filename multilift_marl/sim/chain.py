@@ -36,6 +36,7 @@ from multilift_marl.math3d import (
 )
 from multilift_marl.sim.chain_dynamics import Chain, Nodes, largest_substep, turned
 from multilift_marl.sim.hanging import hang
+from multilift_marl.sim.inertia import Inertias
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.rows import (
     MAX_RATE,
@@ -51,7 +52,9 @@ from multilift_marl.sim.scene import Layout
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def make_chain(system: System, layout: Layout, parameters: Parameters, batch: Batch) -> Chain:
+def make_chain(
+    system: System, layout: Layout, parameters: Parameters, inertias: Inertias, batch: Batch
+) -> Chain:
     """Return the chains of `system`, those of each environment by `parameters`; `update_chain` brings them up to date."""
     n, (e, count) = system.cable_segments, parameters.cable_length.shape
     force = field_offset(batch, "qfrc_applied")
@@ -65,10 +68,10 @@ def make_chain(system: System, layout: Layout, parameters: Parameters, batch: Ba
         bending_damping=system.bending_damping,
         anchors=np.ascontiguousarray(system.anchors),
         hooks=np.ascontiguousarray(system.hooks),
-        mass=np.zeros((e, 1 + count)),
-        inertia=np.zeros((e, 1 + count, 3, 3)),
-        inverse_inertia=np.zeros((e, 1 + count, 3, 3)),
-        center=np.zeros((e, 1 + count, 3)),
+        mass=inertias.mass,
+        inertia=inertias.inertia,
+        inverse_inertia=inertias.inverse,
+        center=inertias.center,
         breaking_load=system.breaking_load,
         loads=force + np.append(0, layout.payload_nv + 6 * np.arange(count)),
         timestep=system.timestep,
@@ -85,23 +88,6 @@ def update_chain(chain: Chain, system: System, parameters: Parameters) -> None:
     chain.length[:] = length / n
     chain.stiffness[:] = n * parameters.cable_stiffness
     chain.node_mass[:] = system.cable_mass * (length / system.cable_length) / (n - 1)
-    chain.mass[:, 0], chain.mass[:, 1:] = parameters.payload_mass, parameters.vehicle_mass
-    chain.center[:, 0] = parameters.payload_center_of_mass
-    axes = _quaternion_matrix(system.payload_axes)
-    scale = parameters.payload_mass / system.payload_mass * parameters.payload_inertia
-    chain.inertia[:, 0] = scale[:, None, None] * (axes * system.payload_inertia @ axes.T)
-    for i, vehicle in enumerate(system.vehicles):
-        own = parameters.vehicle_mass[:, i] / vehicle.mass
-        chain.inertia[:, 1 + i] = own[:, None, None] * np.diag(vehicle.inertia)
-    chain.inverse_inertia[:, 1:] = np.linalg.inv(chain.inertia[:, 1:])
-    if system.payload_shape != "point":
-        chain.inverse_inertia[:, 0] = np.linalg.inv(chain.inertia[:, 0])
-
-
-def _quaternion_matrix(quaternion: np.ndarray) -> np.ndarray:
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    cross_matrix = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * cross_matrix + 2 * cross_matrix @ cross_matrix
 
 
 @kernel

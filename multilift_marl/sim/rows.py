@@ -12,20 +12,25 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
 from multilift_marl.math3d import (
     add,
+    cross,
     dot,
     mat,
     mat_to_quat,
     matrow,
     mul,
+    norm,
     put,
     putmat,
     quat_to_mat,
     row,
+    scale,
     sub,
     vec,
 )
+from multilift_marl.sim.inertia import Inertias, mobility, point_motion
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.scene import Layout
+from multilift_marl.sim.snatch import snatch_peak
 from multilift_marl.sim.standing import hook_place
 
 MAX_SPEED = 100.0  # [m/s] beyond this a simulation has diverged
@@ -45,8 +50,11 @@ class Places(NamedTuple):
     """(E, N) [m]."""
     cable_stiffness: np.ndarray
     """(E, N) [N/m]."""
+    cable_damping: np.ndarray
+    """(N,) [N s/m]."""
     breaking_load: np.ndarray
     """(N,) [N]."""
+    inertias: Inertias
     qpos: int
     """Offset of qpos in a row of `batch.state`; likewise the next one."""
     qvel: int
@@ -54,7 +62,9 @@ class Places(NamedTuple):
     payload_nv: int
 
 
-def make_places(system: System, layout: Layout, parameters: Parameters, batch: Batch) -> Places:
+def make_places(
+    system: System, layout: Layout, parameters: Parameters, inertias: Inertias, batch: Batch
+) -> Places:
     """Return the places of `system` with live `parameters` in the rows of a batch."""
     return Places(
         timestep=system.timestep,
@@ -62,7 +72,9 @@ def make_places(system: System, layout: Layout, parameters: Parameters, batch: B
         hooks=np.ascontiguousarray(system.hooks),
         cable_length=parameters.cable_length,
         cable_stiffness=parameters.cable_stiffness,
+        cable_damping=np.ascontiguousarray(system.cable_damping),
         breaking_load=system.breaking_load,
+        inertias=inertias,
         qpos=field_offset(batch, "qpos"),
         qvel=field_offset(batch, "qvel"),
         payload_nq=layout.payload_nq,
@@ -96,10 +108,13 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
         if diverged[e] or not _sound(e, line, tension[e - lo], c):
             diverged[e] = True
             continue
-        read_payload(e, line, state, c)
         at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
         slack = False
         for n in range(tension.shape[1]):
+            if tension[e - lo, n] > 0.0 and state.cable_tension[e, n] == 0.0:
+                peak = _find_peak(e, n, line, tension[e - lo, n], state, c)
+                record.tension_max[e] = max(record.tension_max[e], peak)
+                state.cable_broken[e, n] = state.cable_broken[e, n] or peak > c.breaking_load[n]
             for j in range(3):
                 state.drone_position[e, n, j] = line[at + j]
                 state.drone_velocity[e, n, j] = line[v + j]
@@ -110,9 +125,49 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
             pull = tension[e - lo, n]
             state.cable_tension[e, n] = pull
             slack = slack or pull <= 0.0
+        read_payload(e, line, state, c)
         if slack:
             record.slack_time[e] += c.timestep
     note_tensions(lo, hi, diverged, False, state, record, c)
+
+
+@kernel
+def _find_peak(e, n, line, tension, state, c):
+    """Return the peak of the snatch of cable n, which went taut before the step that has just been made [N].
+
+    The state is that before the step, `line` that after it. The ends parted freely until the cable was taut.
+    """
+    anchor, hook = row(c.anchors, n), row(c.hooks, n)
+    payload, drone = matrow(state.payload_rotation, e), mat(state.drone_rotation, e, n)
+    if c.payload_nv == 3:
+        payload = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    rates = row(state.payload_body_rates, e)
+    low, low_velocity = point_motion(
+        row(state.payload_position, e), payload, row(state.payload_velocity, e), rates, anchor
+    )
+    rates = vec(state.drone_body_rates, e, n)
+    high, high_velocity = point_motion(
+        vec(state.drone_position, e, n), drone, vec(state.drone_velocity, e, n), rates, hook
+    )
+    cable = sub(high, low)
+    length = norm(cable)
+    direction = scale(1.0 / length, cable)
+    speed, stretch = dot(direction, sub(high_velocity, low_velocity)), length - c.cable_length[e, n]
+
+    # What else pulls the ends apart follows from the velocities after the step.
+    v = c.qvel
+    after = (line[v], line[v + 1], line[v + 2])
+    rates = (line[v + 3], line[v + 4], line[v + 5]) if c.payload_nv == 6 else (0.0, 0.0, 0.0)
+    after = add(after, mul(payload, cross(rates, anchor)))
+    v += c.payload_nv + 6 * n
+    ending = add((line[v], line[v + 1], line[v + 2]), mul(drone, cross((line[v + 3], line[v + 4], line[v + 5]), hook)))
+    gives = mobility(e, 0, payload, anchor, direction, c.inertias)
+    gives += mobility(e, 1 + n, drone, hook, direction, c.inertias)
+    acceleration = (dot(direction, sub(ending, after)) - speed) / c.timestep + gives * tension
+    speed = sqrt(max(speed * speed - 2.0 * acceleration * max(stretch, 0.0), 0.0)) if speed > 0.0 else 0.0
+    if speed == 0.0:
+        return 0.0
+    return snatch_peak(speed, acceleration, 1.0 / gives, c.cable_stiffness[e, n], c.cable_damping[n])
 
 
 @kernel

@@ -21,6 +21,7 @@ from multilift_marl.sim.chain_dynamics import Chain, Motion, Nodes, advance_chai
 from multilift_marl.sim.contact import find_fast, make_bodies, set_speculative
 from multilift_marl.sim.dynamics import apply_loads, make_constants
 from multilift_marl.sim.gusts import start_turbulence
+from multilift_marl.sim.inertia import make_inertias, update_inertias
 from multilift_marl.sim.parameters import (
     Parameters,
     adopt,
@@ -107,6 +108,7 @@ class World:
         self.record, self.diverged = Record.zeros(num_envs), np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
         self.nodes = Nodes.zeros(num_envs, system) if system.cable_model == "chain" else None
+        self._inertias = make_inertias(system, self.parameters)
         self._chain: Chain | None = None
         self._write: Callable[..., None] = write_rows
         self._places: tuple[object, ...] = ()
@@ -201,6 +203,7 @@ class World:
             return
         if self._varied is not None and "vehicle_rotor_time_constant" in names:
             write_lags(self._varied, self.system, self.parameters, changed)
+        update_inertias(self._inertias, self.system, self.parameters)
         if self._chain is not None:
             update_chain(self._chain, self.system, self.parameters)
         for shard in self.shards:
@@ -303,7 +306,7 @@ class World:
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
             batch = Batch(self.model, hi - lo, nthread=1)
             constants = make_constants(self.system, self.layout, batch)
-            places = make_places(self.system, self.layout, self.parameters, batch)  # the same for every shard
+            places = make_places(self.system, self.layout, self.parameters, self._inertias, batch)  # the same for every shard
             span, flow = (batch.state, lo, hi), make_air(self.system)
             air = (None, None) if flow.still else (self.air, flow)
             blown = (self.thrust, self.state, self.plant, self.record, constants, *air, self._varied)
@@ -314,7 +317,7 @@ class World:
                 read = bind(read_rows, *span, batch.bind("sensordata"), *seen)
             else:
                 if self._chain is None:
-                    self._chain = make_chain(self.system, self.layout, self.parameters, batch)
+                    self._chain = make_chain(self.system, self.layout, self.parameters, self._inertias, batch)
                 chains = self._chain, self.nodes
                 self._write, self._places = write_chains, (places, *chains)
                 motion = Motion.zeros(hi - lo, self.system)
