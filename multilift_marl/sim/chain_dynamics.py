@@ -219,22 +219,17 @@ def advance_chains(rows, lo, hi, state, diverged, chain, nodes, motion):
         left, size = UNITS, chain.largest
         while left > 0:
             size = min(size, left)
-            h = size * chain.timestep / UNITS
             if chain.bends:
                 _find_bending(e, i, state, chain, nodes, motion)
-            _find_links(e, i, h, state, chain, nodes, motion)
-            _factorize(e, state, chain, motion)
-            _solve_tensions(e, h, state, chain, motion)
-            while size > 1 and _steepness(e, h, state, chain, motion) > _MARGIN:
-                size //= 2
+            while True:
                 h = size * chain.timestep / UNITS
                 _find_links(e, i, h, state, chain, nodes, motion)
                 _factorize(e, state, chain, motion)
                 _solve_tensions(e, h, state, chain, motion)
-            for _ in range(_PASSES):
-                if _find_turning(e, i, h, chain, nodes, motion) < _SETTLED:
+                if size == 1 or _steepness(e, h, state, chain, motion) <= _MARGIN:
                     break
-                _solve_tensions(e, h, state, chain, motion)
+                size //= 2
+            _add_turning(e, i, h, state, chain, nodes, motion)
             _move(e, i, h, state, chain, nodes, motion)
             left -= size
             if size < chain.largest and _steepness(e, 2.0 * h, state, chain, motion) < _MARGIN:
@@ -460,6 +455,15 @@ def _solve_tensions(e, h, state, chain, motion):
 def _top(e, n, state, chain):
     """Return the last link of cable n that holds: a cable breaks next to its drone."""
     return chain.segments[n] - (2 if state.cable_broken[e, n] else 1)
+
+
+@kernel
+def _add_turning(e, i, h, state, chain, nodes, motion):
+    """Solve again for the tensions, with what the links' turning adds to their stretch, until that has settled."""
+    for _ in range(_PASSES):
+        if _find_turning(e, i, h, chain, nodes, motion) < _SETTLED:
+            break
+        _solve_tensions(e, h, state, chain, motion)
 
 
 @kernel
