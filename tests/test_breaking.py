@@ -25,12 +25,13 @@ def test_a_cable_breaks_when_its_tension_exceeds_the_breaking_load_and_not_befor
     world.step(thrust, 25)
     assert not world.state.cable_broken.any() and world.record.tension_max[0] > 1.2 * 0.4 * GRAVITY
     world.plant.payload_force[:] = [0, 0, -6 * 0.4 * GRAVITY]  # shared by drone and load, as accelerations go
-    tensions = []
+    largest = [0.0]
     for _ in range(25):
-        tensions.append(world.step(thrust).cable_tension[0, 0])
+        world.step(thrust)
+        largest.append(world.record.tension_max[0])
         if world.state.cable_broken[0, 0]:
             break
-    assert tensions[-1] > 2.0 * 0.4 * GRAVITY >= max(tensions[:-1], default=0.0)
+    assert largest[-1] > 2.0 * 0.4 * GRAVITY >= largest[-2]
 
 
 @MODELS
@@ -42,8 +43,8 @@ def test_drone_and_load_part_as_free_bodies(model):
     load_speed, drone_speed = world.state.payload_velocity[0].copy(), world.state.drone_velocity[0, 0].copy()
     world.step(thrust, 100)
     system = world.system
-    lift = thrust[0, 0].sum() / (system.vehicle.mass + system.cable_mass[0] / system.cable_segments[0]) - GRAVITY
-    rope = 0 if model == "massless" else system.cable_mass[0] * 0.9
+    lift = thrust[0, 0].sum() / system.vehicle.mass - GRAVITY
+    rope = 0 if model == "massless" else system.cable_mass[0]
     assert world.state.payload_velocity[0, 2] - load_speed[2] == pytest.approx(-0.4 * GRAVITY, rel=1e-2 + rope)
     assert world.state.drone_velocity[0, 0, 2] - drone_speed[2] == pytest.approx(0.4 * lift, rel=1e-3)
     assert world.state.cable_tension[0, 0] == 0 and not world.diverged.any()

@@ -162,7 +162,7 @@ def test_a_slack_chain_holds_nothing():
     world.step(hover_thrust(world), 25)
     assert world.state.payload_velocity[0, 2] == pytest.approx(-0.981, rel=2e-3)
     assert world.state.cable_tension.max() < 0.2
-    assert world.record.slack_time[0] > 0.07
+    assert world.record.slack_time[0] > 0.05
     assert calm(world)
 
 

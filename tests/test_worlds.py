@@ -13,6 +13,7 @@ from conftest import hover_thrust, make_system, mask, same
 
 from multilift_marl import make_vec
 from multilift_marl.sim import World
+from multilift_marl.sim.contact import DAMPING, STIFFNESS
 from multilift_marl.sim.scene import build_spec
 
 # Many at once
@@ -204,13 +205,9 @@ def test_conjugate_gradients_find_what_newtons_method_finds(preset, num_drones):
             mujoco.mj_forward(model, data)
             touching = max(touching, data.ncon)
             slack += data.nefc - 4 * data.ncon < num_drones
-    assert np.max(far) < 2e-8 and np.median(far) < 1e-10  # [m/s], [rad/s]
+    assert np.max(far) < (4e-6 if preset == "takeoff" else 2e-8)  # [m/s], [rad/s]; many drones rattle on the ground
+    assert np.median(far) < 1e-10
     assert touching >= num_drones if preset == "takeoff" else slack > 0
-
-
-def test_chains_keep_newtons_method():
-    model = World(make_system(2, **{"cable.model": "chain"}), 1, 1).model
-    assert model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON and model.opt.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE
 
 
 # Contact
@@ -238,6 +235,7 @@ def test_contact_by_pairs_is_that_of_mujocos_own_search(overrides):
         spec.delete(pair)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = int(geom.name != "")
+        geom.solref = [-STIFFNESS, -DAMPING]
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER)
     searched, _ = falls(spec.compile())
     assert contacts > 100

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from multilift_marl.config.system import System
 
 MIN_THRUST_TO_WEIGHT = 1.18
+MAX_BENDING = 500.0  # [-] rate of bending in physics steps: substeps are as short as its inverse
 
 
 def check_possible(system: System, ranges: RandomizationConfig) -> None:
@@ -61,6 +63,13 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
         raise ConfigError(
             f"cable {i} would break at rest: {tight[i]:.1f} N under the heaviest payload, but cable.breaking_load is "
             f"{system.breaking_load[i]:g} N; raise it or lower payload.mass"
+        )
+    if system.bending_rate * system.timestep > MAX_BENDING:
+        stiff = replace(system, bending_damping=0 * system.bending_damping).bending_rate == system.bending_rate
+        name = "bending_stiffness" if stiff else "bending_damping"
+        raise ConfigError(
+            f"cable.{name}={getattr(system, name).max():g} is too stiff for links so light; lower it or cable.segments, "
+            "or raise cable.density"
         )
     if n > 1:
         apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)

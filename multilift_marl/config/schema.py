@@ -115,7 +115,9 @@ class CableConfig(Section):
     segments: Links | tuple[Links, ...] = Field(10, description="links of a chain")
     density: PerDrone = Field(0.01, description="[kg/m] of a chain")
     bending_stiffness: Float = Field(0.0, ge=0, description="[N m/rad] between the links of a chain")
-    bending_damping: Float = Field(1e-3, ge=0, description="[N m s/rad] between the links of a chain")
+    bending_damping: Float | None = Field(
+        None, ge=0, description="[N m s/rad] between the links of a chain; None: 90/s × mass of a node × link²"
+    )
     hook: VectorPerDrone = Field(
         (0.0, 0.0, 0.0), description="[m] where the cable is tied to its drone, from its centre of mass, body frame"
     )

@@ -28,6 +28,7 @@ from multilift_marl.math3d import quat_to_mat, thrust_frame
 if TYPE_CHECKING:
     from multilift_marl.config.schema import Config, RandomizationConfig, WindConfig
 
+_BENDING_DECAY = 90.0  # [1/s] of the default damping of bending, over a node's mass times the square of a link
 MIN_SEPARATION = 0.35  # [m] between the centres of two falcons; scales with the mean span
 _FALCON = PRESETS["falcon"]
 
@@ -125,6 +126,18 @@ class System:
         return self.formation_force + GRAVITY * self.cable_mass[:, None] * [0, 0, 1]
 
     @property
+    def bending_rate(self) -> float:
+        """Rate of the fastest bending of any chain [1/s], twice where it swings; 0 without chains.
+
+        Nodes m that move to and fro across links l have ω² = 16 κ/(m l²), and by damping alone the rate 16 β/(m l²).
+        """
+        if self.cable_model != "chain":
+            return 0.0
+        inertia = self.cable_mass / (self.cable_segments - 1) * (self.cable_length / self.cable_segments) ** 2
+        swing = 2 * np.sqrt(16 * self.bending_stiffness / inertia).max()
+        return float(max(swing, (16 * self.bending_damping / inertia).max()))
+
+    @property
     def resting_tension(self) -> np.ndarray:
         """Tension of each resting cable where it is measured, in its segment next to the drone (N,) [N]."""
         return np.linalg.norm(self.drone_pull, axis=1)
@@ -184,6 +197,9 @@ def resolve_system(config: Config) -> System:
         tension = np.linalg.norm(forces, axis=1)
         reach = length[i] / links + tension / (links * stiffness[i])
         ends[i] += (forces / tension[:, None] * reach[:, None]).sum(axis=0)
+    bending_damping = _BENDING_DECAY * rope / np.maximum(segments - 1, 1) * (length / segments) ** 2
+    if cable.bending_damping is not None:
+        bending_damping = np.full(n, cable.bending_damping)
     hooks = vector_per_drone(cable.hook, n, "cable.hook")
     resting = _resting_rotations(vehicles, force + GRAVITY * rope[:, None] * [0, 0, 1])
     slots = ends - (resting * hooks[:, None, :]).sum(axis=-1)
@@ -209,7 +225,7 @@ def resolve_system(config: Config) -> System:
         cable_segments=segments,
         cable_mass=rope,
         bending_stiffness=np.full(n, cable.bending_stiffness),
-        bending_damping=np.full(n, cable.bending_damping),
+        bending_damping=bending_damping,
         formation_force=force,
         hooks=hooks,
         cable_ends=ends,

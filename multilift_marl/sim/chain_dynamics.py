@@ -181,18 +181,9 @@ class Motion(NamedTuple):
 
 
 def largest_substep(system: System) -> int:
-    """Return the longest substep that bending allows, in `UNITS` to a physics step: a power of two, 0 if there is none.
-
-    Springs and dampers along the links are implicit, bending is explicit: its fastest mode, of nodes m that move to and
-    fro across links l, has ω² = 16 κ/(m l²) and, by damping alone, the rate 16 β/(m l²).
-    """
-    inertia = system.cable_mass / (system.cable_segments - 1) * (system.cable_length / system.cable_segments) ** 2
-    fastest = max(
-        2 * float(np.sqrt(16 * system.bending_stiffness / inertia).max()),
-        float((16 * system.bending_damping / inertia).max()),
-    )
-    longest = min(_SUBSTEP, system.timestep, 1 / max(fastest, 1e-9)) * UNITS / system.timestep
-    return 2 ** int(np.log2(longest)) if longest >= 1 else 0
+    """Return the longest substep that bending, which is explicit, allows: a power of two, a physics step being `UNITS`."""
+    longest = min(_SUBSTEP, system.timestep, 1 / max(system.bending_rate, 1e-9))
+    return 2 ** max(0, int(np.log2(longest * UNITS / system.timestep)))
 
 
 @kernel

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
-from multilift_marl.sim.scene import build_model
+from multilift_marl.sim.world import REST_HEIGHT, World
 
 ROPE = 0.01  # [kg/m]
 SEGMENTS = 10
@@ -19,10 +17,10 @@ _ANCHOR_MASS = 1e6  # [kg] of what holds the upper ends; it moves by less than 1
 
 def hanging_chain(
     mass: float, timestep: float, cables: int = 1, angle: float = 0.0, **overrides: Any
-) -> tuple[mujoco.MjModel, mujoco.MjData, System]:
+) -> tuple[World, np.ndarray]:
     """Return a load below fixed anchors on chains of 1 m, straight and at their natural length.
 
-    It is the package's own model, with drones so heavy that they stay where they are, held against gravity and
+    It is the package's own simulation, with drones so heavy that they stay where they are, held against gravity and
     against what the load will weigh.
 
     Args:
@@ -33,35 +31,44 @@ def hanging_chain(
         **overrides: configuration values by name, with __ for the dot.
 
     Returns:
-        The model, its data before the first step, and the system.
+        The world before its first step, and the thrusts that hold the drones (1, N, 4) [N].
     """
     values = {
         "env.num_drones": cables, "cable.model": "chain", "cable.length": 1.0, "cable.angle": float(np.rad2deg(angle)),
-        "cable.density": ROPE, "cable.segments": SEGMENTS, "payload.shape": "point", "payload.mass": mass,
-        "vehicle.mass": _ANCHOR_MASS, "vehicle.rotor_thrust_max": 100 * _ANCHOR_MASS,
-        "vehicle.inertia": (_ANCHOR_MASS,) * 3, "sim.timestep": timestep, "sim.control_hz": 1 / timestep,
+        "cable.density": ROPE, "cable.segments": SEGMENTS, "cable.bending_damping": 0.0, "payload.shape": "point",
+        "payload.mass": mass, "payload.drag_area": 0.0, "vehicle.mass": _ANCHOR_MASS,
+        "vehicle.rotor_thrust_max": 100 * _ANCHOR_MASS, "vehicle.inertia": (_ANCHOR_MASS,) * 3,
+        "vehicle.drag": (0.0, 0.0, 0.0), "vehicle.rotor_inertia": 0.0,
+        "sim.timestep": timestep, "sim.control_hz": 1 / timestep,
     }  # fmt: skip
     system = load_config("hover", values | {key.replace("__", "."): value for key, value in overrides.items()}).system
-    model, layout = build_model(system)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    data = mujoco.MjData(model)
-    data.xfrc_applied[list(layout.drone_bodies), :3] = system.drone_pull + [0, 0, _ANCHOR_MASS * GRAVITY]
-    return model, data, system
+    world = World(system, 1, 1)
+    direction = system.formation_force / np.linalg.norm(system.formation_force, axis=1, keepdims=True)
+    world.state.payload_position[0] = [0.0, 0.0, REST_HEIGHT]
+    world.state.drone_position[0] = world.state.payload_position[0] + system.anchors + direction
+    world.load(np.ones(1, bool))
+    assert world.nodes is not None
+    share = np.arange(1, SEGMENTS)[:, None] / SEGMENTS
+    world.nodes.position[0] = world.state.payload_position[0] + system.anchors[:, None] + share * direction[:, None]
+    world.nodes.velocity[:] = 0.0
+    force = np.linalg.norm(system.drone_pull + [0, 0, _ANCHOR_MASS * GRAVITY], axis=1)
+    return world, np.tile(force[:, None] / 4, (1, 1, 4))
 
 
-def tested_stiffness(data: mujoco.MjData, system: System) -> float:
+def tested_stiffness(world: World) -> float:
     """Return the stiffness [N/m] of the first cable of a load at rest: its tensions over its stretches.
 
     The tensions are what statics says: the load's share below, one node's weight more with every segment, and the
     horizontal pull that goes with the direction of the lowest link.
     """
-    n = int(system.cable_segments[0])
-    lowest = data.body("cable_0/link_0").xmat.reshape(3, 3)[:, 2]
+    system, links = world.system, np.diff(world.cable_points(0, 0), axis=0)
+    n = len(links)
+    size = np.linalg.norm(links, axis=1)
+    lowest = links[0] / size[0]
     share = system.payload_mass * GRAVITY / system.num_drones
-    upward = share + GRAVITY * system.cable_mass[0] / n * np.arange(n)
+    upward = share + GRAVITY * system.cable_mass[0] / (n - 1) * np.arange(n)
     tension = np.hypot(upward, share * np.hypot(lowest[0], lowest[1]) / lowest[2])
-    stretch = [data.joint(f"cable_0/stretch_{j}").qpos[0] for j in range(n)]
-    return float(tension.sum() / (n * np.sum(stretch)))
+    return float(tension.sum() / (n * np.sum(size - system.cable_length[0] / n)))
 
 
 def exponential(matrix: np.ndarray) -> np.ndarray:
@@ -88,7 +95,7 @@ def straight_chain(mass: float, stiffness: float, damping: float, gravity: float
         t: evenly spaced times, the first one step after the start (T,) [s].
     """
     n = SEGMENTS
-    masses = np.full(n, ROPE / n)  # each segment's mass is at its upper end, the first one's at the anchor
+    masses = np.full(n, ROPE / (n - 1))  # of the nodes between the segments
     masses[-1] = mass
     springs = np.diag(np.r_[np.full(n - 1, 2.0), 1.0]) - np.eye(n, k=1) - np.eye(n, k=-1)
     rest = np.linalg.solve(n * stiffness * springs, gravity * masses)
@@ -122,7 +129,7 @@ def inclined_chains(
     along = np.array([np.sin(angle), np.cos(angle)])
     place = link * np.arange(n)[:, None] * along  # the load and the n - 1 free nodes; horizontal, vertical
     velocity, top = np.zeros_like(place), along
-    masses = np.full((n, 2), ROPE / n)
+    masses = np.full((n, 2), ROPE / (n - 1))
     masses[0] = mass / cables
     free = np.ones(2 * n, bool)
     free[0] = False  # by symmetry the load moves vertically
