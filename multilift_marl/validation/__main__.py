@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from multilift_marl.errors import nearest, pip_install
-from multilift_marl.validation import air, bodies, cables, conservation, flight, momentum, symmetry, teams
+from multilift_marl.validation import air, bodies, cables, conservation, flight, momentum, release, symmetry, teams
 from multilift_marl.validation.document import describe, format_table, write_document
 from multilift_marl.validation.draw import draw
 from multilift_marl.validation.experiment import Experiment, Result
@@ -30,6 +30,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "momentum": momentum.momentum,
     "conservation": conservation.conservation,
     "symmetry": symmetry.symmetry,
+    "release": release.release,
     "turbulence": air.turbulence_spectra,
     "gust": air.gust,
     "wash": air.wash,
