@@ -205,7 +205,8 @@ def table() -> str:
     for name, flight in FLIGHTS.items():
         seeds = sorted((HERE / name).glob("seed*.json"))
         scripts = [_cell([HERE / name / f"{script}.json"], error_metric(flight)) for script in SCRIPTED]
-        cells = [_cell(seeds, error_metric(flight)), str(len(seeds)), gain(name), *scripts, flight.published]
+        fresh = [path for path in seeds if path.with_suffix(".npz").is_file()]
+        cells = [_cell(seeds, error_metric(flight)), str(len(fresh or seeds)), gain(name), *scripts, flight.published]
         lines.append(f"| {flight.title} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -236,8 +237,12 @@ def gain(flight: str) -> str:
 
 
 def _cell(paths: list[Path], error: str) -> str:
-    """Return "success %, error cm", means of these results, with the smallest and the largest where they differ."""
-    told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in paths if path.is_file()]
+    """Return "success %, error cm", means of these results, with the smallest and the largest where they differ.
+
+    Results without their episodes are older than today's physics, and marked by a dagger where there are no others.
+    """
+    fresh = [path for path in paths if path.with_suffix(".npz").is_file()]
+    told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in fresh or paths if path.is_file()]
     if not told:
         return "-"
     parts = []
@@ -246,7 +251,7 @@ def _cell(paths: list[Path], error: str) -> str:
         least, most = (f"{value:.{digits}f}" for value in (min(values), max(values)))
         spread = f" ({least} - {most})" if least != most else ""
         parts.append(f"{sum(values) / len(values):.{digits}f}{spread} {unit}")
-    return ", ".join(parts)
+    return ", ".join(parts) + ("" if fresh else " †")
 
 
 def write_tables() -> None:

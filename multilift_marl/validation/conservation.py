@@ -131,8 +131,8 @@ def conservation(fast: bool) -> Result:
     """Teams tumble in free fall with their rotors off and pass through each other; a drone is cut loose."""
     result, seconds = Result(), 3.0 if fast else 10.0
     plot = Plot(
-        "conservation", "energy of a tumbling team", "time [s]", "energy over that at the start",
-        caption="Energy of tumbling teams in free fall, and with what the dampers of chains took.",
+        "conservation", "energy of tumbling teams on chains", "time [s]", "energy over that at the start",
+        caption="Energy of teams that tumble in free fall on chains, which lose it as cables snatch; with what dampers took.",
     )  # fmt: skip
     flights = ((4, 1.1, (1.0, 0.0, 0.0)), (4, 2.0, (0.0, 0.0, 1.0)), (4, 2.0, (1.0, 0.0, 0.0)), (6, 2.0, (0.6, 0.48, 0.64)))
     for model in ("chain", "massless"):
@@ -141,8 +141,10 @@ def conservation(fast: bool) -> Result:
             name = f"tumbling, {model}, {count} drones, {rate:g} rad/s about {axis}"
             result.rows.append(Row(name, "speed of the centre of mass off free fall [m/s]", 0.0, drift.speed, drift.speed, 1e-6))
             result.rows.append(Row(name, "angular momentum, relative change", 0.0, drift.angular, drift.angular, 1e-3))
-            plot.curves.append(Curve(f"{model}, {count}, {rate:g} rad/s", times, energies[:, 0]))
             if model == "chain":
+                about = "xyz"[int(np.argmax(axis))] if max(axis) == 1.0 else "an oblique axis"
+                plot.curves.append(Curve(f"{count} drones, {rate:g} rad/s about {about}", times, energies[:, 0]))
+                plot.curves.append(Curve("" if len(plot.curves) > 1 else "with dampers", times, energies[:, 1], theory=True))
                 result.rows.append(
                     Row(name, "energy with what dampers took, relative change", 0.0, drift.balance, abs(drift.balance), 0.01)
                 )
