@@ -72,7 +72,9 @@ def test_nothing_bounces():
     highest, landed = 0.0, False
     for _ in range(500):
         world.step(np.zeros((1, 1, 4)))
-        landed = landed or world.state.drone_velocity[0, 0, 2] > -0.5 * 6.2 and world.state.drone_position[0, 0, 2] < 0.1
+        landed = landed or (
+            world.state.drone_velocity[0, 0, 2] > -0.5 * 6.2 and world.state.drone_position[0, 0, 2] < 0.1
+        )
         highest = max(highest, world.state.drone_velocity[0, 0, 2] if landed else 0.0)
     assert landed and highest < 0.7  # from 6.2 m/s
     assert world.state.drone_position[0, 0, 2] == pytest.approx(drone_half_size(world.system.vehicle)[2], abs=2e-3)

@@ -10,8 +10,9 @@ from multilift_marl.config.vehicles import PRESETS
 from multilift_marl.control.allocation import allocate
 from multilift_marl.validation.release import attitudes, release_drones
 
+
 def best_by_search(vehicle, thrust, torque, low, high):
-    """Return share of roll and pitch and total thrust by brute force: the first as large, the second as near as can be."""
+    """Return share of roll and pitch and total thrust by brute force, first the largest, then the nearest."""
     inverse = np.linalg.inv(vehicle.allocation)
 
     def range_of_thrust(share):

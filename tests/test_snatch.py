@@ -41,10 +41,12 @@ def test_a_critically_damped_cable_has_a_peak_too():
 
 
 def thrown_apart(speed: float, timestep: float, tilt: float = 0.0, phase: float = 0.3, **cable) -> World:
-    """Return a drone and its payload in free fall that part at `speed` [m/s] until the cable is taut, and a little on."""
+    """Return a drone and its payload in free fall that have parted at `speed` [m/s] until the cable was taut."""
     shape = "box" if tilt else "point"
     values = {"payload.shape": shape, "sim.timestep": timestep, "sim.control_hz": 250}
-    world = World(without_drag(make_system(1, **values, **{f"cable.{key}": value for key, value in cable.items()})), 1, 1)
+    world = World(
+        without_drag(make_system(1, **values, **{f"cable.{key}": value for key, value in cable.items()})), 1, 1
+    )
     state, system = world.state, world.system
     along = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     state.payload_position[:], state.payload_rotation[:], state.drone_rotation[:] = [0, 0, 200], np.eye(3), np.eye(3)

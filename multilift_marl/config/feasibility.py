@@ -68,8 +68,8 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
         stiff = replace(system, bending_damping=0 * system.bending_damping).bending_rate == system.bending_rate
         name = "bending_stiffness" if stiff else "bending_damping"
         raise ConfigError(
-            f"cable.{name}={getattr(system, name).max():g} is too stiff for links so light; lower it or cable.segments, "
-            "or raise cable.density"
+            f"cable.{name}={getattr(system, name).max():g} is too stiff for links so light; lower it or "
+            "cable.segments, or raise cable.density"
         )
     if n > 1:
         apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)

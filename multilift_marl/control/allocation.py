@@ -1,7 +1,7 @@
 """Thrust allocation: from total thrust and body torque to the thrust of each rotor (report eqs 5-11).
 
-Rotors that saturate cannot give both. The order of priority is roll and pitch torque, then total thrust, then yaw torque
-(Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude Control", TCST 2018; so does PX4's sequential
+Rotors that saturate cannot give both. The order of priority is roll and pitch torque, then total thrust, then yaw
+torque (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude Control", TCST 2018; so does PX4's sequential
 desaturation): thrust is of no use to a drone that cannot turn it upward.
 """
 

@@ -34,7 +34,8 @@ from multilift_marl.math3d import (
     sub,
     vec,
 )
-from multilift_marl.sim.chain_dynamics import Chain, Nodes, largest_substep, turned
+from multilift_marl.sim.chain_arrays import Chain, largest_substep
+from multilift_marl.sim.chain_dynamics import turned
 from multilift_marl.sim.hanging import hang
 from multilift_marl.sim.inertia import Inertias
 from multilift_marl.sim.parameters import Parameters
@@ -52,10 +53,8 @@ from multilift_marl.sim.scene import Layout
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def make_chain(
-    system: System, layout: Layout, parameters: Parameters, inertias: Inertias, batch: Batch
-) -> Chain:
-    """Return the chains of `system`, those of each environment by `parameters`; `update_chain` brings them up to date."""
+def make_chain(system: System, layout: Layout, parameters: Parameters, inertias: Inertias, batch: Batch) -> Chain:
+    """Return the chains of `system`, those of each environment by `parameters`, which `update_chain` follows."""
     n, (e, count) = system.cable_segments, parameters.cable_length.shape
     force = field_offset(batch, "qfrc_applied")
     chain = Chain(

@@ -9,9 +9,9 @@ bodies are equal, opposite and in one line. Every place then advances with its n
 SHAKE (Ryckaert, Ciccotti and Berendsen 1977), a symplectic method: linear and angular momentum of payload, nodes and
 drones change by loads alone, to round-off, and energy does not drift.
 
-With the velocities u, w of the ends of a link after the substep, s_j' = s_j + h d_j · (u - w) + h r_j, where r_j is what
-the link's turning adds. Without r_j the tensions solve a linear system: one tridiagonal matrix a cable, eliminated from
-the drone down to its first link, and one dense matrix (N, N) of the first links, which meet at the payload. A few
+With the velocities u, w of the ends of a link after the substep, s_j' = s_j + h d_j · (u - w) + h r_j, where r_j is
+what the link's turning adds. Without r_j the tensions solve a linear system: one tridiagonal matrix a cable, eliminated
+from the drone down to its first link, and one dense matrix (N, N) of the first links, which meet at the payload. A few
 passes with the same factors bring r_j in.
 
 What a tension does across its link is explicit, and stable while T h² < m l. The substep is halved until that holds
@@ -20,13 +20,9 @@ with a margin, so a cable may snatch at any speed.
 
 from __future__ import annotations
 
-from math import atan2, sqrt
-from typing import NamedTuple
-
-import numpy as np
+from math import sqrt
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.math3d import (
     add,
@@ -45,145 +41,12 @@ from multilift_marl.math3d import (
     tmul,
     unit,
 )
+from multilift_marl.sim.chain_arrays import UNITS
+from multilift_marl.sim.chain_bending import find_bending
 
-UNITS = 1024  # into which a physics step can be cut
-_SUBSTEP = 2.5e-4  # [s] the longest substep
 _PASSES = 2  # at most, over what the links' turning adds
 _SETTLED = 1e-6  # [m/s] change of that which needs no further pass
 _MARGIN = 0.3  # [-] T h²/(m l) of a substep that may be taken
-
-
-class Nodes(NamedTuple):
-    """State of the chains: E environments, N cables, S links of the longest one."""
-
-    position: np.ndarray
-    """(E, N, S - 1, 3) from the payload to the drone, world frame [m]."""
-    velocity: np.ndarray
-    """(E, N, S - 1, 3) [m/s]."""
-    contact: np.ndarray
-    """(E, 1 + N, 2, 6) force (world frame) and torque (body frame) of contact in the last step and in that before."""
-
-    @classmethod
-    def zeros(cls, num_envs: int, system: System) -> Nodes:
-        """Return chains at the origin."""
-        e, n, s = num_envs, system.num_drones, int(system.cable_segments.max())
-        return cls(np.zeros((e, n, s - 1, 3)), np.zeros((e, n, s - 1, 3)), np.zeros((e, 1 + n, 2, 6)))
-
-
-class Chain(NamedTuple):
-    """Numbers of the chains and of the bodies that they tie together; body 0 is the payload, 1 + n drone n."""
-
-    segments: np.ndarray
-    """(N,) links."""
-    length: np.ndarray
-    """(E, N) of a link [m]."""
-    stiffness: np.ndarray
-    """(E, N) of a link [N/m]."""
-    damping: np.ndarray
-    """(N,) of a link [N s/m]."""
-    node_mass: np.ndarray
-    """(E, N) [kg]."""
-    bending_stiffness: np.ndarray
-    """(N,) between neighbouring links [N m/rad]."""
-    bending_damping: np.ndarray
-    """(N,) [N m s/rad]."""
-    anchors: np.ndarray
-    """(N, 3) on the payload, from its body frame's origin [m]."""
-    hooks: np.ndarray
-    """(N, 3) on the drones, from their centres of mass [m]."""
-    mass: np.ndarray
-    """(E, 1 + N) of the bodies [kg]."""
-    inertia: np.ndarray
-    """(E, 1 + N, 3, 3) about their centres of mass, body frame [kg m²]."""
-    inverse_inertia: np.ndarray
-    """(E, 1 + N, 3, 3) zero of a point payload, which does not turn."""
-    center: np.ndarray
-    """(E, 1 + N, 3) centre of mass from the body frame's origin [m]."""
-    breaking_load: np.ndarray
-    """(N,) [N]."""
-    loads: np.ndarray
-    """(1 + N,) offsets of the bodies' applied forces in a row of `batch.state`."""
-    timestep: float
-    """Of the physics [s]."""
-    largest: int
-    """Length of the longest substep, a physics step being `UNITS`."""
-    bends: bool
-    """Whether any cable resists bending."""
-
-
-class Motion(NamedTuple):
-    """Working arrays of a shard: its L environments, B = 1 + N bodies, S links of the longest chain."""
-
-    position: np.ndarray
-    """(L, B, 3) of the centres of mass [m]; after the step of the body frames' origins, like the next one."""
-    velocity: np.ndarray
-    """(L, B, 3) [m/s]."""
-    rotation: np.ndarray
-    """(L, B, 3, 3)."""
-    rates: np.ndarray
-    """(L, B, 3) body frame [rad/s]."""
-    stretch: np.ndarray
-    """(L, N, S) of the links [m]."""
-    tension: np.ndarray
-    """(L, N) next to the drone, in the last substep, at least 0 [N]."""
-    peak: np.ndarray
-    """(L, N) largest one in the physics step [N]."""
-    dissipated: np.ndarray
-    """(L,) energy that dampers, along the links and of bending, took in the physics step [J]."""
-    momentum: np.ndarray
-    """(B, 3) angular, about the centre of mass, world frame [N m s]; of one environment, like all below."""
-    force: np.ndarray
-    """(B, 3) gravity and loads, world frame [N]."""
-    torque: np.ndarray
-    """(B, 3) about the centre of mass, body frame [N m]."""
-    impulse: np.ndarray
-    """(B, 6) of the cables so far: linear in the world frame, angular about the origin in the body frame."""
-    free_velocity: np.ndarray
-    """(B, 3) at the end of the substep, were it not for the cables [m/s]."""
-    free_rates: np.ndarray
-    """(B, 3) likewise, world frame [rad/s]."""
-    ends: np.ndarray
-    """(N, 2, 3) anchor and hook from their bodies' centres of mass, world frame [m]."""
-    twist: np.ndarray
-    """(N, 3) angular velocity that a unit impulse of the first link gives the payload [1/(kg m)]."""
-    direction: np.ndarray
-    """(N, S, 3) of the links, from payload to drone."""
-    bending: np.ndarray
-    """(N, S - 1, 3) force of bending on the nodes [N]."""
-    bend_force: np.ndarray
-    """(B, 3) on the bodies, world frame [N], and its moment about their centres of mass, (B, 3) [N m]."""
-    bend_moment: np.ndarray
-    bend_power: np.ndarray
-    """(1,) that the dampers of bending take [W]."""
-    turning: np.ndarray
-    """(N, S) by how much a link stretches faster because it turns [m/s]."""
-    pull: np.ndarray
-    """(N, S) tension of each link [N]."""
-    diagonal: np.ndarray
-    """(N, S) of the tridiagonal matrices, and the elements beside it, (N, S) of links j - 1 and j [1/kg]."""
-    coupling: np.ndarray
-    right: np.ndarray
-    """(N, S) right-hand sides [m/s²]."""
-    matrix: np.ndarray
-    """(N, N) of the first links [1/kg]."""
-
-    @classmethod
-    def zeros(cls, size: int, system: System) -> Motion:
-        """Return arrays for `size` environments."""
-        e, n, s = size, system.num_drones, int(system.cable_segments.max())
-        b = 1 + n
-        shapes = (
-            (e, b, 3), (e, b, 3), (e, b, 3, 3), (e, b, 3), (e, n, s), (e, n), (e, n), (e,),
-            (b, 3), (b, 3), (b, 3), (b, 6), (b, 3), (b, 3), (n, 2, 3), (n, 3), (n, s, 3), (n, s - 1, 3),
-            (b, 3), (b, 3), (1,), (n, s), (n, s), (n, s), (n, s), (n, s), (n, n),
-        )  # fmt: skip
-        return cls(*(np.zeros(shape) for shape in shapes))
-
-
-def largest_substep(system: System) -> int:
-    """Return the longest substep that bending, which is explicit, allows: a power of two, a physics step being `UNITS`."""
-    longest = min(_SUBSTEP, system.timestep, 1 / max(system.bending_rate, 1e-9))
-    return 2 ** max(0, int(np.log2(longest * UNITS / system.timestep)))
 
 
 @kernel
@@ -211,7 +74,7 @@ def advance_chains(rows, lo, hi, state, diverged, chain, nodes, motion):
         while left > 0:
             size = min(size, left)
             if chain.bends:
-                _find_bending(e, i, state, chain, nodes, motion)
+                find_bending(e, i, state, chain, nodes, motion)
             while True:
                 h = size * chain.timestep / UNITS
                 _find_links(e, i, h, state, chain, nodes, motion)
@@ -336,65 +199,6 @@ def _find_links(e, i, h, state, chain, nodes, motion):
 
 
 @kernel
-def _find_bending(e, i, state, chain, nodes, motion):
-    """Find the forces of bending on nodes and bodies: of the moment κ θ + β θ̇ at the angle θ between two links.
-
-    The forces on the three points of a bend are the moment times the derivatives of θ by their places. They have
-    neither a sum nor a moment. Anchor and hook are free pivots.
-    """
-    motion.bend_power[0] = 0.0
-    motion.bend_force[:] = 0.0
-    motion.bend_moment[:] = 0.0
-    motion.bending[:] = 0.0
-    payload = matrow(motion.rotation[i], 0)
-    for n in range(chain.segments.shape[0]):
-        links = chain.segments[n]
-        arm = mul(payload, sub(row(chain.anchors, n), row(chain.center[e], 0)))
-        low, low_velocity = _end(i, 0, arm, motion)
-        middle, middle_velocity = row(nodes.position[e, n], 0), row(nodes.velocity[e, n], 0)
-        for j in range(links - 1):
-            if j < links - 2:
-                high, high_velocity = row(nodes.position[e, n], j + 1), row(nodes.velocity[e, n], j + 1)
-            elif state.cable_broken[e, n]:
-                break
-            else:
-                hook = mul(matrow(motion.rotation[i], 1 + n), row(chain.hooks, n))
-                high, high_velocity = _end(i, 1 + n, hook, motion)
-            first, second = sub(middle, low), sub(high, middle)
-            size1, size2 = norm(first), norm(second)
-            d1, d2 = scale(1.0 / size1, first), scale(1.0 / size2, second)
-            sine, cosine = norm(cross(d1, d2)), dot(d1, d2)
-            if sine > 1e-9:
-                # The angle shrinks as d1 moves along e1 and d2 along e2, unit vectors across the links in the bend.
-                e1 = scale(1.0 / (sine * size1), sub(d2, scale(cosine, d1)))
-                e2 = scale(1.0 / (sine * size2), sub(d1, scale(cosine, d2)))
-                closing = dot(e1, sub(middle_velocity, low_velocity)) + dot(e2, sub(high_velocity, middle_velocity))
-                motion.bend_power[0] += chain.bending_damping[n] * closing * closing
-                moment = chain.bending_stiffness[n] * atan2(sine, cosine) - chain.bending_damping[n] * closing
-                on_low, on_high = scale(-moment, e1), scale(moment, e2)
-                on_middle = sub((0.0, 0.0, 0.0), add(on_low, on_high))
-                put(motion.bending[n, j], add(row(motion.bending[n], j), on_middle))
-                if j > 0:
-                    put(motion.bending[n, j - 1], add(row(motion.bending[n], j - 1), on_low))
-                else:
-                    put(motion.bend_force[0], add(row(motion.bend_force, 0), on_low))
-                    put(motion.bend_moment[0], add(row(motion.bend_moment, 0), cross(arm, on_low)))
-                if j < links - 2:
-                    put(motion.bending[n, j + 1], add(row(motion.bending[n], j + 1), on_high))
-                else:
-                    put(motion.bend_force[1 + n], on_high)
-                    put(motion.bend_moment[1 + n], cross(hook, on_high))
-            low, low_velocity, middle, middle_velocity = middle, middle_velocity, high, high_velocity
-
-
-@kernel
-def _end(i, b, arm, motion):
-    """Return place and velocity of a point of body b, `arm` from its centre of mass in the world frame."""
-    rates = mul(matrow(motion.rotation[i], b), row(motion.rates[i], b))
-    return add(row(motion.position[i], b), arm), add(row(motion.velocity[i], b), cross(rates, arm))
-
-
-@kernel
 def _factorize(e, state, chain, motion):
     """Factorize the system of a substep: eliminate each cable from its drone down, then Cholesky of the first links."""
     count = chain.segments.shape[0]
@@ -459,7 +263,7 @@ def _add_turning(e, i, h, state, chain, nodes, motion):
 
 @kernel
 def _find_turning(e, i, h, chain, nodes, motion):
-    """Find by how much faster than d · (u - w) the links stretch as they turn, by the last tensions; return its change."""
+    """Find by how much faster than d · (u - w) links stretch as they turn, by the last tensions; return its change."""
     change = 0.0
     for n in range(chain.segments.shape[0]):
         links = chain.segments[n]
@@ -533,7 +337,9 @@ def _move(e, i, h, state, chain, nodes, motion):
         torque = add(mul(matrow(motion.rotation[i], b), row(motion.torque, b)), row(motion.bend_moment, b))
         put(motion.momentum[b], add(row(motion.momentum, b), scale(h, torque)))
         if chain.bends:
-            _note_impulse(b, i, scale(h, row(motion.bend_force, b)), scale(h, row(motion.bend_moment, b)), e, chain, motion)
+            _note_impulse(
+                b, i, scale(h, row(motion.bend_force, b)), scale(h, row(motion.bend_moment, b)), e, chain, motion
+            )
 
     for n in range(chain.segments.shape[0]):
         links, top = chain.segments[n], chain.segments[n] - 1

@@ -87,9 +87,9 @@ def find_fast(lo, hi, state, fast, bodies):
 
 
 def set_speculative(batch: Batch, fast: np.ndarray) -> None:
-    """Let MuJoCo look for contacts of the step to come in the simulations in `fast` (n,), where drones might pass others.
+    """Let MuJoCo look for contacts of the step to come in the simulations in `fast` (n,) bool.
 
-    It would cost all of them a seventh of a step's time.
+    In all of them it would cost a seventh of a step's time.
     """
     flags = batch.expand("opt.enableflags")
     flags.reshape(len(fast), -1)[:, 0] = np.where(fast, flags.reshape(len(fast), -1)[:, 0] | _SPECULATIVE, 0)

@@ -196,6 +196,6 @@ def write_model(
 
 
 def fit_cables(batch: Batch, system: System, p: Parameters, broken: np.ndarray) -> None:
-    """Let the massless cables in `broken` (n, N) bool of a batch's n simulations pull no more, and all others be whole."""
+    """Let the massless cables in `broken` (n, N) bool of a batch's simulations pull no more, all others be whole."""
     if system.cable_model == "massless":
         batch.expand("tendon_range")[..., 1] = np.where(broken, _FAR, p.cable_length)

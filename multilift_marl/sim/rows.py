@@ -62,9 +62,7 @@ class Places(NamedTuple):
     payload_nv: int
 
 
-def make_places(
-    system: System, layout: Layout, parameters: Parameters, inertias: Inertias, batch: Batch
-) -> Places:
+def make_places(system: System, layout: Layout, parameters: Parameters, inertias: Inertias, batch: Batch) -> Places:
     """Return the places of `system` with live `parameters` in the rows of a batch."""
     return Places(
         timestep=system.timestep,

@@ -17,7 +17,8 @@ from multilift_marl._jit import bind
 from multilift_marl.config.system import System
 from multilift_marl.sim.air import make_air
 from multilift_marl.sim.chain import make_chain, read_chains, update_chain, write_chains
-from multilift_marl.sim.chain_dynamics import Chain, Motion, Nodes, advance_chains
+from multilift_marl.sim.chain_arrays import Chain, Motion, Nodes
+from multilift_marl.sim.chain_dynamics import advance_chains
 from multilift_marl.sim.contact import find_fast, make_bodies, set_speculative
 from multilift_marl.sim.dynamics import apply_loads, make_constants
 from multilift_marl.sim.gusts import start_turbulence
@@ -252,7 +253,7 @@ class World:
         return shard.batch.bind("qpos")[env - shard.lo]
 
     def cable_points(self, env: int, cable: int) -> np.ndarray:
-        """Return the points of a cable from its anchor up to its hook (S + 1, 3) [m]; of a broken one without the hook."""
+        """Return the points of a cable from its anchor to its hook (S + 1, 3) [m]; of a broken one without the hook."""
         state, system = self.state, self.system
         anchor = state.payload_position[env] + state.payload_rotation[env] @ system.anchors[cable]
         hook = state.drone_position[env, cable] + state.drone_rotation[env, cable] @ system.hooks[cable]
@@ -306,7 +307,9 @@ class World:
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
             batch = Batch(self.model, hi - lo, nthread=1)
             constants = make_constants(self.system, self.layout, batch)
-            places = make_places(self.system, self.layout, self.parameters, self._inertias, batch)  # the same for every shard
+            places = make_places(
+                self.system, self.layout, self.parameters, self._inertias, batch
+            )  # the same for every shard
             span, flow = (batch.state, lo, hi), make_air(self.system)
             air = (None, None) if flow.still else (self.air, flow)
             blown = (self.thrust, self.state, self.plant, self.record, constants, *air, self._varied)

@@ -59,7 +59,9 @@ def totals(world: World, env: int = 0) -> Totals:
     return Totals(float(mass.sum()), center, linear, angular, energy)
 
 
-def tumbling_team(model: str, num_drones: int, rate: float, axis: tuple[float, float, float], **overrides: Any) -> World:
+def tumbling_team(
+    model: str, num_drones: int, rate: float, axis: tuple[float, float, float], **overrides: Any
+) -> World:
     """Return a team that turns as one about its centre of mass, high above the ground, rotors off, without drag.
 
     Args:
@@ -107,7 +109,7 @@ def without_contact(world: World) -> World:
 
 
 def free_flight(world: World, seconds: float) -> tuple[Drift, np.ndarray, np.ndarray]:
-    """Let a team fall, and return its drift, times (T,) [s] and energies (T, 2) over the first: left, and with dampers."""
+    """Let a team fall; return its drift, times (T,) [s] and energies (T, 2) over the first: left, and with dampers."""
     start, shard, h = totals(world), world.shards[0], world.system.timestep
     thrust, taken, times, energies = np.zeros((1, world.num_drones, 4)), 0.0, [], []
     steps = round(seconds / h)
@@ -132,26 +134,44 @@ def conservation(fast: bool) -> Result:
     result, seconds = Result(), 3.0 if fast else 10.0
     plot = Plot(
         "conservation", "energy of tumbling teams on chains", "time [s]", "energy over that at the start",
-        caption="Energy of teams that tumble in free fall on chains, which lose it as cables snatch; with what dampers took.",
+        caption="Energy of teams that tumble in free fall on chains and lose it in snatches; with what dampers took.",
     )  # fmt: skip
-    flights = ((4, 1.1, (1.0, 0.0, 0.0)), (4, 2.0, (0.0, 0.0, 1.0)), (4, 2.0, (1.0, 0.0, 0.0)), (6, 2.0, (0.6, 0.48, 0.64)))
+    flights = (
+        (4, 1.1, (1.0, 0.0, 0.0)),
+        (4, 2.0, (0.0, 0.0, 1.0)),
+        (4, 2.0, (1.0, 0.0, 0.0)),
+        (6, 2.0, (0.6, 0.48, 0.64)),
+    )
     for model in ("chain", "massless"):
         for count, rate, axis in flights:
             drift, times, energies = free_flight(without_contact(tumbling_team(model, count, rate, axis)), seconds)
             name = f"tumbling, {model}, {count} drones, {rate:g} rad/s about {axis}"
-            result.rows.append(Row(name, "speed of the centre of mass off free fall [m/s]", 0.0, drift.speed, drift.speed, 1e-6))
+            result.rows.append(
+                Row(name, "speed of the centre of mass off free fall [m/s]", 0.0, drift.speed, drift.speed, 1e-6)
+            )
             result.rows.append(Row(name, "angular momentum, relative change", 0.0, drift.angular, drift.angular, 1e-3))
             if model == "chain":
                 about = "xyz"[int(np.argmax(axis))] if max(axis) == 1.0 else "an oblique axis"
                 plot.curves.append(Curve(f"{count} drones, {rate:g} rad/s about {about}", times, energies[:, 0]))
-                plot.curves.append(Curve("" if len(plot.curves) > 1 else "with dampers", times, energies[:, 1], theory=True))
+                plot.curves.append(
+                    Curve("" if len(plot.curves) > 1 else "with dampers", times, energies[:, 1], theory=True)
+                )
                 result.rows.append(
-                    Row(name, "energy with what dampers took, relative change", 0.0, drift.balance, abs(drift.balance), 0.01)
+                    Row(
+                        name,
+                        "energy with what dampers took, relative change",
+                        0.0,
+                        drift.balance,
+                        abs(drift.balance),
+                        0.01,
+                    )
                 )
     result.plots.append(plot)
     for model in ("chain", "massless"):
         error = cut_loose(model)
-        result.rows.append(Row(f"cut loose, {model}", "velocity off free fall after 2 s [m/s]", 0.0, error, error, 1e-6))
+        result.rows.append(
+            Row(f"cut loose, {model}", "velocity off free fall after 2 s [m/s]", 0.0, error, error, 1e-6)
+        )
     return result
 
 
