@@ -129,7 +129,7 @@ def test_ctbr_turns_at_the_body_rates_asked_for(axis, full):
     vec = flying("ctbr", num_drones=1)
     action = [0.0, 0.0, 0.0, 0.0]
     action[1 + axis] = 0.1
-    for _ in range(10):
+    for _ in range(25):
         step(vec, *action)
     expected = np.zeros(3)
     expected[axis] = 0.1 * full

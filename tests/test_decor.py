@@ -34,16 +34,10 @@ def geoms(stage):
 
 
 def cable_colours(stage):
-    """Return the colours (N, 3) in which cables are drawn."""
-    found = {}
-    for geom in geoms(stage):
-        if geom.objtype == TENDON:
-            found[geom.objid] = np.array(geom.rgba[:3])
-        elif geom.objtype == GEOM:
-            name = stage.model.body(stage.model.geom_bodyid[geom.objid]).name
-            if name.startswith("cable_"):
-                found[int(name.split("/")[0].removeprefix("cable_"))] = np.array(geom.rgba[:3])
-    return np.array([found[n] for n in sorted(found)])
+    """Return the colours (N, 3) in which cables are drawn, of chains those of their first links, of ten."""
+    tendons = {geom.objid: np.array(geom.rgba[:3]) for geom in geoms(stage) if geom.objtype == TENDON}
+    links = [np.array(geom.rgba[:3]) for geom in extra(stage) if geom.emission > 0]
+    return np.array([tendons[n] for n in sorted(tendons)] or links[::10])
 
 
 def extra(stage):

@@ -21,43 +21,56 @@ def allocate(thrust, torque, inverse, low, high):
         inverse: inverse of `Vehicle.allocation` (4, 4); its first column must be positive.
         low, high: limits of one rotor [N].
     """
-    # Roll and pitch: the largest share of them that some total thrust leaves within the limits of all rotors. Rotor k
-    # bounds that thrust by (low - share t_k)/a_k and (high - share t_k)/a_k; no lower bound may exceed an upper one.
-    share = 1.0
-    for k in range(4):
-        a = inverse[k, 0]
-        tilt = inverse[k, 1] * torque[0] + inverse[k, 2] * torque[1]
-        for j in range(4):
-            b = inverse[j, 0]
-            other = inverse[j, 1] * torque[0] + inverse[j, 2] * torque[1]
-            need = other / b - tilt / a
-            room = high / b - low / a
-            if need > room:
-                share = min(share, max(room, 0.0) / need)
-    roll, pitch = share * torque[0], share * torque[1]
+    # All of thrust, roll and pitch, with as much yaw as that leaves: the rule, and always where the rotors can do it.
+    roll, pitch, total = torque[0], torque[1], thrust
+    least, most = _yaw_range(total, roll, pitch, torque[2], inverse, low, high)
+    if least > most:
+        # Roll and pitch: the largest share of them that some total thrust leaves within the limits of all rotors. Rotor k
+        # bounds that thrust by (low - share t_k)/a_k and (high - share t_k)/a_k; no lower bound may exceed an upper one.
+        share = 1.0
+        for k in range(4):
+            a = inverse[k, 0]
+            tilt = inverse[k, 1] * torque[0] + inverse[k, 2] * torque[1]
+            for j in range(4):
+                b = inverse[j, 0]
+                need = (inverse[j, 1] * torque[0] + inverse[j, 2] * torque[1]) / b - tilt / a
+                room = high / b - low / a
+                if need > room:
+                    share = min(share, max(room, 0.0) / need)
+        roll, pitch = share * torque[0], share * torque[1]
 
-    # Thrust: as near to what is asked as that leaves.
-    least, most = -1e30, 1e30
-    for k in range(4):
-        tilt = inverse[k, 1] * roll + inverse[k, 2] * pitch
-        least = max(least, (low - tilt) / inverse[k, 0])
-        most = min(most, (high - tilt) / inverse[k, 0])
-    total = min(max(thrust, least), most)
-
-    # Yaw: as much as is left.
-    share = 1.0
-    for k in range(4):
-        base = inverse[k, 0] * total + inverse[k, 1] * roll + inverse[k, 2] * pitch
-        yaw = inverse[k, 3] * torque[2]
-        room = (high - base) if yaw > 0.0 else (low - base)
-        if abs(yaw) > 1e-12:
-            share = min(share, max(room / yaw, 0.0))
-    yaw = share * torque[2]
+        # Thrust: as near to what is asked as that leaves, and what it leaves of yaw.
+        least, most = -1e30, 1e30
+        for k in range(4):
+            tilt = inverse[k, 1] * roll + inverse[k, 2] * pitch
+            least = max(least, (low - tilt) / inverse[k, 0])
+            most = min(most, (high - tilt) / inverse[k, 0])
+        total = min(max(thrust, least), most)
+        least, most = _yaw_range(total, roll, pitch, torque[2], inverse, low, high)
+    yaw = max(most, 0.0) * torque[2]
     f0 = _rotor(0, total, roll, pitch, yaw, inverse, low, high)
     f1 = _rotor(1, total, roll, pitch, yaw, inverse, low, high)
     f2 = _rotor(2, total, roll, pitch, yaw, inverse, low, high)
     f3 = _rotor(3, total, roll, pitch, yaw, inverse, low, high)
     return (f0, f1, f2, f3)
+
+
+@kernel
+def _yaw_range(thrust, roll, pitch, yaw, inverse, low, high):
+    """Return the least and the largest share of a yaw torque, from 0 to 1, with which all rotors keep their limits.
+
+    There is none where the least exceeds the largest.
+    """
+    least, most = 0.0, 1.0
+    for k in range(4):
+        base = inverse[k, 0] * thrust + inverse[k, 1] * roll + inverse[k, 2] * pitch
+        change = inverse[k, 3] * yaw
+        if abs(change) > 1e-12:
+            first, second = (low - base) / change, (high - base) / change
+            least, most = max(least, min(first, second)), min(most, max(first, second))
+        elif base < low or base > high:
+            least, most = 1.0, 0.0
+    return least, most
 
 
 @kernel
