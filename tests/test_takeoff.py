@@ -90,7 +90,7 @@ def test_the_team_of_a_known_payload_lifts_it_with_no_jerk_at_its_cables():
     vec = after(ARRIVED + 1.0, 4, **CALM)
     assert (vec.task.stage == LIFTED).all()
     assert vec.task.errors.distance.max() < 0.01
-    assert (vec.world.record.tension_max < 1.5 * vec.world.system.resting_tension.max()).all()  # inside a step, too
+    assert (vec.world.record.tension_max < 1.3 * vec.world.system.resting_tension.max()).all()
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
@@ -101,7 +101,7 @@ def test_the_pull_suits_lighter_and_heavier_payloads(factor):
     for _ in range(vec.max_steps):
         *_, info = vec.step(zeros(vec))
     assert info["success"].all()
-    assert (vec.world.record.tension_max < 1.75 * factor * vec.world.system.resting_tension.max()).all()
+    assert (vec.world.record.tension_max < 1.5 * factor * vec.world.system.resting_tension.max()).all()
 
 
 # What is forgiven

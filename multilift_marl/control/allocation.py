@@ -25,8 +25,9 @@ def allocate(thrust, torque, inverse, low, high):
     roll, pitch, total = torque[0], torque[1], thrust
     least, most = _yaw_range(total, roll, pitch, torque[2], inverse, low, high)
     if least > most:
-        # Roll and pitch: the largest share of them that some total thrust leaves within the limits of all rotors. Rotor k
-        # bounds that thrust by (low - share t_k)/a_k and (high - share t_k)/a_k; no lower bound may exceed an upper one.
+        # Roll and pitch: the largest share of them that some total thrust leaves within the limits of all rotors.
+        # Rotor k bounds that thrust by (low - share t_k)/a_k and (high - share t_k)/a_k; no lower bound may exceed an
+        # upper one.
         share = 1.0
         for k in range(4):
             a = inverse[k, 0]

@@ -167,7 +167,7 @@ _AT_END = ("cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_se
 def _at_end(vec: MultiliftVec) -> dict[str, np.ndarray]:
     """Return what has accumulated over the episodes, (E,) each, in the order of `_AT_END`."""
     record = vec.world.record
-    values = (record.tension_min, record.tension_max, record.slack_time, vec.task.min_separation, record.energy)
+    values = (record.tension_min, record.tension_peak, record.slack_time, vec.task.min_separation, record.energy)
     return dict(zip(_AT_END, values, strict=True))
 
 

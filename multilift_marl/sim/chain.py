@@ -43,6 +43,7 @@ from multilift_marl.sim.rows import (
     MAX_RATE,
     MAX_SPEED,
     MAX_STRETCH,
+    clear_record,
     field_offset,
     note_tensions,
     read_payload,
@@ -124,7 +125,7 @@ def read_chains(rows, lo, hi, constraint, state, record, diverged, c, chain, nod
         for n in range(chain.segments.shape[0]):
             tension = motion.tension[i, n]
             state.cable_tension[e, n] = tension
-            record.tension_max[e] = max(record.tension_max[e], motion.peak[i, n])
+            record.tension_peak[e] = max(record.tension_peak[e], motion.peak[i, n])
             slack = slack or tension <= GRAVITY * chain.node_mass[e, n] * (chain.segments[n] - 1)  # its own weight
         if slack:
             record.slack_time[e] += c.timestep
@@ -232,5 +233,5 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain, nodes):
             opening = dot(row(links, n - 1), row(links[:, 4:], n - 1))
             tension = chain.stiffness[e, i] * links[n - 1, 3] + chain.damping[i] * opening
             state.cable_tension[e, i] = max(0.0, tension)
-        record.tension_max[e], record.stretch_max[e], record.tension_min[e] = 0.0, 0.0, 1e9
+        clear_record(e, record)
     note_tensions(lo, hi, mask, True, state, record, c)

@@ -111,7 +111,7 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
         for n in range(tension.shape[1]):
             if tension[e - lo, n] > 0.0 and state.cable_tension[e, n] == 0.0:
                 peak = _find_peak(e, n, line, tension[e - lo, n], state, c)
-                record.tension_max[e] = max(record.tension_max[e], peak)
+                record.tension_peak[e] = max(record.tension_peak[e], peak)
                 state.cable_broken[e, n] = state.cable_broken[e, n] or peak > c.breaking_load[n]
             for j in range(3):
                 state.drone_position[e, n, j] = line[at + j]
@@ -196,6 +196,7 @@ def note_tensions(lo, hi, chosen, which, state, record, c):
                 state.cable_broken[e, n] = True
             record.tension_min[e] = min(record.tension_min[e], pull)
             record.tension_max[e] = max(record.tension_max[e], pull)
+            record.tension_peak[e] = max(record.tension_peak[e], pull)
             record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[e, n] * c.cable_length[e, n]))
 
 
@@ -262,4 +263,5 @@ def write_payload(e, line, state, c):
 def clear_record(e, record):
     """Let the record of environment e start anew."""
     record.energy[e], record.slack_time[e] = 0.0, 0.0
-    record.tension_min[e], record.tension_max[e], record.stretch_max[e] = 1e9, 0.0, 0.0
+    record.tension_min[e], record.tension_max[e], record.tension_peak[e] = 1e9, 0.0, 0.0
+    record.stretch_max[e] = 0.0

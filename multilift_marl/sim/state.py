@@ -89,7 +89,9 @@ class Record(NamedTuple):
     tension_min: np.ndarray
     """(E,) smallest cable tension [N]."""
     tension_max: np.ndarray
-    """(E,) largest cable tension [N]."""
+    """(E,) largest cable tension, mean of a physics step; of chains of its last substep [N]."""
+    tension_peak: np.ndarray
+    """(E,) largest cable tension, the peaks of snatches inside a step and all substeps included [N]."""
     slack_time: np.ndarray
     """(E,) time with any cable slack, or a chain that pulls its drone by no more than its weight [s]."""
     stretch_max: np.ndarray
