@@ -65,18 +65,18 @@ def test_a_few_iterations_improve_the_return(tmp_path):
     trainer = make_trainer(
         tmp_path,
         **{
-            "env.num_envs": 64, "env.num_threads": 0, "env.episode_seconds": 4.0, "train.horizon": 32,
-            "train.frames": 64 * 32 * 40, "eval.episodes": 64, "train.residual": "formation", "train.overrides": {},
-            "train.initial_std": 0.3, "train.learning_rate": 1e-3, "train.critic_learning_rate": None,
-            "train.epochs": 4, "train.gae_lambda": 0.95, "train.hidden": [128, 128],
+            "seed": 1, "env.num_envs": 64, "env.num_threads": 0, "env.episode_seconds": 4.0, "train.horizon": 128,
+            "train.frames": 64 * 128 * 20, "eval.episodes": 64, "train.residual": "formation", "train.overrides": {},
+            "train.initial_std": 0.5, "train.learning_rate": 3e-4, "train.critic_learning_rate": None,
+            "train.epochs": 4, "train.gae_lambda": 0.97, "train.hidden": [128, 128],
         },
     )  # fmt: skip
     rewards, values = [], {}
-    for _ in range(40):
+    for _ in range(13):
         values = trainer.step()
         rewards.append(values["reward/total"])
-    settled = np.mean(rewards[4:14])  # before, the episodes that were all begun at once differ
-    assert np.mean(rewards[-10:]) > 1.025 * settled, rewards  # five times what a mean of ten varies by
+    settled = np.mean(rewards[2:6])  # before, the episodes that were all begun at once differ
+    assert np.mean(rewards[-4:]) > 1.04 * settled, rewards
     assert values["explained_variance"] > 0.2
 
 
