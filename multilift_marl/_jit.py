@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import fcntl
 import functools
-import hashlib
-import os
 from collections.abc import Callable
-from contextlib import ExitStack
-from pathlib import Path
 from typing import Any, TypeVar, TypeVarTuple, cast
 
-from numba import njit, typeof
+from numba import config, njit, typeof
+
+from multilift_marl._kernel_cache import cache_folder, make_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 Arguments = TypeVarTuple("Arguments")
-_PACKAGE = Path(__file__).parent
-_STAMP = _PACKAGE / "__pycache__" / "kernels.sha256"
-_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "__init__.py")
 
 
 def kernel(function: F) -> F:
@@ -25,27 +19,10 @@ def kernel(function: F) -> F:
 
     Arithmetic is exact IEEE, so results do not depend on how many environments are computed together.
     """
-    dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy")(function)
-    if (cache := getattr(dispatcher, "_cache", None)) is not None:  # none where Numba is switched off
-        cache._cache_file.save = functools.partial(_save_in_turn, cache._cache_file, cache._cache_file.save)
+    dispatcher: Any = njit(nogil=True, error_model="numpy")(function)
+    if not config.DISABLE_JIT:  # else it is the function itself
+        dispatcher._cache = make_cache(function)
     return cast(F, dispatcher)
-
-
-def _save_in_turn(files: Any, save: Callable[[Any, Any], None], key: Any, data: Any) -> None:
-    """Add to the cache while no other process does.
-
-    Numba numbers a kernel's files by an index that it reads first: two processes that compile different signatures at
-    once would write the same file, and one would later be taken for the other. Nothing is added by a process that began
-    with other sources than there are now.
-    """
-    with ExitStack() as held:
-        try:
-            lock = held.enter_context(open(os.path.join(files._cache_path, "kernels.lock"), "w"))
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        except OSError:  # a file system that knows no locks
-            pass
-        if not _STAMP.is_file() or _STAMP.read_text() == _SOURCES:
-            save(key, data)
 
 
 def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Callable[[], None]:
@@ -54,6 +31,8 @@ def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Ca
     That look-up costs more than many kernels do: a named tuple of ten arrays takes about 2 µs. The arrays must stay the
     same objects in memory; what is in them may change.
     """
+    if config.DISABLE_JIT:
+        return functools.partial(function, *arguments)  # type: ignore[return-value]
     types = tuple(typeof(argument) for argument in arguments)
     compiled: Any = function  # Numba's dispatcher
     compiled.compile(types)
@@ -61,35 +40,6 @@ def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Ca
 
 
 def compiled() -> bool:
-    """Return whether the simulation was ever compiled, as far as the package's own folder knows."""
-    return any((_PACKAGE / "sim" / "__pycache__").glob("*.nbi"))
-
-
-def _digest() -> str:
-    """Return a number of all sources that kernels may depend on."""
-    digest = hashlib.sha256()
-    for source in sorted(_PACKAGE.rglob("*.py")):
-        if source.relative_to(_PACKAGE).parts[0] not in _WITHOUT_KERNELS:
-            digest.update(source.read_bytes())
-    return digest.hexdigest()
-
-
-def _drop_stale_kernels() -> None:
-    """Delete compiled kernels when any source that they may depend on has changed.
-
-    Numba looks only at the file of the kernel itself, not at those of the functions and constants that it uses. Indices
-    go and data, too: an index written anew might find old data.
-    """
-    try:
-        if _STAMP.is_file() and _STAMP.read_text() == _SOURCES:
-            return
-        for file in _PACKAGE.rglob("__pycache__/*.nb[ci]"):
-            file.unlink(missing_ok=True)
-        _STAMP.parent.mkdir(exist_ok=True)
-        _STAMP.write_text(_SOURCES)
-    except OSError:  # installed read-only: Numba then keeps its cache in the user's own folder
-        return
-
-
-_SOURCES = _digest()
-_drop_stale_kernels()
+    """Return whether kernels of these sources were ever compiled here."""
+    folder = cache_folder()
+    return folder is not None and any(folder.glob("*.kernel"))

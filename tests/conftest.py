@@ -7,8 +7,6 @@ configuration of a cable model, for both models.
 from __future__ import annotations
 
 import importlib.util
-import os
-import tempfile
 from dataclasses import replace
 from math import sqrt
 from pathlib import Path
@@ -16,10 +14,6 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-
-if "PYTEST_XDIST_WORKER" in os.environ:  # each worker compiles for itself, so that none waits
-    _kernels = tempfile.TemporaryDirectory(prefix="kernels")
-    os.environ["NUMBA_CACHE_DIR"] = _kernels.name
 
 import multilift_marl as ml
 from multilift_marl.config import System

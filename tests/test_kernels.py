@@ -1,9 +1,9 @@
-"""Compiled kernels: none outlives a constant that it was compiled with."""
+"""Compiled kernels: none outlives a source it was compiled from; neither damage nor a full disk stops anybody."""
 
 from __future__ import annotations
 
-import fcntl
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 import multilift_marl as ml
+from multilift_marl import _kernel_cache
 
-HOVER = """
+WEIGHTS = """
 from multilift_marl.config.system import GRAVITY
 import numpy as np
 from multilift_marl.sim.standing import Drones, hover_drone
@@ -23,46 +24,161 @@ one = np.ones(1)
 hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, Drones(one, one, np.ones((1, 4, 4)), np.zeros((1, 3)), False))
 print((state.rotor_speed**2).sum() / GRAVITY)
 """
+OUTSIDE = """
+import tunables
+from multilift_marl._jit import kernel
+from multilift_marl.math3d import clip
+from tunables import OFFSET, shifted
+
+@kernel
+def value(x):
+    return shifted(clip(x, 0.0, 1.0)) + OFFSET + tunables.DEEP
+
+print(value(2.0))
+"""
+TUNABLES = """
+from multilift_marl._jit import kernel
+
+OFFSET = 10.0
+DEEP = 100.0
+
+@kernel
+def shifted(x):
+    return x + 1000.0
+"""
 
 
-def own_cache() -> dict[str, str]:
-    """Return an environment in which kernels are kept beside their source."""
-    return {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+@pytest.fixture
+def package(tmp_path):
+    """Return a copy of the package without compiled kernels."""
+    copy = tmp_path / "multilift_marl"
+    shutil.copytree(Path(ml.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(Path(ml.__file__).parents[1] / "configs", tmp_path / "configs")
+    return copy
 
 
-def test_no_compiled_kernel_outlives_a_constant_it_was_compiled_with(tmp_path):
-    package = tmp_path / "multilift_marl"
-    shutil.copytree(Path(ml.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+def run(code: str | Path, folder: Path, limit: int | None = None, **variables: str) -> tuple[float, str]:
+    """Return what a fresh process prints there, and its warnings; kernels are kept beside their source.
 
-    def weights_lifted() -> float:
-        told = subprocess.run(
-            [sys.executable, "-c", HOVER], cwd=tmp_path, env=own_cache(), capture_output=True, text=True, check=True
-        )
-        return float(told.stdout)
+    Args:
+        limit: bytes that a file may have.
+    """
+    kept = {key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    command = [sys.executable, *(["-c", code] if isinstance(code, str) else [str(code)])]
+    limited = None if limit is None else lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    environment = kept | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"} | variables
+    told = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=True, preexec_fn=limited
+    )
+    return float(told.stdout), told.stderr
 
-    assert weights_lifted() == pytest.approx(1)
+
+def kernels(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*.kernel"))
+
+
+def test_no_compiled_kernel_outlives_a_constant_it_was_compiled_with(package, tmp_path):
+    assert run(WEIGHTS, tmp_path)[0] == pytest.approx(1)
     constants = package / "config" / "vehicles.py"
     source = constants.read_text(encoding="utf-8")
     assert "GRAVITY = 9.81" in source
     constants.write_text(source.replace("GRAVITY = 9.81", "GRAVITY = 3.71"))
-    assert weights_lifted() == pytest.approx(1)
+    assert run(WEIGHTS, tmp_path)[0] == pytest.approx(1)
 
 
-def test_processes_take_turns_at_the_cache(tmp_path):
-    """Two that compile different signatures of a kernel at once would give both the same file."""
-    source = tmp_path / "doubled.py"
-    source.write_text(
-        "from multilift_marl._jit import kernel\n\n\n@kernel\ndef doubled(x):\n    return x + x\n\n\n"
-        "print('ready', flush=True)\nprint(doubled(3), flush=True)\n"
+@pytest.mark.parametrize(
+    ("file", "old", "new", "result"),
+    [
+        ("multilift_marl/math3d.py", "return min(max(value, low), high)", "return low + 0.5", 1110.5),
+        ("tunables.py", "OFFSET = 10.0", "OFFSET = 20.0", 1121.0),
+        ("tunables.py", "DEEP = 100.0", "DEEP = 200.0", 1211.0),
+        ("tunables.py", "1000.0", "2000.0", 2111.0),
+    ],
+)
+def test_kernels_of_others_are_compiled_anew_when_what_they_use_has_changed(package, tmp_path, file, old, new, result):
+    (tmp_path / "outside.py").write_text(OUTSIDE)
+    (tmp_path / "tunables.py").write_text(TUNABLES)
+    assert run(tmp_path / "outside.py", tmp_path)[0] == 1111
+    source = (tmp_path / file).read_text(encoding="utf-8")
+    assert old in source
+    (tmp_path / file).write_text(source.replace(old, new))
+    assert run(tmp_path / "outside.py", tmp_path)[0] == result
+
+
+def test_kernels_are_read_back_not_compiled_again(package, tmp_path):
+    run(WEIGHTS, tmp_path)
+    written = {path: path.stat().st_mtime_ns for path in kernels(package)}
+    assert written and all(path.parent.name.startswith("multilift_marl-") for path in written)
+    run(WEIGHTS, tmp_path)
+    assert written == {path: path.stat().st_mtime_ns for path in kernels(package)}
+
+
+@pytest.mark.parametrize("damage", ["emptied", "cut", "flipped", "foreign"])
+def test_a_damaged_file_counts_as_missing(package, tmp_path, damage):
+    run(WEIGHTS, tmp_path)
+    for path in kernels(package):
+        content = path.read_bytes()
+        middle = len(content) // 2
+        damaged = {
+            "emptied": b"",
+            "cut": content[:middle],
+            "flipped": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+            "foreign": b"no kernel" * 100,
+        }[damage]
+        path.write_bytes(damaged)
+        bad = path, damaged
+    value, warnings = run(WEIGHTS, tmp_path)
+    assert value == pytest.approx(1) and not warnings
+    assert bad[0].read_bytes() != bad[1]  # mended
+
+
+def test_where_nothing_can_be_written_kernels_are_compiled_each_time(package, tmp_path):
+    (package / "__pycache__").write_text("a file in the folder's place: nobody can write there, root neither")
+    value, warnings = run(WEIGHTS, tmp_path, HOME="/dev/null", XDG_CACHE_HOME="/dev/null/caches")
+    assert value == pytest.approx(1)
+    assert warnings.startswith("compiled kernels cannot be kept: ") and warnings.count("\n") == 1
+    assert "NUMBA_CACHE_DIR" in warnings
+
+
+def test_a_package_that_is_read_only_keeps_kernels_in_the_users_cache(package, tmp_path):
+    (package / "__pycache__").write_text("a file in the folder's place")
+    assert run(WEIGHTS, tmp_path, XDG_CACHE_HOME=str(tmp_path / "caches")) == (pytest.approx(1), "")
+    first = kernels(tmp_path / "caches")
+    constants = package / "config" / "vehicles.py"
+    constants.write_text(constants.read_text(encoding="utf-8").replace("GRAVITY = 9.81", "GRAVITY = 3.71"))
+    assert run(WEIGHTS, tmp_path, XDG_CACHE_HOME=str(tmp_path / "caches")) == (pytest.approx(1), "")
+    assert len(kernels(tmp_path / "caches")) == 2 * len(first) > 0
+
+
+def test_kernels_go_where_numba_is_told(package, tmp_path):
+    run(WEIGHTS, tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "told"))
+    assert kernels(tmp_path / "told") and not kernels(package)
+
+
+def test_a_full_disk_costs_time_alone(package, tmp_path):
+    value, warnings = run(WEIGHTS, tmp_path, limit=1000)
+    assert value == pytest.approx(1) and not kernels(package)
+    assert warnings.startswith("compiled kernels cannot be kept in ") and warnings.count("\n") == 1
+    assert not list(package.rglob("*.part"))
+
+
+def test_folders_of_older_sources_go_but_for_the_newest(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for age in range(6):
+        folder = tmp_path / f"multilift_marl-{age}"
+        folder.mkdir()
+        os.utime(folder, (1000 - age, 1000 - age))
+    current = _kernel_cache.cache_folder.__wrapped__()
+    left = {folder.name for folder in tmp_path.iterdir()}
+    assert left == {current.name, "multilift_marl-0", "multilift_marl-1", "multilift_marl-2"}
+
+
+def test_it_flies_without_the_compiler(package, tmp_path):
+    code = (
+        "import numpy as np, multilift_marl as ml\n"
+        "vec = ml.make_vec('hover', num_envs=1, num_drones=2, num_threads=1)\n"
+        "vec.reset(seed=3)\n"
+        "print(vec.step(np.zeros((1, 2, vec.action_size)))[1].sum())"
     )
-    folder = tmp_path / "__pycache__"
-    folder.mkdir()
-    with open(folder / "kernels.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        process = subprocess.Popen([sys.executable, source], env=own_cache(), stdout=subprocess.PIPE, text=True)
-        assert process.stdout.readline() == "ready\n"
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(timeout=5)
-        assert not list(folder.glob("*.nbi"))
-    assert process.communicate(timeout=60)[0] == "6\n"
-    assert len(list(folder.glob("*.nbi"))) == 1
+    plain, fast = (run(code, tmp_path, NUMBA_DISABLE_JIT=value)[0] for value in "10")
+    assert plain == pytest.approx(fast, rel=1e-6)

@@ -1,0 +1,231 @@
+"""Compiled kernels on disk: one file for each kernel and its types, in a folder named by the sources they come from.
+
+Numba's own cache looks at the file of the kernel alone, not at those of the functions and constants that it uses; it
+keeps an index that two processes must not write at once; and it takes what it reads for sound. Here the folder's name
+is a digest of the package's sources, a kernel from elsewhere (a task of one's own) is also named by a digest of its own
+source, files are written whole and renamed, and one whose checksum is wrong counts as missing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import pickle
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache, lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numba.core.caching import Cache as NumbaCache
+from numba.core.caching import CompileResultCacheImpl, NullCache, _CacheLocator
+from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
+
+LOGGER = logging.getLogger("multilift_marl.kernels")
+PACKAGE = Path(__file__).parent
+KEPT = 3  # folders of other sources, the newest
+_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "__init__.py")
+
+
+@cache
+def sources_digest() -> str:
+    """Return a digest of all sources of the package that kernels may depend on."""
+    digest = hashlib.sha256()
+    for source in sorted(PACKAGE.rglob("*.py")):
+        name = source.relative_to(PACKAGE)
+        if name.parts[0] not in _WITHOUT_KERNELS:
+            digest.update(name.as_posix().encode() + source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Return the folder of today's kernels; None, and a warning, if it can be neither read nor made.
+
+    It is `NUMBA_CACHE_DIR` where that is set, else the package's own `__pycache__`, else the user's cache.
+    """
+    name = f"multilift_marl-{sources_digest()}"
+    asked = os.environ.get("NUMBA_CACHE_DIR")
+    homes = [Path(asked)] if asked else [PACKAGE / "__pycache__", _user_cache()]
+    for home in homes:
+        folder = home / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except (OSError, RuntimeError):  # read-only, full, no home
+            continue
+        _forget_others(home, folder)
+        return folder
+    LOGGER.warning(
+        "compiled kernels cannot be kept: %s cannot be written; every start compiles anew, up to a minute. Set "
+        "NUMBA_CACHE_DIR to a folder that can be",
+        " and ".join(str(home) for home in homes),
+    )
+    return None
+
+
+def _user_cache() -> Path:
+    """Return the folder for caches of this user."""
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
+def _forget_others(home: Path, current: Path) -> None:
+    """Delete the folders of older sources but the newest few."""
+    with contextlib.suppress(OSError):
+        others = sorted((f for f in home.glob("multilift_marl-*") if f != current), key=lambda f: f.stat().st_mtime)
+        for folder in others[:-KEPT]:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+class _Nowhere(_CacheLocator):
+    """What Numba asks for the place of its own files, of which there are none."""
+
+    def __init__(self, function: Callable[..., Any], file: str):
+        self._name = f"{function.__qualname__}{file}"
+
+    def ensure_cache_path(self) -> None:
+        """Do nothing."""
+
+    def get_cache_path(self) -> str:
+        """Return no path."""
+        return ""
+
+    def get_source_stamp(self) -> str:
+        """Return no stamp."""
+        return ""
+
+    def get_disambiguator(self) -> str:
+        """Return a name."""
+        return self._name
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> _Nowhere:
+        """Return the locator of a function."""
+        return cls(function, file)
+
+
+class _Results(CompileResultCacheImpl):  # how Numba turns a compiled function into what can be pickled, and back
+    _locator_classes = (_Nowhere,)
+
+
+class KernelCache(NumbaCache):
+    """The files of one kernel, with the interface of `numba.core.caching.Cache`."""
+
+    _impl_class = _Results
+
+    def __init__(self, function: Callable[..., Any], folder: Path):
+        super().__init__(function)
+        self._folder, self._function = folder, function
+        self._cache_path = str(folder)
+
+    def _path(self, key: Any) -> Path:
+        """Return the file of a signature: kernel, types, processor and Python in its name."""
+        code = self._function.__code__
+        told = (repr(key), self._function.__module__, sys.version, foreign_digest(self._function))
+        digest = hashlib.sha256("\0".join(told).encode()).hexdigest()[:32]
+        name = "".join(c if c.isalnum() else "_" for c in self._function.__qualname__)[-40:]
+        return self._folder / f"{name}-{code.co_firstlineno}-{digest}.kernel"
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what was compiled for these types; None if nothing sound is there."""
+        key = self._index_key(sig, target_context.codegen())
+        try:
+            checksum, content = _split(self._path(key).read_bytes())
+            if hashlib.sha256(content).digest() != checksum:
+                return None
+            stored, data = pickle.loads(content)
+            return self._impl.rebuild(target_context, data) if stored == key else None
+        except Exception:  # missing, unreadable, or from another version of Numba: compile again
+            return None
+
+    def _save_overload(self, sig: Any, data: Any) -> None:
+        """Keep what was compiled; what cannot be written is not kept."""
+        if not self._impl.check_cachable(data):
+            return
+        key = self._index_key(sig, data.codegen)
+        content = dumps((key, self._impl.reduce(data)))
+        try:
+            write_whole(self._path(key), hashlib.sha256(content).digest() + content)
+        except OSError as error:
+            _warn_once(f"compiled kernels cannot be kept in {self._folder}: {error.strerror}; compiled anew next time")
+
+    def flush(self) -> None:
+        """Forget nothing: a file belongs to one version of the sources."""
+
+
+def make_cache(function: Callable[..., Any]) -> KernelCache | NullCache:
+    """Return where a kernel's compiled versions are kept."""
+    folder = cache_folder()
+    return NullCache() if folder is None else KernelCache(function, folder)
+
+
+def _split(content: bytes) -> tuple[bytes, bytes]:
+    size = hashlib.sha256().digest_size
+    return content[:size], content[size:]
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that is there whole or not at all; other processes may write the same one."""
+    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.replace(unfinished, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(unfinished)
+        raise
+
+
+@lru_cache
+def _warn_once(message: str) -> None:
+    LOGGER.warning(message)
+
+
+@cache
+def foreign_digest(function: Callable[..., Any]) -> str:
+    """Return a digest of what a kernel outside the package is made of; "" for the package's own.
+
+    That is its file, the files of the kernels that it names, of the modules beside it that it names, and the constants.
+    """
+    files, constants = set[str](), set[str]()
+    _collect(function, set(), files, constants)
+    if not files:
+        return ""
+    digest = hashlib.sha256("\0".join(sorted(constants)).encode())
+    for file in sorted(files):
+        with contextlib.suppress(OSError):  # typed in, not read from a file
+            digest.update(Path(file).read_bytes())
+    return digest.hexdigest()
+
+
+def _collect(function: Callable[..., Any], seen: set[Any], files: set[str], constants: set[str]) -> None:
+    """Add the files outside the package that a function depends on, and the values of the constants that it names."""
+    file = function.__code__.co_filename
+    if function in seen or PACKAGE in Path(file).parents:
+        return
+    seen.add(function)
+    files.add(file)
+    for name in function.__code__.co_names:
+        value = function.__globals__.get(name)
+        if isinstance(value, Dispatcher):
+            _collect(value.py_func, seen, files, constants)
+        elif isinstance(value, ModuleType):
+            beside = getattr(value, "__file__", None)
+            if beside and Path(beside).parent == Path(file).parent:
+                files.add(beside)
+        elif isinstance(value, np.ndarray):
+            constants.add(f"{name} {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}")
+        elif isinstance(value, bool | int | float | complex | str | tuple):
+            constants.add(f"{name} {value!r}")
