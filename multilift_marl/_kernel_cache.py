@@ -30,7 +30,7 @@ from numba.core.serialize import dumps
 
 LOGGER = logging.getLogger("multilift_marl.kernels")
 PACKAGE = Path(__file__).parent
-KEPT = 3  # folders of other sources, the newest
+KEPT = 20  # folders of other sources, those used last
 _WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "__init__.py")
 
 
@@ -59,6 +59,7 @@ def cache_folder() -> Path | None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
+            os.utime(folder)
         except (OSError, RuntimeError):  # read-only, full, no home
             continue
         _forget_others(home, folder)
@@ -81,7 +82,7 @@ def _user_cache() -> Path:
 
 
 def _forget_others(home: Path, current: Path) -> None:
-    """Delete the folders of older sources but the newest few."""
+    """Delete the folders of other sources but those used last."""
     with contextlib.suppress(OSError):
         others = sorted((f for f in home.glob("multilift_marl-*") if f != current), key=lambda f: f.stat().st_mtime)
         for folder in others[:-KEPT]:
@@ -177,6 +178,7 @@ def _split(content: bytes) -> tuple[bytes, bytes]:
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file that is there whole or not at all; other processes may write the same one."""
+    path.parent.mkdir(parents=True, exist_ok=True)  # others may have deleted it
     handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -162,8 +162,9 @@ def test_a_full_disk_costs_time_alone(package, tmp_path):
     assert not list(package.rglob("*.part"))
 
 
-def test_folders_of_older_sources_go_but_for_the_newest(tmp_path, monkeypatch):
+def test_folders_of_other_sources_go_but_for_those_used_last(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(_kernel_cache, "KEPT", 3)
     for age in range(6):
         folder = tmp_path / f"multilift_marl-{age}"
         folder.mkdir()
