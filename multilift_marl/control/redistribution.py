@@ -10,13 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.gains import Gains
+from multilift_marl.math3d import clip
 
 TILTS = np.radians(np.arange(0.0, 71.0))  # tried in this order
 AXES = np.radians(np.arange(0.0, 360.0, 5.0))  # horizontal axes of the tilt
 LEAST_HEIGHT = 0.2  # [m] of a drone above the payload; lower ones are a failure
+THRUST_SHARE = 0.8  # of its largest thrust, which a drone may need at rest
+WAIT, RAMP = 1.0, 3.0  # [s] after a loss until the slots set off, and that they take
 
 
 class Redistribution(NamedTuple):
@@ -78,6 +82,30 @@ def redistribute(
             found.force[keep], found.thrust[keep], found.offset[keep] = force[best], thrust[best], offset[best]
             return found
     return None
+
+
+def redistributed_slots(system: System, gains: Gains, hangs: bool, max_offset: float) -> np.ndarray:
+    """Return by how much each slot moves for each lost drone, (N lost, N, 3) in slot frames [m]; 0 where none holds.
+
+    Args:
+        system, gains, hangs, max_offset: see `redistribute`; no drone needs more than `THRUST_SHARE`.
+    """
+    offsets = np.zeros((system.num_drones, system.num_drones, 3))
+    for lost in range(system.num_drones):
+        found = redistribute(system, gains, lost, hangs, THRUST_SHARE, max_offset)
+        if found is not None:
+            offsets[lost] = found.offset
+    return offsets
+
+
+@kernel
+def ramp(seconds: float) -> float:
+    """Return the share of their way that slots have moved, so many seconds after a loss.
+
+    They wait until the falling drone has snatched at its cable.
+    """
+    share = clip((seconds - WAIT) / RAMP, 0.0, 1.0)
+    return share**2 * (3.0 - 2.0 * share)
 
 
 def _tilted(tilt: float, axes: np.ndarray) -> np.ndarray:
