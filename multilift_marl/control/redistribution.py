@@ -1,4 +1,4 @@
-"""Cable forces that hold the payload after a drone is lost, and where the remaining drones are that exert them.
+"""What the remaining drones do after a loss: give way to the falling drone, then go where they hold the payload.
 
 Statics alone: the payload's weight, the lost drone's that hangs from its anchor, and the remaining cables balance in
 force and moment. The payload is tilted as little as thrust and the range of the slots' offsets allow.
@@ -20,7 +20,9 @@ TILTS = np.radians(np.arange(0.0, 71.0))  # tried in this order
 AXES = np.radians(np.arange(0.0, 360.0, 5.0))  # horizontal axes of the tilt
 LEAST_HEIGHT = 0.2  # [m] of a drone above the payload; lower ones are a failure
 THRUST_SHARE = 0.8  # of its largest thrust, which a drone may need at rest
-WAIT, RAMP = 1.0, 3.0  # [s] after a loss until the slots set off, and that they take
+GIVE_OUT, GIVE_DOWN, GIVE_NEAR = 0.2, 0.2, 0.5  # [m] outward, down, and further down times the cosine to the lost slot
+GIVE_SECONDS = 0.9  # after a loss; the falling drone snatches at its cable after 0.6
+WAIT, RAMP = 1.0, 3.0  # [s] after a loss until the slots set off to where they hold the payload, and that they take
 
 
 class Redistribution(NamedTuple):
@@ -99,13 +101,23 @@ def redistributed_slots(system: System, gains: Gains, hangs: bool, max_offset: f
 
 
 @kernel
-def ramp(seconds: float) -> float:
-    """Return the share of their way that slots have moved, so many seconds after a loss.
+def plan_offset(seconds: float, held: np.ndarray, cosine: float, hangs: bool) -> tuple[float, float, float]:
+    """Return by how much a slot is to move, so many seconds after a loss, in its frame [m].
 
-    They wait until the falling drone has snatched at its cable.
+    Until the falling drone has snatched at its cable, drones give way: the snatch is then less than half as hard. A
+    plan that lets them all sink by half a metre alone makes it harder.
+
+    Args:
+        seconds: since the loss.
+        held: where the slot holds the payload (3,), see `redistributed_slots`.
+        cosine: of the angle from the slot's azimuth to the lost one's.
+        hangs: whether the lost drone hangs on its cable.
     """
+    giving = 1.0 if hangs and seconds < GIVE_SECONDS else 0.0
     share = clip((seconds - WAIT) / RAMP, 0.0, 1.0)
-    return share**2 * (3.0 - 2.0 * share)
+    share = share**2 * (3.0 - 2.0 * share)
+    down = GIVE_DOWN + GIVE_NEAR * cosine
+    return share * held[0] + giving * GIVE_OUT, share * held[1], share * held[2] - giving * down
 
 
 def _tilted(tilt: float, axes: np.ndarray) -> np.ndarray:

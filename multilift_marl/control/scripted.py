@@ -202,7 +202,7 @@ class FormationNarrow(Formation):
 
 
 class FormationRedistributed(FormationIntegral):
-    """The formation with its integral; once a drone is lost, the slots move to where the others hold the payload.
+    """The formation with its integral; once a drone is lost, the slots give way, then go where the others hold the payload.
 
     Where that is, the task computes by statics, and tells; see `control/redistribution.py`.
 
@@ -210,7 +210,7 @@ class FormationRedistributed(FormationIntegral):
         ConfigError: the task tells of no loss.
     """
 
-    GAINS = (*FormationIntegral.GAINS, *(("redistribution", axis, axis, 1.0) for axis in range(3)))
+    GAINS = (*FormationIntegral.GAINS, *(("planned_offset", axis, axis, 1.0) for axis in range(3)))
 
     def __init__(self, vec: MultiliftVec):
         if not self.fits(vec):
@@ -223,7 +223,7 @@ class FormationRedistributed(FormationIntegral):
     @classmethod
     def fits(cls, vec: MultiliftVec) -> bool:
         """Return whether the task tells where to go after a loss."""
-        return "redistribution_0" in vec.observation_names
+        return "planned_offset_0" in vec.observation_names
 
 
 LINEAR: dict[str, type[Formation]] = {
