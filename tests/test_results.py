@@ -121,18 +121,6 @@ def flat(section, prefix=""):
     return found
 
 
-CHANGED = {  # recipes that have changed since their weights were trained; to be emptied by training them again
-    "gate": {"train.residual", "train.initial_std"},
-    "loss": {
-        "control.max_offset",
-        "task_options",
-        "task_options.success_angle",
-        "train.initial_std",
-        "train.overrides.reward.attitude",
-    },
-}
-
-
 @pytest.mark.parametrize(
     "weights", sorted((ROOT / "results").glob("*/seed*/policy.pt")), ids=lambda path: "-".join(path.parts[-3:-1])
 )
@@ -141,7 +129,6 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
     recipe = flat(ml.load_config(weights.parts[-3]).model_dump(mode="json"))
     assert stored["seed"] == int(weights.parts[-2].removeprefix("seed"))
     own = {"seed", "env.num_threads", "train.threads"}
-    own |= CHANGED.get(weights.parts[-3], set())
     later = recipe.keys() - stored.keys() - own  # keys that were added since
     assert later <= {"train.critic_learning_rate", "train.warmup", "vehicle.rotor_inertia"}
     assert {key: stored[key] for key in stored.keys() - own} == {
