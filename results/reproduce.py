@@ -196,38 +196,59 @@ def ship(recipes: list[str]) -> None:
 
 
 def table() -> str:
-    """Return all flights as a Markdown table: success and error of each team, of learned ones the mean of all seeds."""
-    columns = ("learned", "training seeds", "learned - best script", *SCRIPTED)
-    lines = [
-        f"| | {' | '.join(columns)} | published |",
-        f"|---|{'---|' * (len(columns) + 1)}",
-    ]
+    """Return all flights and all teams as a Markdown table: success and error, of learned ones the mean of seeds."""
+    rows = []
     for name, flight in FLIGHTS.items():
-        seeds = sorted((HERE / name).glob("seed*.json"))
         scripts = [_cell([HERE / name / f"{script}.json"], error_metric(flight)) for script in SCRIPTED]
-        fresh = [path for path in seeds if path.with_suffix(".npz").is_file()]
-        cells = [_cell(seeds, error_metric(flight)), str(len(fresh or seeds)), gain(name), *scripts, flight.published]
-        lines.append(f"| {flight.title} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([flight.title, *_learned(name), gain(name), *scripts, flight.published])
+    return _markdown(["learned", "training seeds", "learned - best script", *SCRIPTED, "published"], rows)
+
+
+def summary() -> str:
+    """Return the same of the learned teams and the best script of each flight alone."""
+    rows = []
+    for name, flight in FLIGHTS.items():
+        best = best_script(name)
+        script = f"{best}: {_cell([HERE / name / f'{best}.json'], error_metric(flight))}" if best else "-"
+        difference = gain(name).replace(f", {best}", "")
+        rows.append([flight.title, *_learned(name), script, difference, flight.published])
+    return _markdown(["learned", "training seeds", "best script", "learned - best script", "published"], rows)
+
+
+def _learned(flight: str) -> tuple[str, str]:
+    """Return what learned teams did, and how many."""
+    seeds = sorted((HERE / flight).glob("seed*.json"))
+    fresh = [path for path in seeds if path.with_suffix(".npz").is_file()]
+    return _cell(seeds, error_metric(FLIGHTS[flight])), str(len(fresh or seeds))
+
+
+def _markdown(columns: list[str], rows: list[list[str]]) -> str:
+    """Return a table of which the first column has no name."""
+    head = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
+    return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
+
+
+def best_script(flight: str) -> str:
+    """Return the script with the most successes, of several the one with the least error; "" if none was flown."""
+    scripts = {name: np.load(path) for name in SCRIPTED if (path := HERE / flight / f"{name}.npz").is_file()}
+    return min(scripts, default="", key=lambda name: (-scripts[name]["success"].mean(), scripts[name]["error"].mean()))
 
 
 def gain(flight: str) -> str:
     """Return what learned teams do better than the best script: success and error, paired by episode.
 
-    Of several training seeds each episode counts by its mean. The best script is that with the most successes, of
-    several the one with the least error. Learning gains if it succeeds more often, or errs less and succeeds no less
-    often, both beyond the 95 % intervals.
+    Of several training seeds each episode counts by its mean. Learning gains if it succeeds more often, or errs less
+    and succeeds no less often, both beyond the 95 % intervals.
     """
-    told = {path.stem: np.load(path) for path in sorted((HERE / flight).glob("*.npz")) if "." not in path.stem}
-    learned = [each for name, each in told.items() if name.startswith("seed")]
-    scripts = {name: each for name, each in told.items() if name in SCRIPTED}
-    if not learned or not scripts:
+    learned = [np.load(path) for path in sorted((HERE / flight).glob("seed*.npz")) if "." not in path.stem]
+    best = best_script(flight)
+    if not learned or not best:
         return "-"
-    best = min(scripts, key=lambda name: (-scripts[name]["success"].mean(), scripts[name]["error"].mean()))
+    script = np.load(HERE / flight / f"{best}.npz")
     parts, intervals = [], []
     for key, unit, digits in (("success", "points", 1), ("error", "cm", 2)):
         mean = np.mean([each[key].astype(float) for each in learned], axis=0)
-        difference = 100 * (mean - scripts[best][key].astype(float))
+        difference = 100 * (mean - script[key].astype(float))
         intervals.append(bootstrap(difference))
         low, high = (f"{bound:+.{digits}f}" for bound in intervals[-1])
         parts.append(f"{difference.mean():+.{digits}f} ({low} to {high}) {unit}")
@@ -256,10 +277,11 @@ def _cell(paths: list[Path], error: str) -> str:
 
 def write_tables() -> None:
     """Replace what stands between the markers in the documents."""
-    for path in (ROOT / "README.md", ROOT / "docs" / "tasks.md"):
+    for path, content in ((ROOT / "README.md", summary()), (ROOT / "docs" / "tasks.md", table())):
         text = path.read_text(encoding="utf-8")
         marked = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.DOTALL)
-        path.write_text(marked.sub(lambda found: f"{found[1]}{table()}\n{found[2]}", text), encoding="utf-8")
+        replaced = marked.sub(lambda found, content=content: f"{found[1]}{content}\n{found[2]}", text)
+        path.write_text(replaced, encoding="utf-8")
 
 
 def main(arguments: list[str]) -> None:

@@ -8,7 +8,7 @@ from conftest import GRAVITY, make, refusal
 
 from multilift_marl.config.load import load_config
 from multilift_marl.control.gains import make_gains
-from multilift_marl.control.redistribution import redistribute
+from multilift_marl.control.redistribution import plan_offset, redistribute
 from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.evaluation.rollout import fly_episodes
 
@@ -56,8 +56,49 @@ def test_a_team_that_redistributes_comes_to_rest_as_computed(name, angle):
     assert np.median(flown["payload_attitude_error_deg"]) < angle
 
 
+def test_slots_give_way_to_the_falling_drone_then_go_where_they_hold_the_payload():
+    held = np.array([0.3, -0.2, 0.6])
+    assert plan_offset(0.5, held, 1.0, True) == pytest.approx((0.2, 0.0, -0.7))
+    assert plan_offset(0.5, held, -1.0, True) == pytest.approx((0.2, 0.0, 0.3))
+    assert plan_offset(0.5, held, 1.0, False) == plan_offset(0.95, held, 1.0, True) == (0, 0, 0)
+    assert plan_offset(2.5, held, 1.0, True) == pytest.approx(held / 2)  # half of the way after half of the time
+    assert plan_offset(4.0, held, 1.0, True) == plan_offset(99.0, held, -1.0, False) == pytest.approx(held)
+
+
+def test_drones_are_told_their_planned_offset():
+    vec = make("loss_6", num_envs=8, num_drones=6, **{"task_options.loss_time": (0.5, 0.5)})
+    told = vec.observation_names.index("planned_offset_0")
+    team, (observation, _) = make_scripted("formation_redistributed", vec), vec.reset(seed=1)
+    who = vec.task.who.copy()
+    _, found = solve("loss_6")
+    for step in range(1, 240):
+        observation = vec.step(team.act(observation))[0]
+        offset = observation[..., told : told + 3]
+        if step < 25:
+            assert not offset.any()
+        elif step == 40:
+            angle = vec.task.rig.azimuth[who][:, None] - vec.task.rig.azimuth
+            np.testing.assert_allclose(offset[..., 2], -0.2 - 0.5 * np.cos(angle), atol=1e-6)
+            np.testing.assert_allclose(offset[..., :2], [[[0.2, 0.0]] * 6] * 8, atol=1e-6)
+    np.testing.assert_allclose(offset[who == 0], [found.offset] * (who == 0).sum(), atol=1e-6)
+    assert (who == 0).any()
+
+
+@pytest.mark.parametrize("name", ["loss", "loss_6"])
+def test_giving_way_halves_the_snatch(name):
+    peaks = {}
+    for script in ("formation_integral", "formation_redistributed"):
+        vec = make(name, num_envs=16, num_drones=load_config(name).env.num_drones, **{"control.max_offset": 1.0})
+        team, (observation, _) = make_scripted(script, vec), vec.reset(seed=0)
+        for _ in range(280):  # the last loss is at 4 s, its snatch 0.6 s later
+            observation = vec.step(team.act(observation))[0]
+        peaks[script] = np.median(vec.task.peak_tension)
+    assert peaks["formation_redistributed"] < 0.6 * peaks["formation_integral"]
+    assert peaks["formation_redistributed"] < vec.task.options.success_tension < peaks["formation_integral"]
+
+
 def test_the_script_needs_to_know_who_is_lost():
     assert "formation_redistributed" in fitting_scripts(make("loss", num_envs=1))
     assert "formation_redistributed" not in fitting_scripts(make("gate", num_envs=1))
     message = refusal(make_scripted, "formation_redistributed", make("hover", num_envs=1))
-    assert message.startswith("formation_redistributed needs to know which drone is lost, and task hover does not tell")
+    assert message.startswith("formation_redistributed is for the loss of a drone, and task hover tells of none")

@@ -209,6 +209,7 @@ class TrainConfig(Section):
         "formation_gusts",
         "formation_lead",
         "formation_narrow",
+        "formation_redistributed",
     ] = Field("formation", description="script that an untrained policy flies and the learned one corrects")
     frames: Int = Field(5_000_000, ge=1, description="environment steps in all")
     horizon: Int = Field(128, ge=1, description="steps of each environment between updates")

@@ -1,4 +1,4 @@
-"""Cable forces that hold the payload after a drone is lost, and where the remaining drones are that exert them.
+"""What the remaining drones do after a loss: give way to the falling drone, then go where they hold the payload.
 
 Statics alone: the payload's weight, the lost drone's that hangs from its anchor, and the remaining cables balance in
 force and moment. The payload is tilted as little as thrust and the range of the slots' offsets allow.
@@ -10,13 +10,19 @@ from typing import NamedTuple
 
 import numpy as np
 
+from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.gains import Gains
+from multilift_marl.math3d import clip
 
 TILTS = np.radians(np.arange(0.0, 71.0))  # tried in this order
 AXES = np.radians(np.arange(0.0, 360.0, 5.0))  # horizontal axes of the tilt
 LEAST_HEIGHT = 0.2  # [m] of a drone above the payload; lower ones are a failure
+THRUST_SHARE = 0.8  # of its largest thrust, which a drone may need at rest
+GIVE_OUT, GIVE_DOWN, GIVE_NEAR = 0.2, 0.2, 0.5  # [m] outward, down, and further down times the cosine to the lost slot
+GIVE_SECONDS = 0.9  # after a loss; the falling drone snatches at its cable after 0.6
+WAIT, RAMP = 1.0, 3.0  # [s] after a loss until the slots set off to where they hold the payload, and that they take
 
 
 class Redistribution(NamedTuple):
@@ -78,6 +84,40 @@ def redistribute(
             found.force[keep], found.thrust[keep], found.offset[keep] = force[best], thrust[best], offset[best]
             return found
     return None
+
+
+def redistributed_slots(system: System, gains: Gains, hangs: bool, max_offset: float) -> np.ndarray:
+    """Return by how much each slot moves for each lost drone, (N lost, N, 3) in slot frames [m]; 0 where none holds.
+
+    Args:
+        system, gains, hangs, max_offset: see `redistribute`; no drone needs more than `THRUST_SHARE`.
+    """
+    offsets = np.zeros((system.num_drones, system.num_drones, 3))
+    for lost in range(system.num_drones):
+        found = redistribute(system, gains, lost, hangs, THRUST_SHARE, max_offset)
+        if found is not None:
+            offsets[lost] = found.offset
+    return offsets
+
+
+@kernel
+def plan_offset(seconds: float, held: np.ndarray, cosine: float, hangs: bool) -> tuple[float, float, float]:
+    """Return by how much a slot is to move, so many seconds after a loss, in its frame [m].
+
+    Until the falling drone has snatched at its cable, drones give way: the snatch is then less than half as hard. A
+    plan that lets them all sink by half a metre alone makes it harder.
+
+    Args:
+        seconds: since the loss.
+        held: where the slot holds the payload (3,), see `redistributed_slots`.
+        cosine: of the angle from the slot's azimuth to the lost one's.
+        hangs: whether the lost drone hangs on its cable.
+    """
+    giving = 1.0 if hangs and seconds < GIVE_SECONDS else 0.0
+    share = clip((seconds - WAIT) / RAMP, 0.0, 1.0)
+    share = share**2 * (3.0 - 2.0 * share)
+    down = GIVE_DOWN + GIVE_NEAR * cosine
+    return share * held[0] + giving * GIVE_OUT, share * held[1], share * held[2] - giving * down
 
 
 def _tilted(tilt: float, axes: np.ndarray) -> np.ndarray:

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from multilift_marl.config.vehicles import GRAVITY
-from multilift_marl.control.gains import make_gains
 from multilift_marl.control.payload_geometric import PayloadGeometric
-from multilift_marl.control.redistribution import redistribute
 from multilift_marl.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -27,8 +25,6 @@ LEAD_GAIN = 0.87  # [-] of what the acceleration asks for; RMSE is least at 0.81
 
 
 NARROWING = 0.7  # [m] inward from the slots; 0.5 to 0.7 m pass a gap of 1 m, at 0.8 m drones collide
-THRUST_SHARE = 0.8  # of its largest thrust, which a drone may need at rest after a loss
-RAMP = (1.0, 3.0)  # [s] after a loss until the slots set off, and that they take
 
 
 class Formation:
@@ -206,55 +202,28 @@ class FormationNarrow(Formation):
 
 
 class FormationRedistributed(FormationIntegral):
-    """The formation with its integral; once a drone is lost, the slots move to where the others hold the payload.
+    """The formation with its integral; once a drone is lost, the slots give way, then go where the others hold the payload.
 
-    Where that is follows from statics, see `redistribute`; each drone looks it up for the azimuth in which it is told
-    that the lost one is. The slots set off `RAMP[0]` after the loss, when the falling drone has snatched at its cable,
-    and take `RAMP[1]`. It remembers the time since the loss, so it is no linear map: `matrix` is that of the integral.
+    Where that is, the task computes by statics, and tells; see `control/redistribution.py`.
 
     Raises:
         ConfigError: the task tells of no loss.
     """
 
+    GAINS = (*FormationIntegral.GAINS, *(("planned_offset", axis, axis, 1.0) for axis in range(3)))
+
     def __init__(self, vec: MultiliftVec):
         if not self.fits(vec):
             raise ConfigError(
-                f"formation_redistributed needs to know which drone is lost, and task {vec.config.task} does not tell; "
+                f"formation_redistributed is for the loss of a drone, and task {vec.config.task} tells of none; "
                 "take formation_integral"
             )
         super().__init__(vec)
-        system, gains = vec.world.system, make_gains(vec.config.control, vec.world.system)
-        hangs = not getattr(vec.task.options, "snap", False)
-        self._offsets = np.zeros((system.num_drones, system.num_drones, 3))  # lost, own
-        for lost in range(system.num_drones):
-            found = redistribute(system, gains, lost, hangs, THRUST_SHARE, self._max_offset)
-            if found is not None:
-                self._offsets[lost] = found.offset
-        self._azimuth, self._dt = system.slot_azimuth, vec.task.dt
-        self._told = [self._names.index(name) for name in ("team_lost_0", "lost_direction_0", "lost_direction_1")]
-        self._since = np.zeros((vec.num_envs, system.num_drones))
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """See `Formation.act`; of all environments, step by step."""
-        is_lost, cosine, sine = (np.asarray(observation)[..., i] for i in self._told)
-        self._since = np.where(is_lost > 0.5, self._since + self._dt, 0.0)
-        there = np.arctan2(sine, cosine) + self._azimuth
-        lost = np.cos(there[..., None] - self._azimuth).argmax(axis=-1)
-        share = np.clip((self._since - RAMP[0]) / RAMP[1], 0.0, 1.0)
-        share = share**2 * (3 - 2 * share)
-        action = np.einsum("...d,ad->...a", np.asarray(observation, np.float32), self._matrix)
-        offset = self._offsets[lost, np.arange(len(self._azimuth))]
-        action[..., :3] += share[..., None] * offset / self._max_offset
-        return np.clip(action, -1, 1)
-
-    def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget the losses in the environments of the mask (E,) bool (None: all)."""
-        self._since[slice(None) if mask is None else mask] = 0.0
 
     @classmethod
     def fits(cls, vec: MultiliftVec) -> bool:
-        """Return whether the task tells who is lost."""
-        return "lost_direction_0" in vec.observation_names
+        """Return whether the task tells where to go after a loss."""
+        return "planned_offset_0" in vec.observation_names
 
 
 LINEAR: dict[str, type[Formation]] = {
@@ -264,11 +233,11 @@ LINEAR: dict[str, type[Formation]] = {
     "formation_gusts": FormationGusts,
     "formation_lead": FormationLead,
     "formation_narrow": FormationNarrow,
+    "formation_redistributed": FormationRedistributed,
 }
 """Scripts that are maps of the observation."""
 SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {
     **LINEAR,
-    "formation_redistributed": FormationRedistributed,
     "payload_geometric": PayloadGeometric,
 }
 

@@ -13,8 +13,10 @@ from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference
+from multilift_marl.control.gains import make_gains
+from multilift_marl.control.redistribution import RAMP, WAIT, plan_offset, redistributed_slots
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import norm, row
+from multilift_marl.math3d import norm, put, row, scale
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.observations import Component
@@ -33,7 +35,7 @@ class LossOptions(StartOptions):
     success_body_rate: Float = Field(0.5, gt=0, description="[rad/s] ... and turning no faster than this ...")
     success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds, and ...")
     success_tension: Float = Field(
-        40.0, gt=1,
+        20.0, gt=1,
         description="[-] no cable's tension at any time, mean of a physics step, over its resting tension; the lost "
         "drone's does not count",
     )  # fmt: skip
@@ -56,8 +58,9 @@ class Loss(Task):
         Component("lost", 1, "-", "-", "1 if the own motors have stopped"),
         Component("team_lost", 1, "-", "-", "1 if those of any drone have"),
         Component("lost_direction", 2, "slot", "-", "cosine and sine of its azimuth from the own one; 0 before"),
+        Component("planned_offset", 3, "slot", "m", "by how much the own slot is to move after a loss, by a plan"),
     )
-    EXTRA_STATE: ClassVar[int] = 3
+    EXTRA_STATE: ClassVar[int] = 4
     LEAST_DRONES: ClassVar[int] = 2
     KEPT: ClassVar[tuple[str, ...]] = ("when", "who", "peak_tension")
 
@@ -70,6 +73,9 @@ class Loss(Task):
         self.when, self.who = np.zeros(world.num_envs), np.zeros(world.num_envs, np.int64)
         world.breakable = world.breakable or self.options.snap
         self.peak_tension = np.zeros(world.num_envs)
+        self._held = redistributed_slots(
+            world.system, make_gains(config.control, world.system), not self.options.snap, config.control.max_offset
+        )
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, start, drone and time; see `Task.start`."""
@@ -88,7 +94,8 @@ class Loss(Task):
 
     def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell who is lost; see `Task.observer`."""
-        return bind(_tell, lo, hi, self.who, self.watch, self.rig, observation, critic)
+        told = (self.time, self.when, self.who, self._held)
+        return bind(_tell, lo, hi, told, not self.options.snap, self.watch, self.rig, observation, critic)
 
     def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
@@ -121,17 +128,20 @@ def _lose(lo, hi, time, dt, when, who, snap, state, plant, watch, tensions):
 
 
 @kernel
-def _tell(lo, hi, who, watch, rig, observation, critic):
+def _tell(lo, hi, told, hangs, watch, rig, observation, critic):
+    time, when, who, held = told
     for e in range(lo, hi):
-        gone = watch.lost[e, who[e]]
-        any_lost, azimuth = 1.0 if gone else 0.0, rig.azimuth[who[e]]
-        told = critic[e, critic.shape[1] - 3 :]
-        told[0], told[1], told[2] = any_lost, any_lost * cos(azimuth), any_lost * sin(azimuth)
+        lost, seconds = who[e], time[e] - when[e]
+        any_lost, azimuth = 1.0 if watch.lost[e, lost] else 0.0, rig.azimuth[lost]
+        out = critic[e, critic.shape[1] - 4 :]
+        out[0], out[1], out[2] = any_lost, any_lost * cos(azimuth), any_lost * sin(azimuth)
+        out[3] = any_lost * min(seconds / (WAIT + RAMP), 1.0)
         for n in range(observation.shape[1]):
-            own = observation[e, n, observation.shape[2] - 4 :]
+            own = observation[e, n, observation.shape[2] - 7 :]
             own[0], own[1] = 1.0 if watch.lost[e, n] else 0.0, any_lost
             own[2] = any_lost * cos(azimuth - rig.azimuth[n])
             own[3] = any_lost * sin(azimuth - rig.azimuth[n])
+            put(own[4:], scale(any_lost, plan_offset(seconds, held[lost, n], cos(azimuth - rig.azimuth[n]), hangs)))
 
 
 @kernel
