@@ -143,6 +143,7 @@ class Job(NamedTuple):
 def judge(asked: list[str], workers: int) -> None:
     """Fly what has not been flown yet, one team in each process at a time."""
     jobs = [job for each in asked for job in list_jobs(*each.split("/", 1)) if not job.done]
+    jobs = list(dict.fromkeys(jobs))
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         for told in as_completed([pool.submit(fly, job) for job in jobs]):
             print(told.result(), flush=True)
