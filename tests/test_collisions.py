@@ -61,6 +61,52 @@ def test_drones_on_broken_chains_collide_alike():
         assert np.abs(gained).max() < 1e-6
 
 
+def strike(preset: str, pair: str, speed: float, phase: float) -> tuple[float, float]:
+    """Let a loose drone fall on the payload, or either on the ground; return depth [m] and speed of return [m/s]."""
+    mass = 0.1 * PRESETS[preset].mass
+    values = {"vehicle.preset": preset, "payload.mass": mass, "cable.length": 30.0}
+    system = without_drag(make_system(1, **values))
+    world = World(system, 1, 1)
+    state, halves = world.state, (system.payload_size[2] / 2, drone_half_size(system.vehicle)[2])
+    gap = 0.05 + phase * speed * system.timestep
+    payload, drone = {
+        "drone on payload": (50.0, 50.0 + sum(halves) + gap),
+        "drone on ground": (50.0, halves[1] + gap),
+        "payload on ground": (halves[0] + gap, 50.0),
+    }[pair]
+    falling = (0.0, -speed) if pair.startswith("drone") else (-speed, 0.0)
+    state.payload_position[:], state.drone_position[:] = [0, 0, payload], [0, 0, drone]
+    state.drone_position[0, :, 0] = 0.0 if "drone on" in pair else 20.0
+    state.payload_rotation[:] = state.drone_rotation[:] = np.eye(3)
+    state.payload_velocity[:], state.drone_velocity[:] = [0, 0, falling[0]], [0, 0, falling[1]]
+    state.rotor_speed[:] = 0.0
+    load(world)
+    world.break_cables(np.ones((1, 1), bool))
+    world.plant.motors_off[:] = True
+    nearest, back = np.inf, 0.0
+    for _ in range(round((0.05 / speed + 0.1) / system.timestep)):
+        world.step(np.zeros((1, 1, 4)))
+        heights = state.payload_position[0, 2] - halves[0], state.drone_position[0, 0, 2] - halves[1]
+        pace = state.payload_velocity[0, 2], state.drone_velocity[0, 0, 2]
+        apart, opening = {
+            "drone on payload": (heights[1] - heights[0] - 2 * halves[0], pace[1] - pace[0]),
+            "drone on ground": (heights[1], pace[1]),
+            "payload on ground": (heights[0], pace[0]),
+        }[pair]
+        nearest, back = min(nearest, apart), max(back, opening)
+    assert not world.diverged.any()
+    return -nearest, back
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("pair", ["drone on payload", "drone on ground", "payload on ground"])
+@pytest.mark.parametrize("speed", [5.0, 20.0])
+def test_payload_and_ground_stop_what_falls_on_them(name, pair, speed):
+    for phase in (0.0, 0.5):
+        depth, back = strike(name, pair, speed, phase)
+        assert depth < 0.004 * speed + 0.005 and back < 0.06 * speed
+
+
 def test_nothing_bounces():
     world = World(without_drag(make_system(1, **{"cable.length": 20.0})), 1, 1)
     world.state.payload_position[:], world.state.drone_position[:] = [0, 30, 0.1], [0, 0, 2.0]
