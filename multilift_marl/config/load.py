@@ -88,7 +88,9 @@ def resolve_config(
         if value is not None and overrides.setdefault(key, value) != value:
             short = key.rpartition(".")[2]
             raise ConfigError(f"{short}={value!r} and {key}={overrides[key]!r} were both given; leave out one of them")
-    return build_config(task.model_dump(), overrides) if isinstance(task, Config) else load_config(task, overrides)
+    if not isinstance(task, Config):
+        return load_config(task, overrides)
+    return build_config(task.model_dump(include=task.model_fields_set), overrides)  # what is stated stays known as such
 
 
 def check_names(given: Iterable[str], own: Iterable[str]) -> None:
