@@ -82,7 +82,7 @@ class MultiliftSB3VecEnv(VecEnv):
         observation, _ = self.vec.reset(self._seeds[0], options=self._options[0])  # the core tells environments apart
         self._reset_seeds()
         self._reset_options()
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         return self._by_row(observation)
 
     def step_async(self, actions: np.ndarray) -> None:
