@@ -9,7 +9,6 @@ import warnings
 from functools import partial
 
 import torch
-from pettingzoo.utils import BaseParallelWrapper
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
 from torch.nn.utils import clip_grad_norm_, parameters_to_vector
@@ -27,26 +26,9 @@ KEYS = {name: ("drone", name) for name in ("observation", "action", "loc", "scal
 LOG_PROB, VALUE = ("drone", "log_prob"), ("drone", "state_value")
 
 
-class NumbersOnly(BaseParallelWrapper):
-    """Keeps of the infos what fits into tensors, as TorchRL asks: names of causes and nested terms do not."""
-
-    def reset(self, seed=None, options=None):
-        """Start an episode."""
-        observations, infos = super().reset(seed, options)
-        return observations, self._numbers(infos)
-
-    def step(self, actions):
-        """Advance one step."""
-        *results, infos = super().step(actions)
-        return *results, self._numbers(infos)
-
-    def _numbers(self, infos):
-        return {agent: {"success": info["success"]} for agent, info in infos.items()}
-
-
 def make(seed: int, **overrides) -> PettingZooWrapper:
     """Return one environment; the agents drone_0 ... form TorchRL's group "drone"."""
-    return PettingZooWrapper(NumbersOnly(multilift_v0.parallel_env("hover", seed=seed, **overrides)))
+    return PettingZooWrapper(multilift_v0.parallel_env("hover", seed=seed, **overrides))
 
 
 def network(env: SerialEnv, outputs: int, **keywords) -> MultiAgentMLP:

@@ -10,6 +10,10 @@ class ConfigError(ValueError):
     """A configuration, an override or a physical system that cannot be."""
 
 
+class UnknownKeywordError(ConfigError, TypeError):
+    """A keyword argument that is none: a TypeError, too, since libraries try out keywords and drop those refused."""
+
+
 class CheckpointError(RuntimeError):
     """A checkpoint that is missing, truncated or foreign."""
 

@@ -47,12 +47,14 @@ def test_unknown_key_names_the_nearest(key, nearest):
     ],
 )
 def test_unknown_name_without_a_section_is_looked_for_everywhere(name, hint):
-    assert refusal(ml.make_vec, "hover", **{name: 1}) == f"unknown key '{name}'; {hint}"
+    expected = f"unknown key '{name}' (unexpected keyword argument '{name}'); {hint}"
+    assert refusal(ml.make_vec, "hover", **{name: 1}) == expected
 
 
 def test_unknown_name_like_no_other_lists_sections_and_arguments():
     message = refusal(ml.make_vec, "hover", zzzzz=1)
-    assert message.startswith("unknown key 'zzzzz'; known: cable, control, env, ") and "num_drones" in message
+    assert message.startswith("unknown key 'zzzzz' (unexpected keyword argument 'zzzzz'); known: cable, control, env, ")
+    assert "num_drones" in message
 
 
 def test_two_values_of_one_key_are_refused_and_the_same_twice_is_not():

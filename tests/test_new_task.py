@@ -1,8 +1,17 @@
-"""The written example of a new task works, and is short."""
+"""The written example of a new task works, and is short; a task's target may jump."""
 
 import subprocess
 import sys
 from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import make
+
+from multilift_marl.config.load import build_config
+from multilift_marl.math3d import rot_z
+from multilift_marl.tasks import TASKS
+from multilift_marl.tasks.hover import Hover
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "new_task.py"
 
@@ -11,3 +20,48 @@ def test_a_new_task_takes_under_a_hundred_lines_and_flies(tmp_path):
     assert len(EXAMPLE.read_text().splitlines()) < 100
     done = subprocess.run([sys.executable, EXAMPLE], cwd=tmp_path, capture_output=True, text=True)
     assert done.stdout == "100% of 64 teams lifted their payload\n", done.stderr
+
+
+LEAPT_AT = 50  # policy steps
+
+
+class Leaping(Hover):
+    """Hover about a target that is elsewhere, and turned, from one moment on."""
+
+    name = "leaping"
+    leap, turn = np.array([0.8, 0.0, 0.6]), 0.5
+
+    def planner(self, lo, hi):
+        """Let the targets leap after a second."""
+
+        def plan():
+            self.time[lo:hi] += self.control_dt
+            for e in range(lo, hi):
+                if abs(self.time[e] - LEAPT_AT * self.dt) < 0.5 * self.control_dt:
+                    turned = np.reshape(rot_z(self.turn), (3, 3)) @ self.goal.rotation[e]
+                    self.place_goal(e, self.goal.position[e] + self.leap, turned)
+
+        return plan
+
+
+@pytest.mark.parametrize("disturbance", ["none", "integral"])
+def test_a_target_that_leaps_is_flown_to_like_any_far_one(disturbance, monkeypatch):
+    monkeypatch.setitem(TASKS, "leaping", Leaping)
+    calm = {f"task_options.start_{name}": 0 for name in ("radius", "speed", "tilt")}
+    config = build_config({"task": "leaping"}, {"control.disturbance": disturbance, **calm})
+    vec = make(config, num_envs=2)
+    error = [name.startswith("payload_error_") and "integral" not in name for name in vec.observation_names]
+    (before, _), fastest = vec.reset(seed=0), 0.0
+    for step in range(1, 400):
+        seen, _, terminated, _, info = vec.step(np.zeros((2, 4, 4)))
+        assert not terminated.any(), (step, vec.failure_causes[info["failure_cause"].max()])
+        state, errors = vec.world.state, vec.task.errors
+        fastest = max(fastest, np.linalg.norm(state.drone_velocity, axis=-1).max())
+        if step == LEAPT_AT:  # told, measured and commanded in the same step
+            np.testing.assert_allclose(errors.distance, 1.0, atol=0.1)
+            told = np.linalg.norm((seen - before)[..., error], axis=-1)
+            np.testing.assert_allclose(told, 1.0, atol=0.2)
+            np.testing.assert_array_equal(vec.reference.command, vec.task.goal.slots)
+        before = seen
+    assert fastest < 1.5 * vec.config.control.reference_speed
+    assert errors.distance.max() < 0.1 and errors.angle.max() < 0.1

@@ -83,8 +83,9 @@ def test_same_numbers_as_the_core(task, num_drones, cables, act):
             assert [told[key] for key in ("success", "failure", "diverged")] == [
                 bool(info[key][0]) for key in ("success", "failure", "diverged")
             ]
-            assert told["failure_cause"] == vec.failure_causes[info["failure_cause"][0]]
-            assert told["reward_terms"] == {name: value[0] for name, value in info["reward_terms"].items()}
+            assert told["failure_cause"] == info["failure_cause"][0]
+            assert all(told[f"reward_terms.{name}"] == value[0] for name, value in info["reward_terms"].items())
+            assert not any(isinstance(value, str | dict) for value in told.values())  # TorchRL makes tensors of them
         assert same(env.state(), vec.state()[0])
         step += 1
     assert terminated[0] or truncated[0]
@@ -96,7 +97,7 @@ def test_a_failed_episode_says_why():
     assert all(terminations.values()) and not any(truncations.values())
     for info in infos.values():
         assert info["failure"] and not info["success"] and not info["diverged"]
-        assert info["failure_cause"] in env.vec.failure_causes[1:-1]
+        assert 0 < info["failure_cause"] < len(env.vec.failure_causes) - 1
 
 
 def test_agents_are_gone_after_the_end_and_back_after_reset():
@@ -105,7 +106,7 @@ def test_agents_are_gone_after_the_end_and_back_after_reset():
     assert env.agents == []
     assert all(list(part) == env.possible_agents for part in told)
     assert all(told[3].values()) and not any(told[2].values())
-    assert {info["failure_cause"] for info in told[4].values()} == {"none"}
+    assert {info["failure_cause"] for info in told[4].values()} == {0}
     with pytest.raises(RuntimeError, match=r"has ended or none was started: call reset\(\) before step\(\)"):
         env.step(split(env, gentle(env, 0)))
     env.reset()
@@ -152,10 +153,12 @@ def test_infos_are_not_shared_between_agents():
     env = parallel_env()
     env.reset(seed=0)
     infos = env.step(split(env, gentle(env, 0)))[4]
-    infos["drone_0"]["reward_terms"].clear()
+    before = pickle.loads(pickle.dumps(infos["drone_1"]))
     infos["drone_0"]["mine"] = 1
-    assert infos["drone_1"]["reward_terms"].keys() == dict.fromkeys(env.vec.reward_terms).keys()
-    assert "mine" not in infos["drone_1"]
+    for value in infos["drone_0"].values():
+        if isinstance(value, np.ndarray):
+            value[...] = -1
+    assert same(infos["drone_1"], before)
 
 
 def test_float64_and_float32_actions_fly_alike():
@@ -206,14 +209,6 @@ def test_names_and_overrides_reach_the_core():
     assert env.metadata["name"] == "multilift_v0" and env.metadata["is_parallelizable"]
     with pytest.raises(ml.errors.ConfigError, match=r"did you mean 'payload.mass'"):
         parallel_env("hover", **{"payload.mas": 1.0})
-
-
-def test_a_pickled_copy_is_a_new_environment_of_the_same_configuration():
-    env = parallel_env(num_drones=3, seed=4)
-    expected = fly(env, None)
-    copy = pickle.loads(pickle.dumps(env))
-    assert copy.agents == []
-    assert same(fly(copy, None), expected)
 
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "parallel_registry"), reason="PettingZoo before 1.27 has no registry")

@@ -181,7 +181,7 @@ def test_pettingzoo_passes_options_on_and_tells_the_draw():
     _, infos = env.reset(
         seed=1, options={"randomization": {"payload_mass": 0.8}, "state": {"payload_velocity": [0, 0, 0.1]}}
     )
-    assert infos["drone_1"]["randomization"]["payload_mass"] == 0.8
+    assert infos["drone_1"]["randomization.payload_mass"] == 0.8
     assert env.vec.world.state.payload_velocity[0].tolist() == [0, 0, 0.1]
     with pytest.raises(ValueError, match="payload_mass"):
         env.reset(options={"randomization": {"payload_mess": 1}})

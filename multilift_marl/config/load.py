@@ -12,7 +12,7 @@ import yaml
 from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Section
-from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -81,25 +81,37 @@ def resolve_config(
         ConfigError: see `load_config`; or one value was given twice, differently.
     """
     named = {"env.num_envs": num_envs, "env.num_threads": num_threads, "env.num_drones": num_drones, "seed": seed}
-    check_names(overrides, [key.rpartition(".")[2] for key in named])
+    if unknown := find_unknown(overrides, [key.rpartition(".")[2] for key in named]):
+        name, hint = unknown
+        raise UnknownKeywordError(f"unknown key '{name}' (unexpected keyword argument '{name}'){hint}")
     for key, value in named.items():
         if value is not None and overrides.setdefault(key, value) != value:
             short = key.rpartition(".")[2]
             raise ConfigError(f"{short}={value!r} and {key}={overrides[key]!r} were both given; leave out one of them")
-    return build_config(task.model_dump(), overrides) if isinstance(task, Config) else load_config(task, overrides)
+    if not isinstance(task, Config):
+        return load_config(task, overrides)
+    return build_config(task.model_dump(include=task.model_fields_set), overrides)  # what is stated stays known as such
 
 
 def check_names(given: Iterable[str], own: Iterable[str]) -> None:
-    """Refuse a name without a dot that is neither a caller's own nor a section or value of a configuration.
+    """Refuse the first name that `find_unknown` finds.
 
-    The hint knows every key, too: frames is near train.frames.
+    Raises:
+        ConfigError: an unknown name.
+    """
+    if unknown := find_unknown(given, own):
+        raise ConfigError(f"unknown key '{unknown[0]}'{unknown[1]}")
+
+
+def find_unknown(given: Iterable[str], own: Iterable[str]) -> tuple[str, str] | None:
+    """Return the first name without a dot that is neither a caller's own nor a section or value of a configuration.
 
     Args:
         given: the names; those with a dot are left to `build_config`.
         own: of the caller's arguments.
 
-    Raises:
-        ConfigError: an unknown name.
+    Returns:
+        The name and a hint, None if all are known. The hint knows every key, too: frames is near train.frames.
     """
     top = {*Config.model_fields, *own}
     keys: dict[str, list[str]] = {}
@@ -109,7 +121,8 @@ def check_names(given: Iterable[str], own: Iterable[str]) -> None:
     for name in given:
         if "." not in name and name not in top:
             hint = nearest(name, keys, lambda near: "' or '".join(keys[near]))
-            raise ConfigError(f"unknown key '{name}'{hint if 'did you mean' in hint else nearest(name, top)}")
+            return name, hint if "did you mean" in hint else nearest(name, top)
+    return None
 
 
 def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:

@@ -108,8 +108,9 @@ class ReferenceAction(Interface):
         """See `Interface.ride`."""
         smoothing = (self.settings.reference_frequency, self.settings.reference_speed, self.dt)
         flown = (team.state, team.reference, team.pull, team.thrust, team.gains)
-        leave = bind(leave_goal, lo, hi, team.reference, team.goal)
-        moved = bind(smooth_moving, lo, hi, team.reference, team.goal, *smoothing)
+        left = Reference.zeros(*team.reference.yaw.shape)
+        leave = bind(leave_goal, lo, hi, team.reference, team.goal, left)
+        moved = bind(smooth_moving, lo, hi, team.reference, team.goal, left, *smoothing)
         return leave, plan, act, moved, bind(fly, lo, hi, *flown)
 
 

@@ -10,8 +10,26 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
-from multilift_marl.math3d import add, clip, heading, limit, matrow, mul, put, row, scale, sub, thrust_frame, turn, vec
+from multilift_marl.math3d import (
+    add,
+    clip,
+    heading,
+    limit,
+    matrow,
+    mul,
+    norm,
+    put,
+    row,
+    scale,
+    sub,
+    thrust_frame,
+    turn,
+    vec,
+)
 from multilift_marl.sim.standing import Drones, make_drones
+
+LEAP_SPEED = 20.0  # [m/s] of a slot from one control step to the next: what is faster was put elsewhere ...
+LEAP_RATE = 50.0  # [rad/s] ... or turned at once
 
 
 class Goal(NamedTuple):
@@ -193,15 +211,21 @@ def smooth(lo, hi, reference, frequency, speed, dt):
 
 
 @kernel
-def leave_goal(lo, hi, reference, goal):
+def leave_goal(lo, hi, reference, goal, left):
     """Make the references of environments lo to hi relative to the slots and motion of their goals, which then move on.
 
     `smooth_moving` makes them absolute again. In between, references ride along: only commands are smoothed, so a
-    moving target is followed without lag.
+    moving target is followed without lag. `left` (Reference) keeps them as they were, its commands the slots.
     """
     for e in range(lo, hi):
         velocity, acceleration = row(goal.velocity, e), row(goal.acceleration, e)
         for n in range(reference.yaw.shape[1]):
+            put(left.command[e, n], vec(goal.slots, e, n))
+            put(left.position[e, n], vec(reference.position, e, n))
+            put(left.velocity[e, n], vec(reference.velocity, e, n))
+            put(left.acceleration[e, n], vec(reference.acceleration, e, n))
+            left.command_yaw[e, n] = goal.drone_yaw[e]
+            left.yaw[e, n], left.yaw_rate[e, n] = reference.yaw[e, n], reference.yaw_rate[e, n]
             put(reference.position[e, n], sub(vec(reference.position, e, n), vec(goal.slots, e, n)))
             own_velocity = add(velocity, vec(goal.slot_velocity, e, n))
             own_acceleration = add(acceleration, vec(goal.slot_acceleration, e, n))
@@ -212,12 +236,15 @@ def leave_goal(lo, hi, reference, goal):
 
 
 @kernel
-def smooth_moving(lo, hi, reference, goal, frequency, speed, dt):
-    """Do as `smooth`, about goals that move; see `leave_goal`."""
+def smooth_moving(lo, hi, reference, goal, left, frequency, speed, dt):
+    """Do as `smooth`, about goals that move; see `leave_goal`. References of slots that leap stay and are smoothed."""
     for e in range(lo, hi):
         for n in range(reference.yaw.shape[1]):
-            put(reference.position[e, n], add(vec(reference.position, e, n), vec(goal.slots, e, n)))
-            reference.yaw[e, n] += goal.drone_yaw[e]
+            if _has_leapt(e, n, goal, left, dt):
+                _stay(e, n, reference, goal, left)
+            else:
+                put(reference.position[e, n], add(vec(reference.position, e, n), vec(goal.slots, e, n)))
+                reference.yaw[e, n] += goal.drone_yaw[e]
     smooth(lo, hi, reference, frequency, speed, dt)
     for e in range(lo, hi):
         velocity, acceleration, jerk = row(goal.velocity, e), row(goal.acceleration, e), row(goal.jerk, e)
@@ -228,6 +255,26 @@ def smooth_moving(lo, hi, reference, goal, frequency, speed, dt):
             put(reference.acceleration[e, n], add(vec(reference.acceleration, e, n), own_acceleration))
             put(reference.jerk[e, n], add(vec(reference.jerk, e, n), add(jerk, vec(goal.slot_jerk, e, n))))
             reference.yaw_rate[e, n] += goal.drone_yaw_rate[e]
+
+
+@kernel
+def _has_leapt(e, n, goal, left, dt):
+    """Return whether slot or heading of a drone has moved in a control step `dt` [s] as nothing that flies can."""
+    moved = norm(sub(vec(goal.slots, e, n), vec(left.command, e, n)))
+    turned = abs(wrap(goal.drone_yaw[e] - left.command_yaw[e, n]))
+    return moved > LEAP_SPEED * dt or turned > LEAP_RATE * dt
+
+
+@kernel
+def _stay(e, n, reference, goal, left):
+    """Put a reference back to where it was left, its motion relative to that of its slot now."""
+    own_velocity = add(row(goal.velocity, e), vec(goal.slot_velocity, e, n))
+    own_acceleration = add(row(goal.acceleration, e), vec(goal.slot_acceleration, e, n))
+    put(reference.position[e, n], vec(left.position, e, n))
+    put(reference.velocity[e, n], sub(vec(left.velocity, e, n), own_velocity))
+    put(reference.acceleration[e, n], sub(vec(left.acceleration, e, n), own_acceleration))
+    reference.yaw[e, n] = left.yaw[e, n]
+    reference.yaw_rate[e, n] = left.yaw_rate[e, n] - goal.drone_yaw_rate[e]
 
 
 @kernel

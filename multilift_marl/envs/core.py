@@ -25,7 +25,7 @@ TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
 
 
 class MultiliftVec:
-    """E environments of one task. The core does not reset by itself.
+    """E environments of one task. The core does not reset by itself. Copies, also by pickle, go on bit for bit.
 
     Args:
         config: what to build.
@@ -115,11 +115,14 @@ class MultiliftVec:
             raise
         return self.current()
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, action: np.ndarray, restart: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all environments by one policy step.
 
         Args:
             action: (E, N, A) floating point; values beyond [-1, 1] are clipped.
+            restart: start new episodes in environments that have ended, in place of a step: their reward is 0.
 
         Returns:
             observation (E, N, D) float32, reward (E, N) float32, terminated (E,), truncated (E,) bool, and info:
@@ -130,15 +133,18 @@ class MultiliftVec:
             ValueError: wrong shape or dtype, or an action that is not finite.
             RuntimeError: an environment has ended and was not reset.
         """
-        self._accept(action)
+        begin = self._ended & restart & (self.episodes >= 0)
+        self._accept(action, self._ended & ~begin)
         self.world.run(self._advance)
         self.world.check_warnings()
         self.steps += 1
+        if begin.any():  # these have flown on, which nobody sees
+            self.reset(mask=begin)
         diverged = self.world.diverged
         if diverged.any():
             self.task.cause[diverged], self.task.terms[diverged] = DIVERGED, 0.0
         terminated = self.task.cause > 0
-        truncated = ~terminated & (self.steps >= self.max_steps)
+        truncated = ~terminated & ~begin & (self.steps >= self.max_steps)
         self._ended = terminated | truncated
         reward = np.repeat(self.task.terms.sum(axis=1, dtype=np.float64)[:, None], self.num_drones, axis=1)
         info = self._info(terminated, truncated)
@@ -199,6 +205,16 @@ class MultiliftVec:
         self.pilot.load_state_dict(saved)
         self._starts.load_state_dict(groups["imperfections"])
 
+    def __reduce__(
+        self,
+    ) -> tuple[type[MultiliftVec], tuple[Config, int, int], tuple[dict[str, np.ndarray], np.ndarray]]:
+        saved = self.state_dict(), self.task.terms.copy()
+        return type(self), (self.config, self.purpose, self.first_env), saved
+
+    def __setstate__(self, saved: tuple[dict[str, np.ndarray], np.ndarray]) -> None:
+        self.load_state_dict(saved[0])
+        self.task.terms[:] = saved[1]  # of the last step: later ones do not depend on them
+
     def _start(self, mask: np.ndarray, fixed: dict[str, Rows]) -> None:
         """Start the episodes in `mask`, with a row of what is fixed of draw and state for each."""
         chosen = np.flatnonzero(mask).tolist()
@@ -242,7 +258,7 @@ class MultiliftVec:
         for call in after:
             call()
 
-    def _accept(self, action: np.ndarray) -> None:
+    def _accept(self, action: np.ndarray, ended: np.ndarray) -> None:
         action = np.asarray(action)
         if action.shape != self._action.shape:
             raise ValueError(
@@ -250,9 +266,9 @@ class MultiliftVec:
             )
         if action.dtype.kind != "f":
             raise ValueError(f"action has dtype {action.dtype}, expected floating point numbers in [-1, 1]")
-        if self._ended.any():
+        if ended.any():
             raise RuntimeError(
-                f"environment {int(np.argmax(self._ended))} has ended or was never reset: call reset(mask=...) first"
+                f"environment {int(np.argmax(ended))} has ended or was never reset: call reset(mask=...) first"
             )
         if not np.isfinite(action).all():
             e, n, k = np.argwhere(~np.isfinite(action))[0]

@@ -1,11 +1,14 @@
-"""What the faces of the core share: pictures, and what one environment tells of itself."""
+"""What the faces of the core share: fresh seeds, spaces, pictures, and what one environment tells of itself."""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import nearest
@@ -13,6 +16,21 @@ from multilift_marl.rendering import Renderer, Window
 
 BATCH_RENDER_MODES = ("rgb_array",)  # of many environments
 RENDER_MODES = (*BATCH_RENDER_MODES, "human")
+
+
+def seed_afresh(vec: MultiliftVec) -> None:
+    """Let environments that were never reset start from fresh entropy, unless their configuration states a seed.
+
+    So copies and workers fly episodes of their own. `vec.seeds` says which.
+    """
+    if "seed" not in vec.config.model_fields_set and (vec.episodes < 0).all():
+        vec.seeds[:] = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def possible_modes(render_mode: str | None) -> list[str]:
+    """Return the render modes of an environment made with `render_mode`: no "human" where there is no display."""
+    windows = sys.platform in ("win32", "darwin") or any(os.environ.get(key) for key in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return [mode for mode in RENDER_MODES if mode != "human" or windows or mode == render_mode]
 
 
 class Pictures:
@@ -62,12 +80,26 @@ class Pictures:
                 self._window = Window(self._vec)
             self._window.show()
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_renderer": None, "_window": None}  # a copy opens its own
+
     def close(self) -> None:
         """Free renderer and window; the next picture makes new ones."""
         for tool in (self._renderer, self._window):
             if tool is not None:
                 tool.close()
         self._renderer = self._window = None
+
+
+def row_spaces(vec: MultiliftVec, drones: int) -> tuple[Box, Box]:
+    """Return the spaces of what `drones` drones in a row observe (drones·D,) and of their actions (drones·A,)."""
+    observed, acted = drones * vec.observation_size, drones * vec.action_size
+    return Box(-np.inf, np.inf, (observed,), np.float32), Box(-1.0, 1.0, (acted,), np.float32)
+
+
+def mean_reward(reward: np.ndarray) -> np.ndarray:
+    """Return the mean (E,) over the drones, in float64: that of equal float32 numbers is then exactly each of them."""
+    return reward.mean(axis=1, dtype=np.float64)
 
 
 def solo_info(vec: MultiliftVec, info: dict[str, Any]) -> dict[str, Any]:

@@ -7,14 +7,23 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from multilift_marl.config.load import list_configs
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec, make_vec
-from multilift_marl.envs.faces import BATCH_RENDER_MODES, RENDER_MODES, Pictures, solo_info
+from multilift_marl.envs.faces import (
+    BATCH_RENDER_MODES,
+    RENDER_MODES,
+    Pictures,
+    mean_reward,
+    possible_modes,
+    row_spaces,
+    seed_afresh,
+    solo_info,
+)
+from multilift_marl.errors import nearest
 
 
 class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -22,17 +31,15 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Drone n has the n-th D numbers of an observation and the n-th A numbers of an action. Info holds `success`,
     `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms` {name: float} and
-    `randomization` {name: array}, the hidden draw. A copy, also by pickle, is a new environment of the same
-    configuration, not yet reset.
+    `randomization` {name: array}, the hidden draw. Copies, also by pickle, go on bit for bit.
 
-    Without a seed an environment starts with the configured one, so environments that are to fly different episodes
-    need different seeds.
+    Where neither the configuration nor the first reset states a seed, that reset draws one (`vec.seeds`).
 
     Args:
         task: a configuration's name, the path of one, or a Config.
         render_mode: None, "rgb_array" for `render`, or "human" for a window that shows every step.
         num_drones: N; None for the configured value, likewise the next.
-        seed: of the first reset.
+        seed: of the first reset; None draws one, unless the configuration states it.
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
 
     Attributes:
@@ -51,9 +58,10 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ):  # fmt: skip
         single = {"env.num_envs": 1, "env.num_threads": 1}
         self.vec = make_vec(task, num_drones=num_drones, seed=seed, **overrides | single)
-        self.metadata = {**self.metadata, "render_fps": self.vec.config.env.policy_hz}
+        modes = possible_modes(render_mode)
+        self.metadata = {**self.metadata, "render_modes": modes, "render_fps": self.vec.config.env.policy_hz}
         self.render_mode = render_mode
-        self.observation_space, self.action_space = _joint_spaces(self.vec)
+        self.observation_space, self.action_space = row_spaces(self.vec, self.vec.num_drones)
         self._pictures = Pictures(self.vec, render_mode)
 
     def reset(
@@ -62,7 +70,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Start a new episode.
 
         Args:
-            seed: start at episode 0 of this seed; None goes to the next episode.
+            seed: start at episode 0 of this seed; None goes to the next episode, at first of a seed of its own.
             options: see `MultiliftVec.reset`.
 
         Returns:
@@ -71,6 +79,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: a negative seed, an unknown option or one that cannot be.
         """
+        seed_afresh(self.vec)
         observation, info = self.vec.reset(seed, options=options)
         self._pictures.show()
         super().reset(seed=seed)  # for wrappers that draw from np_random; nothing here does
@@ -94,7 +103,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         joint = _split(self.vec, action, self.action_space)
         observation, reward, terminated, truncated, info = self.vec.step(joint)
         self._pictures.show()
-        mean = float(_mean(reward)[0])
+        mean = float(mean_reward(reward)[0])
         return observation.reshape(-1), mean, bool(terminated[0]), bool(truncated[0]), solo_info(self.vec, info)
 
     def render(self) -> np.ndarray | None:
@@ -110,33 +119,34 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Free renderer and window; the environment itself holds nothing that must be closed."""
         self._pictures.close()
 
-    def __reduce__(self) -> tuple[type[MultiliftGymnasiumEnv], tuple[Config, str | None]]:
-        return type(self), (self.vec.config, self.render_mode)
-
 
 class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """E teams of N drones on the batched core, each as one agent: observations (E, N·D), actions (E, N·A).
 
-    An environment that ends is reset in the same step (`AutoresetMode.SAME_STEP`): the observation and info returned
-    are the new episode's, the last ones of the old stand in `info["final_obs"]` and `info["final_info"]`, as in
-    Gymnasium's own vector environments. Each entry `key` of an info has its mask `_key` (E,).
+    An environment that ends is reset as in Gymnasium's own vector environments: in the same step (`SAME_STEP`), where
+    observation and info returned are the new episode's and the last ones of the old stand in `info["final_obs"]` and
+    `info["final_info"]`; in the next step (`NEXT_STEP`), whose action does not count and whose reward is 0; or by the
+    caller (`DISABLED`), with `options={"reset_mask": ...}`. Each entry `key` of an info has its mask `_key` (E,).
+    Copies, also by pickle, go on bit for bit.
 
     Args:
         task: a configuration's name, the path of one, or a Config.
         num_envs: E; None for the configured value, likewise the next three.
         num_threads: threads that step them; 0 for one on each CPU. Results do not depend on it.
         num_drones: N.
-        seed: of the first reset.
+        seed: of the first reset; None draws one, unless the configuration states it.
         first_env: number of the first environment, for replaying one of a larger batch.
         render_mode: None, or "rgb_array" for `render`.
+        autoreset_mode: see above; also "SameStep", "NextStep" or "Disabled".
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
 
     Attributes:
         vec: the batched core underneath.
+        autoreset_mode: as given; `metadata` has it, too.
 
     Raises:
         ConfigError: an unknown key, a wrong value or an impossible system.
-        ValueError: an unknown render mode.
+        ValueError: an unknown render mode or autoreset mode.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (as Gymnasium has it)
@@ -148,16 +158,18 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def __init__(
         self, task: str | Config = "hover", *, num_envs: int | None = None, num_threads: int | None = None,
         num_drones: int | None = None, seed: int | None = None, first_env: int = 0, render_mode: str | None = None,
-        **overrides: Any,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, **overrides: Any,
     ):  # fmt: skip
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.vec = make_vec(
             task, num_envs=num_envs, num_threads=num_threads, num_drones=num_drones, seed=seed, first_env=first_env,
             **overrides,
         )  # fmt: skip
         self.num_envs = self.vec.num_envs
-        self.metadata = {**self.metadata, "render_fps": self.vec.config.env.policy_hz}
+        own = {"autoreset_mode": self.autoreset_mode, "render_fps": self.vec.config.env.policy_hz}
+        self.metadata = {**self.metadata, **own}
         self.render_mode = render_mode
-        self.single_observation_space, self.single_action_space = _joint_spaces(self.vec)
+        self.single_observation_space, self.single_action_space = row_spaces(self.vec, self.vec.num_drones)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._pictures = Pictures(self.vec, render_mode, BATCH_RENDER_MODES)
@@ -180,13 +192,14 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises:
             ValueError: a negative seed, a mask of wrong shape or type, an unknown option or one that cannot be.
         """
+        seed_afresh(self.vec)
         options = dict(options or {})
         mask = options.pop("reset_mask", None)
         observation, info = self.vec.reset(seed, mask, options)
         return self._joint(observation), self._told(info, np.ones(self.num_envs, bool) if mask is None else mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advance all environments by one policy step and reset those that have ended.
+        """Advance all environments by one policy step and reset those that have ended, as `autoreset_mode` says.
 
         Args:
             actions: (E, N·A) floating point; values beyond [-1, 1] are clipped.
@@ -196,12 +209,13 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Raises:
             ValueError: actions of wrong shape or type, or not finite.
-            RuntimeError: the environments were never reset.
+            RuntimeError: environments were never reset, or have ended and nobody resets them.
         """
-        joint = _split(self.vec, actions, self.action_space)
-        observation, reward, terminated, truncated, info = self.vec.step(joint)
+        joint, mode = _split(self.vec, actions, self.action_space), self.autoreset_mode
+        restart = mode is AutoresetMode.NEXT_STEP
+        observation, reward, terminated, truncated, info = self.vec.step(joint, restart)
         over, infos = terminated | truncated, {}
-        if over.any():
+        if mode is AutoresetMode.SAME_STEP and over.any():
             final = np.full(self.num_envs, None, dtype=object)
             for e in np.flatnonzero(over):
                 final[e] = observation[e].reshape(-1)
@@ -209,7 +223,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             infos |= {f"_{key}": over.copy() for key in infos}
             observation, info = self.vec.reset(mask=over)
         infos |= self._told(info, np.ones(self.num_envs, bool))
-        return self._joint(observation), _mean(reward), terminated, truncated, infos
+        return self._joint(observation), mean_reward(reward), terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...]:
         """Return a picture (H, W, 3) uint8 of each environment.
@@ -241,10 +255,12 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return told | {f"_{key}": mask.copy() for key in told}
 
 
-def _joint_spaces(vec: MultiliftVec) -> tuple[Box, Box]:
-    """Return the spaces of the team's observations (N·D,) and actions (N·A,)."""
-    observed, acted = vec.num_drones * vec.observation_size, vec.num_drones * vec.action_size
-    return Box(-np.inf, np.inf, (observed,), np.float32), Box(-1.0, 1.0, (acted,), np.float32)
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Return a mode given as such or by its value."""
+    names = [each.value for each in AutoresetMode]
+    if isinstance(mode, str) and mode not in names:
+        raise ValueError(f"unknown autoreset_mode '{mode}'{nearest(mode, names)}")
+    return AutoresetMode(mode)
 
 
 def _split(vec: MultiliftVec, action: np.ndarray, space: gymnasium.Space[Any]) -> np.ndarray:
@@ -256,11 +272,6 @@ def _split(vec: MultiliftVec, action: np.ndarray, space: gymnasium.Space[Any]) -
             f"{vec.num_drones} drones in a row"
         )
     return action.reshape(vec.num_envs, vec.num_drones, vec.action_size)
-
-
-def _mean(reward: np.ndarray) -> np.ndarray:
-    """Return the mean (E,) over the drones, in float64: that of equal float32 numbers is then exactly each of them."""
-    return reward.mean(axis=1, dtype=np.float64)
 
 
 def register() -> None:

@@ -12,17 +12,19 @@ from pettingzoo import ParallelEnv
 from multilift_marl.config.load import list_configs, resolve_config
 from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.envs.faces import RENDER_MODES, Pictures, solo_info
+from multilift_marl.envs.faces import RENDER_MODES, Pictures, possible_modes, seed_afresh
 from multilift_marl.errors import nearest
 
 
 class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     """A team of N drones as a PettingZoo environment; agents `drone_0` ... act at once and end together.
 
-    Observations are (D,) float32, actions (A,) in [-1, 1], rewards are the team's. Each agent's info holds `success`,
-    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms` {name: float} and
-    `randomization` {name: array}, the hidden draw. A copy, also by pickle, is a new environment of the same
-    configuration, not yet reset.
+    Observations are (D,) float32, actions (A,) in [-1, 1], rewards are the team's. Each agent's info holds numbers and
+    arrays alone, as wrappers that make tensors of it ask: `success`, `failure`, `diverged` (bool), `failure_cause`, an
+    index into `vec.failure_causes` (0: none), `reward_terms.<name>` (float) and `randomization.<name>`, the hidden
+    draw. Copies, also by pickle, go on bit for bit.
+
+    Where neither the configuration nor the first reset states a seed, that reset draws one (`vec.seeds`).
 
     Args:
         config: what to build; it is stepped alone, whatever `env.num_envs` says.
@@ -48,7 +50,8 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     def __init__(self, config: Config, render_mode: str | None = None):
         config = resolve_config(config, num_envs=1, num_threads=1)
         self.vec = vec = MultiliftVec(config)
-        self.metadata = {**self.metadata, "render_fps": config.env.policy_hz}
+        modes = possible_modes(render_mode)
+        self.metadata = {**self.metadata, "render_modes": modes, "render_fps": config.env.policy_hz}
         self.render_mode = render_mode
         self.possible_agents = [f"drone_{n}" for n in range(vec.num_drones)]
         self.agents: list[str] = []
@@ -57,7 +60,6 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         self.action_spaces = {name: Box(-1.0, 1.0, (vec.action_size,), np.float32) for name in names}
         self.state_space = Box(*unbounded, (vec.state_size,), np.float32)
         self._joint = np.zeros((1, vec.num_drones, vec.action_size))
-        self._rows = list(zip(names, self._joint[0], strict=True))
         self._pictures = Pictures(vec, render_mode)
 
     def reset(
@@ -66,7 +68,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         """Start a new episode.
 
         Args:
-            seed: start at episode 0 of this seed; None goes to the next episode.
+            seed: start at episode 0 of this seed; None goes to the next episode, at first of a seed of its own.
             options: `randomization` and `state`, values by name to start from; see docs/randomization.md.
 
         Returns:
@@ -76,6 +78,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
             ValueError: a negative seed, an unknown option or one that cannot be.
         """
         options = {name: value for name, value in (options or {}).items() if name != "options"}  # of PettingZoo's test
+        seed_afresh(self.vec)
         observation, info = self.vec.reset(seed, options=options)
         self.agents = self.possible_agents.copy()
         self._pictures.show()
@@ -103,7 +106,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         if len(actions) != len(agents):
             raise self._mismatch(actions)
         shape = self._joint.shape[2:]
-        for name, row in self._rows:
+        for n, name in enumerate(self.possible_agents):
             if name not in actions:
                 raise self._mismatch(actions)
             action = np.asarray(actions[name])
@@ -112,7 +115,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
                     f"action of {name} has shape {action.shape} and dtype {action.dtype}, expected {shape} "
                     "floating point numbers in [-1, 1]"
                 )
-            row[:] = action
+            self._joint[0, n] = action
         observation, reward, terminated, truncated, info = self.vec.step(self._joint)
         over, out_of_time = bool(terminated[0]), bool(truncated[0])
         if over or out_of_time:
@@ -151,14 +154,13 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         """Free renderer and window; the environment itself holds nothing that must be closed."""
         self._pictures.close()
 
-    def __reduce__(self) -> tuple[type[MultiliftParallelEnv], tuple[Config, str | None]]:
-        return type(self), (self.vec.config, self.render_mode)
-
     def _infos(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
-        """Return a dict for each agent; none is shared, so that wrappers may write into theirs."""
-        told = solo_info(self.vec, info)
-        own = ("reward_terms", "randomization")
-        return {name: {**told, **{key: told[key].copy() for key in own}} for name in self.possible_agents}
+        """Return a dict for each agent; nothing in it is shared, so that wrappers may write into theirs."""
+        told: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
+        told["failure_cause"] = int(info["failure_cause"][0])
+        told |= {f"reward_terms.{name}": float(array[0]) for name, array in info["reward_terms"].items()}
+        drawn = {f"randomization.{name}": array[0] for name, array in info["randomization"].items()}
+        return {name: told | {key: row.copy() for key, row in drawn.items()} for name in self.possible_agents}
 
     def _mismatch(self, actions: dict[str, Any]) -> ValueError:
         for name in self.possible_agents:
@@ -177,7 +179,7 @@ def parallel_env(
     Args:
         task: a configuration's name, the path of one, or a Config.
         num_drones: N; None for the configured value, likewise the next.
-        seed: of the first reset.
+        seed: of the first reset; None draws one, unless the configuration states it.
         render_mode: None, "rgb_array" or "human".
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
 

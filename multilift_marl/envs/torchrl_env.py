@@ -31,6 +31,7 @@ class MultiliftEnv(EnvBase):
 
     Attributes:
         vec: the batched core underneath.
+        group_map: {"agents": names of the drones}, as TorchRL's own multi-agent environments have it.
 
     Raises:
         ConfigError: see `MultiliftVec`.
@@ -39,6 +40,7 @@ class MultiliftEnv(EnvBase):
     def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
         self.vec = vec = MultiliftVec(config, purpose, first_env)
         super().__init__(device="cpu", batch_size=[vec.num_envs])
+        self.group_map = {"agents": [f"drone_{n}" for n in range(vec.num_drones)]}
         e, n, flag = vec.num_envs, vec.num_drones, Binary(1, (vec.num_envs, 1), dtype=torch.bool)
         self.observation_spec = Composite(
             agents=Composite(observation=Unbounded((e, n, vec.observation_size)), shape=(e, n)),

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Section
-from multilift_marl.control.formation import Goal, Reference, make_rig
+from multilift_marl.control.formation import Goal, Reference, make_rig, place_formation
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
@@ -149,9 +150,25 @@ class Task:
     def planner(self, lo: int, hi: int) -> Callable[[], None] | None:
         """Return what moves the goals of environments lo to hi on by one control step; None if they stay.
 
-        It adds `control_dt` to `time` and writes goal and its velocities for that moment.
+        It adds `control_dt` to `time` and writes goal and its velocities for that moment. A goal may leap, see
+        `place_goal`: references are smoothed to slots that leap, and ride along with those that move.
         """
         return None
+
+    def place_goal(self, env: int, position: ArrayLike, rotation: ArrayLike | None = None) -> None:
+        """Put the target of one environment elsewhere, the formation with it, at a start or in flight.
+
+        Compiled planners write `goal.position` and `goal.rotation` and call `formation.place_formation`.
+
+        Args:
+            env: the environment.
+            position: (3,) of the payload [m].
+            rotation: (3, 3) its attitude; None leaves it.
+        """
+        self.goal.position[env] = position
+        if rotation is not None:
+            self.goal.rotation[env] = rotation
+        place_formation(env, self.goal, self.rig)
 
     def counts(self, time: float, length: float) -> bool:
         """Return whether errors at `time` [s] of an episode of `length` [s] belong to those that are reported."""
