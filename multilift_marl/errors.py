@@ -34,3 +34,9 @@ def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str) -
 def pip_install(extra: str) -> str:
     """Return the command that installs an extra of this package, from an index or in a clone."""
     return f'pip install "multilift_marl[{extra}]" (in a clone: pip install -e ".[{extra}]")'
+
+
+def reason(error: BaseException) -> str:
+    """Return what went wrong in few words, such as "No space left on device"."""
+    told = error.strerror if isinstance(error, OSError) else None
+    return told or str(error).partition("\n")[0] or type(error).__name__

@@ -60,7 +60,7 @@ def _train(values: dict[str, Any]) -> int:
     minutes = trainer.seconds / 60
     if not finished:
         print(f"stopped after {minutes:.1f} min of training; go on with: python train.py resume={folder}")
-        return 130
+        return trainer.status
     baseline = "formation_integral" if trainer.config.control.action == "reference" else "none"
     print(
         f"trained {trainer.frames:,} steps in {minutes:.1f} min: success {trainer.best[0]:.1%}, "
