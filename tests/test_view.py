@@ -192,7 +192,7 @@ def listeners(port):
 
 
 def test_the_page_is_served_to_this_machine_alone(page):
-    with urllib.request.urlopen(f"http://{HOST}:{page.port}/", timeout=30) as answer:
+    with urllib.request.urlopen(page.address, timeout=30) as answer:
         assert answer.status == 200 and b"<html" in answer.read().lower()
     assert listeners(page.port) == ["0100007F"]  # 127.0.0.1, and no other address
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import tempfile
 import time
@@ -30,7 +31,7 @@ from multilift_marl.agents.mappo import make_learner, update
 from multilift_marl.agents.policy import LearnedPolicy, check_policy
 from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.config.schema import Config
-from multilift_marl.envs.core import TRAINING_EVALUATION
+from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason
 from multilift_marl.evaluation.metrics import summarize
@@ -60,8 +61,9 @@ class Trainer:
             if key.partition(".")[0] in ("task", "seed", "train", "eval"):
                 raise ConfigError(f"train.overrides changes the environment and cannot hold '{key}'; set {key} itself")
         self.env = MultiliftEnv(build_config(config.model_dump(), config.train.overrides))
-        self.learner = make_learner(config.train, self.env)
         self.frames_per_batch = self.env.vec.num_envs * config.train.horizon
+        _check_memory(self.env.vec, self.frames_per_batch)
+        self.learner = make_learner(config.train, self.env)
         if config.train.minibatches > self.frames_per_batch:
             raise ConfigError(
                 f"train.minibatches={config.train.minibatches} exceeds the {self.frames_per_batch} steps of a batch; "
@@ -300,6 +302,17 @@ def _quietly(show: Callable[..., object], *arguments: Any) -> None:
     """Show something on a terminal that may be gone."""
     with suppress(OSError):
         show(*arguments)
+
+
+def _check_memory(vec: MultiliftVec, steps: int) -> None:
+    """Refuse a batch that is larger than this machine's memory."""
+    numbers = 2 * vec.state_size + vec.num_drones * (2 * vec.observation_size + 2 * vec.action_size + 6)
+    needed, there = 4 * steps * numbers, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise ConfigError(
+            f"a batch of {steps} steps takes {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
+            "train.horizon or env.num_envs"
+        )
 
 
 def adapted_rate(rate: float, kl: float, desired: float) -> float:

@@ -22,10 +22,12 @@ _USAGE = """Train a team.
 
 _RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.episodes", "env.num_threads")
 
+_NAMES = ("config", "resume")
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train; return the exit status."""
-    return run_command(_train, _USAGE, ("config", "resume"), arguments)
+    return run_command(_train, _USAGE, _NAMES, arguments, names=_NAMES)
 
 
 def _train(values: dict[str, Any]) -> int:
@@ -49,7 +51,7 @@ def _train(values: dict[str, Any]) -> int:
             return 0
         print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
     else:
-        name = str(values.pop("config", "hover"))
+        name = values.pop("config", "hover")
         config = load_config(name, values)
         _ = config.system  # refuse an impossible system before the long wait
         announce_compiling()
