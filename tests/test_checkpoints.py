@@ -263,7 +263,8 @@ def test_signals_save_and_stop(tmp_path, monkeypatch, number):
 
 @pytest.mark.parametrize("lasts", [False, True])
 def test_a_full_disk_costs_nothing(tmp_path, monkeypatch, capsys, lasts):
-    trainer = make_trainer(tmp_path, **{"train.checkpoint_every": 1, "train.frames": 128 * 3, "eval.every": 100})
+    frames = 128 * (1 if lasts else 3)
+    trainer = make_trainer(tmp_path, **{"train.checkpoint_every": 1, "train.frames": frames, "eval.episodes": 1})
     trainer.save("last")
     step, replace = trainer.step, os.replace
 
