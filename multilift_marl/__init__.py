@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from multilift_marl import sim
+from multilift_marl import _interrupt, sim  # noqa: F401 (_interrupt first: Ctrl-C may come while the rest is imported)
 from multilift_marl.config import load_config
 from multilift_marl.envs.core import make_vec
 from multilift_marl.envs.gymnasium_env import register as _register_with_gymnasium

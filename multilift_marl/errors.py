@@ -35,6 +35,18 @@ def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str) -
     return f"; did you mean '{full(close[0])}'?" if close else f"; known: {', '.join(names)}"
 
 
+def shorten(value: object, most: int = 80) -> str:
+    """Return a value as text of one line, cut where it is long."""
+    text = "".join(char if char.isprintable() else repr(char)[1:-1] for char in str(value)[: 2 * most])
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
 def pip_install(extra: str) -> str:
     """Return the command that installs an extra of this package, from an index or in a clone."""
     return f'pip install "multilift_marl[{extra}]" (in a clone: pip install -e ".[{extra}]")'
+
+
+def reason(error: BaseException) -> str:
+    """Return what went wrong in few words, such as "No space left on device"."""
+    told = error.strerror if isinstance(error, OSError) else None
+    return told or str(error).partition("\n")[0] or type(error).__name__

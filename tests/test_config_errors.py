@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import random
 import re
 
 import pytest
@@ -10,6 +12,8 @@ from conftest import refusal, refuse_system, refuse_task
 
 import multilift_marl as ml
 from multilift_marl.config import load_config, parse_overrides
+from multilift_marl.config.load import config_dir, dump_config
+from multilift_marl.errors import ConfigError
 
 
 def refuse_values(**overrides) -> str:
@@ -235,3 +239,97 @@ def test_argument_without_key_or_value_is_refused(argument):
 
 def test_argument_that_is_no_yaml_is_refused():
     assert re.match(r"the value of seed=\[1 is not valid YAML", refusal(parse_overrides, ["seed=[1"]))
+
+
+# Hostile files and command lines
+
+BOMB = ", ".join(f"&a{i} [{', '.join([f'*a{i - 1}' if i else '1'] * 10)}]" for i in range(9))
+HOSTILE = {
+    "2020-01-01": "must be a number, but is '2020-01-01'",
+    "0x_": "must be a number, but is '0x_'",
+    "1:30": "must be a number, but is '1:30'",
+    "!!python/object/apply:os.getcwd []": "is not taken",
+    "!!int x": "the tag tag:yaml.org,2002:int is not taken",
+    "&a [*a]": r"\*a holds itself",
+    "&a {b: *a}": r"\*a holds itself",
+    "[" * 3000 + "]" * 3000: "nested more than 30 deep",
+    f"[{BOMB}]": "more than 20000 values",
+    "{a: 1, a: 2}": "'a' is given twice",
+    "1" * 5000: "too many digits",
+    "\0": "special characters are not allowed",
+    "=": "must be a number, but is '='",
+    "x" * 5000: "must be a number, but is 'xxx",
+}
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=lambda text: repr(text[:12]))
+def test_hostile_values_are_refused_in_a_short_sentence(write, text):
+    from_line = refusal(lambda: load_config("hover", parse_overrides([f"payload.mass={text}"])))
+    from_file = refusal(load_config, write(f"payload:\n  mass: {text}\n"))
+    for message in (from_line, from_file):
+        assert re.search(HOSTILE[text], message) and len(message) < 500, message
+
+
+@pytest.mark.parametrize("text, value", [("0o17", 15), ("017", 17), ("0x1F", 31), ("1_000", 1000), ("2e3", 2000)])
+def test_whole_numbers_are_those_of_yaml_1_2(write, text, value):
+    assert load_config("hover", parse_overrides([f"seed={text}"])).seed == value
+    assert load_config(write(f"seed: {text}")).seed == value
+
+
+@pytest.mark.parametrize("name", ["2e6", "0o17", "017", "1:30", "2020-01-01", "yes", "=", "a b: c"])
+def test_text_that_looks_like_a_number_survives_a_dump(write, name):
+    config = load_config("hover", {"task_options.anything": name})
+    assert load_config(write(dump_config(config))) == config
+
+
+def test_a_key_given_twice_is_refused(write):
+    assert refusal(parse_overrides, ["seed=1", "seed=2"]) == "seed is given twice; leave out one of them"
+    assert "'seed' is given twice (line 3)" in refusal(load_config, write("seed: 1\nenv: {}\nseed: 2\n"))
+
+
+def test_aliases_and_merges_are_taken(write):
+    config = load_config(write("randomization: &r {payload_mass: 0.1}\ntrain: {overrides: {<<: *r}}\n"))
+    assert config.train.overrides == {"payload_mass": 0.1}
+
+
+@pytest.mark.parametrize(
+    "key, value",
+    [
+        ("env.num_envs", "1e8"), ("train.horizon", "1e12"), ("train.hidden", "[]"), ("train.hidden", "[1e9]"),
+        ("train.threads", "1e9"), ("env.episode_seconds", "1e308"), ("seed", "1e400"), ("seed", "1e300"),
+    ],
+)  # fmt: skip
+def test_sizes_that_no_machine_has_are_refused_before_anything_is_built(key, value):
+    assert refuse_values(**parse_overrides([f"{key}={value}"])).startswith(f"{key} must")
+
+
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.yaml")
+    (tmp_path / "folder.yaml").mkdir()
+    os.symlink("/dev/zero", tmp_path / "device.yaml")
+    (tmp_path / "long.yaml").write_text("#" * 2_000_000)
+    (tmp_path / "bytes.yaml").write_bytes(b"seed: \xff")
+    for name, words in (
+        ("pipe", "no regular file"), ("folder", "no regular file"), ("device", "no regular file"),
+        ("long", "longer than 1000000 bytes"), ("bytes", "can't decode"), ("a\0b", "null byte"),
+        ("x" * 300, "too long"),
+    ):  # fmt: skip
+        assert words in refusal(load_config, tmp_path / f"{name}.yaml")
+    for name in ("\0", "x" * 5000):
+        assert re.match("cannot read|no configuration named", refusal(load_config, name))
+        assert "file that can be read" in refuse_values(task_options__file=name)
+
+
+def test_damaged_configurations_load_or_are_refused(write):
+    """A small fuzzer: whatever a file holds, nothing but a ConfigError comes of it."""
+    rng, whole = random.Random(0), (config_dir() / "hover.yaml").read_bytes()
+    for _ in range(60):
+        text = bytearray(whole[: rng.randrange(len(whole))])
+        for _ in range(rng.choice([0, 1, 5]) if text else 0):
+            text[rng.randrange(len(text))] = rng.randrange(256)
+        path = write("")
+        path.write_bytes(text)
+        try:
+            load_config(path)
+        except ConfigError as error:
+            assert "\n" not in str(error)

@@ -261,8 +261,8 @@ def test_without_graphics_evaluation_goes_on(run, tmp_path, monkeypatch, capsys)
     ("argument", "message"),
     [
         ("baseline=formatoin", "unknown baseline 'formatoin'; did you mean 'formation'?"),
-        ("episodes=0", "episodes must be a whole number, at least 1, but is 0"),
-        ("episodes=many", "episodes must be a whole number, at least 1, but is 'many'"),
+        ("episodes=0", "episodes must be a whole number from 1 to 1000000, but is 0"),
+        ("episodes=many", "episodes must be a whole number from 1 to 1000000, but is 'many'"),
         ("video=perhaps", "video must be true or false, but is 'perhaps'"),
         ("camera=sid", "unknown camera 'sid'; did you mean 'side'?"),
         ("trail=long", "trail must be a number of seconds from 0 to 1000, but is 'long'"),
@@ -275,6 +275,9 @@ def test_without_graphics_evaluation_goes_on(run, tmp_path, monkeypatch, capsys)
         ("control.action=velocity", "was trained with control.action=reference and cannot fly velocity"),
         ("task=track", "was trained in task hover and cannot fly this track: number"),
         ("payload.mas=1", "unknown key 'payload.mas'; did you mean 'payload.mass'?"),
+        ("out=/dev/null", "cannot write into /dev/null (File exists); give another folder by out=<folder>"),
+        ("out=/dev/null/x", "cannot write into /dev/null/x (Not a directory); give another folder"),
+        ("checkpoint=/dev/null", "no checkpoint /dev/null"),
         ("episods=3", "unknown key 'episods'; did you mean 'episodes'?"),
     ],
 )

@@ -1,5 +1,8 @@
 """The training command: interrupts, help, and errors of one sentence."""
 
+import errno
+import io
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +13,7 @@ import pytest
 from conftest import SMALL, make_trainer
 
 from multilift_marl.agents.checkpoint import load_checkpoint
-from multilift_marl.agents.logging import read_metrics
+from multilift_marl.agents.logging import RunLog, read_metrics
 from multilift_marl.cli import common
 from multilift_marl.cli.train import main as train
 from multilift_marl.config import load_config
@@ -43,11 +46,24 @@ def test_interrupt_saves_and_resume_finishes(tmp_path):
     assert len(read_metrics(folder)) == done + 2
 
 
-@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
-def test_interrupt_while_importing_is_one_line(tmp_path, script):
+@pytest.mark.parametrize(
+    "command",
+    [
+        [str(ROOT / "train.py")],
+        [str(ROOT / "evaluate.py")],
+        ["-m", "multilift_marl.view"],
+        [
+            "-c",
+            "import sys; sys.argv = ['multilift-train']; from multilift_marl.cli.train import main; sys.exit(main())",
+        ],
+    ],
+    ids=["train.py", "evaluate.py", "view", "multilift-train"],
+)
+def test_interrupt_while_importing_is_one_line(tmp_path, command):
     process = subprocess.Popen(
-        [sys.executable, "-X", "importtime", str(ROOT / script)], cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        [sys.executable, "-X", "importtime", *command], cwd=tmp_path, stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells start jobs behind them deaf to it
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     while "numpy" not in process.stderr.readline():
         pass
@@ -60,6 +76,42 @@ def test_help_may_be_cut_short():
     command = f"{sys.executable} {ROOT / 'train.py'} --help | head -1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr) == ("Train a team.\n", "")
+
+
+def test_help_on_terminals_of_any_kind(monkeypatch, capsys):
+    ascii_only = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", ascii_only)
+    assert train(["--help"]) == 0 and b"[kg m\\xb2]" in ascii_only.buffer.getvalue()
+    monkeypatch.setattr(sys, "stdout", None)  # closed, as by >&-
+    assert train(["--help"]) == 0
+    monkeypatch.setattr(sys, "stdout", open("/dev/full", "w"))
+    assert train(["--help"]) == 2
+    assert capsys.readouterr().err.startswith("error: cannot read or write the output (No space left on device); ")
+
+
+def test_a_folder_that_cannot_hold_runs_is_named(tmp_path, monkeypatch, capsys):
+    (tmp_path / "runs").touch()
+    monkeypatch.chdir(tmp_path)
+    assert train([f"{key}={value}" for key, value in SMALL.items()]) == 2
+    assert capsys.readouterr().err == "error: cannot make a run in runs/ (File exists); train in another folder\n"
+
+
+def test_a_table_of_metrics_survives_a_full_disk(tmp_path, monkeypatch):
+    log = RunLog(tmp_path)
+    log.write({"iteration": 1, "frames": 8}, {"a": 1.0})
+    for column in ("a", "b"):  # a row is added, or the table written anew
+        with monkeypatch.context() as full:
+            full.setattr("builtins.open", raise_full)
+            with pytest.raises(OSError, match="No space"):
+                log.write({"iteration": 2, "frames": 16}, {column: 2.0})
+        assert [row["iteration"] for row in read_metrics(tmp_path)][:1] == ["1"]
+    log.write({"iteration": 4, "frames": 32}, {"a": 4.0})
+    log.close()
+    assert [row["iteration"] for row in read_metrics(tmp_path)] == ["1", "2", "2", "4"]
+
+
+def raise_full(*arguments, **keywords):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_the_first_time_the_wait_for_the_compiler_is_announced(monkeypatch, capsys):
@@ -90,6 +142,13 @@ def test_help_explains_every_key(capsys):
         (["payload.mass=30"], "lower payload.mass"),
         (["frames"], "'frames' is not of the form key=value"),
         (["resume=nowhere"], "no run folder nowhere"),
+        (["resume="], "resume= is empty; give a name behind it"),
+        (["resume=3"], "no run folder 3: give the path"),
+        (["resume=\0"], r"no run folder \x00: give the path"),
+        (["resume=" + "x" * 300], "File name too long"),
+        (["config=[1]"], "no configuration named '[1]'"),
+        (["seed=1", "seed=2"], "seed is given twice"),
+        (["train.horizon=1e5", "env.num_envs=1e4"], "takes"),
     ],
 )
 def test_command_line_errors_are_one_sentence(tmp_path, monkeypatch, capsys, arguments, message):

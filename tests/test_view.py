@@ -1,5 +1,6 @@
 """The browser viewer: what its buttons do to the flight, that it is served to this machine alone, what it shows."""
 
+import http.client
 import socket
 import subprocess
 import sys
@@ -192,9 +193,42 @@ def listeners(port):
 
 
 def test_the_page_is_served_to_this_machine_alone(page):
-    with urllib.request.urlopen(f"http://{HOST}:{page.port}/", timeout=30) as answer:
+    with urllib.request.urlopen(page.address, timeout=30) as answer:
         assert answer.status == 200 and b"<html" in answer.read().lower()
     assert listeners(page.port) == ["0100007F"]  # 127.0.0.1, and no other address
+
+
+@pytest.mark.parametrize("upgrade", [False, True], ids=["page", "websocket"])
+def test_only_who_has_the_address_may_open_the_page(page, upgrade):
+    own, token = f"{HOST}:{page.port}", page.address.partition("=")[2]
+    cookie, wrong = f"multilift_{page.port}={token}", f"multilift_{page.port}={token[:-1]}"
+    websocket = {
+        "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    }  # fmt: skip
+
+    def ask(path="/", host=own, **headers):
+        connection = http.client.HTTPConnection(own, timeout=30)
+        connection.request("GET", path, headers={"Host": host} | headers | (websocket if upgrade else {}))
+        answer = connection.getresponse()
+        connection.close()
+        return answer.status, answer.getheader("Set-Cookie", "")
+
+    opened = 101 if upgrade else 200
+    assert ask(f"/?token={token}")[0] == opened
+    assert ask(Cookie=f"theirs={{}}; {cookie}", Origin=f"http://{own}")[0] == opened
+    assert ask(f"/?token={token}", host="localhost:9000", Origin="http://localhost:9000")[0] == opened  # a tunnel
+    if not upgrade:
+        given = ask(f"/?token={token}")[1]
+        assert given.startswith(f"{cookie}; ") and "HttpOnly" in given and "SameSite=Strict" in given
+    for refused in (
+        ask(), ask(f"/?token={token[:-1]}"), ask("/?token="), ask(Cookie=wrong),
+        ask(f"/?token={token}", host="evil.com"),
+        ask(f"/?token={token}", host=f"{HOST}.evil.com:{page.port}"), ask(f"/?token={token}", host="["),
+        ask(Cookie=cookie, Origin="http://evil.com"), ask(Cookie=cookie, Origin="null"),
+        ask(Cookie=cookie, Origin="http://127.0.0.1:1"), ask(Cookie=cookie, Origin=f"https://{own}"),
+    ):  # fmt: skip
+        assert refused == (403, "")
 
 
 def test_a_port_that_is_taken_is_named(page):

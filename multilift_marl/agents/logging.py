@@ -6,6 +6,7 @@ import csv
 import json
 import platform
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,42 +27,57 @@ class RunLog:
         self._path = folder / "metrics.csv"
         self._rows: list[dict[str, Any]] = [row for row in read_metrics(folder) if int(row["iteration"]) <= iteration]
         self._columns = list(self._rows[0]) if self._rows else []
+        self._behind = False  # whether rows are missing in the file
         if self._rows:
             self._rewrite()
-        self._writer = SummaryWriter(str(folder), purge_step=frames + 1 if iteration else None)
+        self._writer: SummaryWriter | None = SummaryWriter(str(folder), purge_step=frames + 1 if iteration else None)
 
     def write(self, row: dict[str, float], values: dict[str, float]) -> None:
         """Write one iteration: `row` holds iteration and frames, `values` the numbers; TensorBoard's step is frames."""
         line = {**row, **values}
         new = [name for name in line if name not in self._columns]
         self._rows.append(line)
-        if new:  # columns that come only with an evaluation
-            self._columns += new
+        self._columns += new
+        if new or self._behind:  # columns that come only with an evaluation; rows that could not be written
             self._rewrite()
         else:
+            self._behind = True
             with open(self._path, "a", newline="", encoding="utf-8") as file:
                 csv.DictWriter(file, self._columns, restval="").writerow(line)
+            self._behind = False
+        if self._writer is None:
+            self._writer = SummaryWriter(str(self._path.parent))
         for name, value in values.items():
-            self._writer.add_scalar(name, value, row["frames"])
+            try:
+                self._writer.add_scalar(name, value, row["frames"])
+            except OSError:  # TensorBoard's writer never recovers: the next row begins a file of its own
+                self._writer = None
+                raise
 
     def close(self) -> None:
         """Flush and close the event file."""
-        self._writer.close()
+        with suppress(OSError):
+            if self._writer is not None:
+                self._writer.close()
 
     def _rewrite(self) -> None:
-        with open(self._path, "w", newline="", encoding="utf-8") as file:
+        self._behind = True
+        aside = self._path.with_suffix(".tmp")  # so that a full disk costs no row that is there
+        with open(aside, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self._columns, restval="")
             writer.writeheader()
             writer.writerows(self._rows)
+        aside.replace(self._path)
+        self._behind = False
 
 
 def read_metrics(folder: Path) -> list[dict[str, str]]:
-    """Return the rows of a run's metrics.csv, empty if there are none yet."""
+    """Return the rows of a run's metrics.csv that are whole, empty if there are none yet."""
     path = folder / "metrics.csv"
     if not path.is_file():
         return []
-    with open(path, newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    with open(path, newline="", encoding="utf-8", errors="replace") as file:
+        return [row for row in csv.DictReader(file) if (row.get("iteration") or "").isdecimal()]
 
 
 def write_versions(folder: Path) -> None:

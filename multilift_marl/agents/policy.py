@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+from multilift_marl.agents.checkpoint import check_like, load_checkpoint, save_checkpoint
 from multilift_marl.agents.networks import Actor
 from multilift_marl.config.load import build_config
 from multilift_marl.errors import CheckpointError, ConfigError
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 _SHIPPED = Path(__file__).resolve().parents[1] / "policies"
-_KEPT = ("config", "actor", "observation_names", "action_names", "frames")  # what a policy needs of a checkpoint
+_KEPT = {"config": dict, "actor": dict, "observation_names": list, "action_names": list, "frames": int}
+"""What a policy needs of a checkpoint."""
 
 
 class LearnedPolicy:
@@ -36,22 +37,25 @@ class LearnedPolicy:
         actor: the network.
 
     Raises:
-        CheckpointError: the weights are of a network of another shape.
+        CheckpointError: a part is missing or of another type, or the weights are of another network or not finite.
         ConfigError: the configuration is of another version.
     """
 
     def __init__(self, content: dict[str, Any], source: str):
+        check_policy(content, source)
         self.config = build_config(content["config"])
         self.observation_names, self.action_names = tuple(content["observation_names"]), tuple(content["action_names"])
-        self.source, self.frames = source, int(content["frames"])
-        weights, size = content["actor"], (len(self.observation_names), len(self.action_names))
-        train = self.config.train
+        self.source, self.frames = source, content["frames"]
+        size, train = (len(self.observation_names), len(self.action_names)), self.config.train
         with torch.random.fork_rng(devices=[]):  # initial weights, overwritten at once, must not cost random numbers
             self.actor = Actor(train.actor, *size, train.hidden, train.initial_std, torch.zeros(size[1], size[0]))
         try:
-            self.actor.load_state_dict(weights)
-        except RuntimeError as error:
-            raise CheckpointError(f"{source} holds a network of another shape; train again") from error
+            check_like(content["actor"], self.actor.state_dict(), "actor")
+        except ValueError as error:
+            raise CheckpointError(
+                f"{source} holds other weights than its network has ({error}); train again"
+            ) from error
+        self.actor.load_state_dict(content["actor"])
 
     @torch.no_grad()
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -114,11 +118,21 @@ def load_policy(name: str | Path) -> LearnedPolicy:
     elif not path.is_file() and (_SHIPPED / f"{name}.pt").is_file():
         path = _SHIPPED / f"{name}.pt"
     content = load_checkpoint(path)
-    if missing := [key for key in _KEPT if key not in content]:
-        raise CheckpointError(
-            f"{path} holds no policy ('{missing[0]}' is missing); give a checkpoint of a training run"
-        )
     return LearnedPolicy(content, str(path))
+
+
+def check_policy(content: dict[str, Any], source: str) -> None:
+    """Refuse a checkpoint of which a policy cannot be made, by a CheckpointError."""
+    cure = "give a checkpoint of a training run"
+    for key, kind in _KEPT.items():
+        if key not in content:
+            raise CheckpointError(f"{source} holds no policy ('{key}' is missing); {cure}")
+        if not isinstance(content[key], kind) or isinstance(content[key], bool):
+            found = type(content[key]).__name__
+            raise CheckpointError(f"{source} holds no policy ('{key}' is {found}, expected {kind.__name__}); {cure}")
+    for key in ("observation_names", "action_names"):
+        if not all(isinstance(name, str) for name in content[key]):
+            raise CheckpointError(f"{source} holds no policy ('{key}' must be words); {cure}")
 
 
 def shipped_policies() -> list[str]:

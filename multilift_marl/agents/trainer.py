@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import signal
+import tempfile
 import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +18,27 @@ import torch
 from torchrl.collectors import Collector
 from tqdm import tqdm
 
-from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+from multilift_marl.agents.checkpoint import (
+    check_like,
+    clear_leftovers,
+    load_checkpoint,
+    lock_run,
+    save_checkpoint,
+    unlock_run,
+)
 from multilift_marl.agents.logging import RunLog, write_versions
 from multilift_marl.agents.mappo import make_learner, update
+from multilift_marl.agents.policy import LearnedPolicy, check_policy
 from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.config.schema import Config
-from multilift_marl.envs.core import TRAINING_EVALUATION
+from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
-from multilift_marl.errors import CheckpointError, ConfigError
+from multilift_marl.errors import CheckpointError, ConfigError, reason
 from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
 _NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best")
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Trainer:
@@ -33,6 +48,9 @@ class Trainer:
         config: what to train.
         folder: the run's folder; nothing is written there before `run` or `save`.
         checkpoint: content of the checkpoint to go on from.
+
+    Attributes:
+        status: exit status of a process whose training was stopped.
     """
 
     def __init__(self, config: Config, folder: Path, checkpoint: dict[str, Any] | None = None):
@@ -43,8 +61,9 @@ class Trainer:
             if key.partition(".")[0] in ("task", "seed", "train", "eval"):
                 raise ConfigError(f"train.overrides changes the environment and cannot hold '{key}'; set {key} itself")
         self.env = MultiliftEnv(build_config(config.model_dump(), config.train.overrides))
-        self.learner = make_learner(config.train, self.env)
         self.frames_per_batch = self.env.vec.num_envs * config.train.horizon
+        _check_memory(self.env.vec, self.frames_per_batch)
+        self.learner = make_learner(config.train, self.env)
         if config.train.minibatches > self.frames_per_batch:
             raise ConfigError(
                 f"train.minibatches={config.train.minibatches} exceeds the {self.frames_per_batch} steps of a batch; "
@@ -54,7 +73,7 @@ class Trainer:
         self.iteration, self.seconds = 0, 0.0
         self.best = (-1.0, -float("inf"))  # success, negative error
         self._returns = np.zeros(self.env.vec.num_envs)  # of the episodes in flight
-        self._stop = False
+        self._stop, self._warned, self.status = False, False, 128 + signal.SIGINT
         if checkpoint is not None:
             self._restore(checkpoint)
         self.collector = Collector(
@@ -74,34 +93,66 @@ class Trainer:
             torch.set_rng_state(checkpoint["rng"])
 
     def run(self) -> bool:
-        """Train to the end; return False if the user stopped it. Ctrl-C saves and stops, a second one stops at once."""
-        previous = signal.signal(signal.SIGINT, self._interrupt)
-        log = RunLog(self.folder, self.iteration, self.frames)
-        name = f"{self.config.task} {self.config.train.algorithm}"
-        bar = tqdm(total=self.iterations, initial=self.iteration, desc=name, unit="it", dynamic_ncols=True)
-        shown: dict[str, str] = {}
-        try:
-            while not (self.finished or self._stop):
-                start = time.perf_counter()
-                values = self.step()
-                if "return" in values:
-                    shown["return"] = f"{values['return']:.0f}"
-                last = self.finished
-                if self.iteration % self.config.eval.every == 0 or last:
-                    values |= self.evaluate()
-                    shown["success"] = f"{values['eval/success_rate']:.0%}"
-                    shown["error"] = f"{100 * values['eval/payload_position_error_m']:.1f} cm"
-                log.write({"iteration": self.iteration, "frames": self.frames}, values)
-                self.seconds += time.perf_counter() - start
-                if self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
-                    self.save("last")
-                bar.set_postfix(shown)
-                bar.update()
-        finally:
-            bar.close()
-            log.close()
-            signal.signal(signal.SIGINT, previous)
+        """Train to the end; return False if the user stopped it.
+
+        Ctrl-C, SIGTERM and SIGHUP save and stop, a second one stops at once. A disk that is full is no reason to stop:
+        what could not be written is written again after the next iteration.
+
+        Raises:
+            CheckpointError: another process trains this run, or its end could not be saved.
+        """
+        lock_run(self.folder)
+        with ExitStack() as stack:
+            stack.callback(unlock_run, self.folder)
+            clear_leftovers(self.folder)
+            for number in _STOPPING:
+                if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup's stays
+                    stack.callback(signal.signal, number, signal.signal(number, self._interrupt))
+            log = RunLog(self.folder, self.iteration, self.frames)
+            stack.callback(log.close)
+            name = f"{self.config.task} {self.config.train.algorithm}"
+            bar = tqdm(total=self.iterations, initial=self.iteration, desc=name, unit="it", dynamic_ncols=True)
+            stack.callback(_quietly, bar.close)
+            self._train(log, bar)
         return not self._stop
+
+    def _train(self, log: RunLog, bar: tqdm) -> None:
+        shown: dict[str, str] = {}
+        unsaved = False
+        while not (self.finished or self._stop):
+            start = time.perf_counter()
+            values = self.step()
+            if "return" in values:
+                shown["return"] = f"{values['return']:.0f}"
+            last = self.finished
+            if self.iteration % self.config.eval.every == 0 or last:
+                values |= self.evaluate()
+                shown["success"] = f"{values['eval/success_rate']:.0%}"
+                shown["error"] = f"{100 * values['eval/payload_position_error_m']:.1f} cm"
+            self._attempt(partial(log.write, {"iteration": self.iteration, "frames": self.frames}, values))
+            self.seconds += time.perf_counter() - start
+            if unsaved or self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
+                unsaved = not self._attempt(partial(self.save, "last"))
+            _quietly(bar.set_postfix, shown)
+            _quietly(bar.update)
+        if unsaved:
+            spare = Path(tempfile.gettempdir()) / f"{self.folder.name}-last.pt"
+            self.save("last", spare)
+            raise CheckpointError(
+                f"cannot write into {self.folder}: the run is saved as {spare}; make room, move it to "
+                f"{self.folder / 'checkpoints' / 'last.pt'}, and resume"
+            )
+
+    def _attempt(self, write: Callable[[], None]) -> bool:
+        """Return whether `write` could write; say so if not, once."""
+        try:
+            write()
+        except (OSError, CheckpointError) as error:
+            if not self._warned:
+                _quietly(tqdm.write, f"warning: {error}; training goes on and tries again after each iteration")
+            self._warned = True
+            return False
+        return True
 
     @property
     def finished(self) -> bool:
@@ -144,9 +195,7 @@ class Trainer:
 
     def evaluate(self) -> dict[str, float]:
         """Fly the deterministic policy on the seeds of evaluation during training; keep the best checkpoint."""
-        from multilift_marl.agents.policy import LearnedPolicy  # a copy, without exploration
-
-        policy = LearnedPolicy(self._content(), "the run")
+        policy = LearnedPolicy(self._content(), "the run")  # a copy, without exploration
         episodes = fly_episodes(
             self.config, policy.bind, self.config.eval.episodes, self.config.seed, TRAINING_EVALUATION
         )
@@ -155,13 +204,15 @@ class Trainer:
         values = {f"eval/{name}": summary[name]["mean"] for name in names}
         score = (values["eval/success_rate"], -values["eval/payload_position_error_m"])
         if score > self.best:
-            self.best = score
-            self.save("best")
+            before, self.best = self.best, score
+            if not self._attempt(partial(self.save, "best")):
+                self.best = before
         return values
 
-    def save(self, name: str) -> None:
-        """Write checkpoints/<name>.pt."""
-        save_checkpoint(self.folder / "checkpoints" / f"{name}.pt", self._content() | self._training_state())
+    def save(self, name: str, path: Path | None = None) -> None:
+        """Write checkpoints/<name>.pt, or `path`; a CheckpointError if that cannot be."""
+        path = path or self.folder / "checkpoints" / f"{name}.pt"
+        save_checkpoint(path, self._content() | self._training_state())
 
     def _content(self) -> dict[str, Any]:
         """Return what a policy needs."""
@@ -192,16 +243,31 @@ class Trainer:
             raise CheckpointError(f"the checkpoint cannot be resumed, '{missing[0]}' is missing; give a training run's")
         try:
             self._load(content)
-        except (RuntimeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
+        except Exception as error:  # torch's optimizers raise many kinds
             raise CheckpointError(
-                f"the checkpoint does not fit this version or system ({reason}); train anew"
+                f"the checkpoint does not fit this version or system ({reason(error)}); train anew"
             ) from error
 
     def _load(self, content: dict[str, Any]) -> None:
+        environments, optimizer = content["env"], self.learner.optimizer
+        own = self._training_state()
+        for key in ("loss", "rng", "returns", "iteration", "seconds", "best"):
+            check_like(content[key], own[key], key)
+        check_like(content["actor"], self.learner.actor.state_dict(), "actor")
+        torch.Generator().set_state(content["rng"])  # refuses what is no state
+        if content["iteration"] < 0:
+            raise ValueError("'iteration' is negative")
+        for key in ("world.system", "task_name"):  # which the first checkpoints do not hold
+            environments.setdefault(key, own["env"][key])
+        self.env.set_state(environments)
         self.learner.loss.load_state_dict(content["loss"])
-        self.learner.optimizer.load_state_dict(content["optimizer"])
-        self.env.set_state(content["env"])
+        optimizer.load_state_dict(content["optimizer"])
+        for group, expected in zip(optimizer.param_groups, own["optimizer"]["param_groups"], strict=True):
+            for key in expected.keys() - {"params"}:
+                check_like(group[key], expected[key], f"optimizer.{key}")
+        for parameter, moments in optimizer.state.items():
+            like = {"step": torch.zeros(()), "exp_avg": parameter.data, "exp_avg_sq": parameter.data}
+            check_like(moments, like, "optimizer.state")
         self._returns[:] = content["returns"].numpy()
         self.iteration, self.seconds, self.best = content["iteration"], content["seconds"], tuple(content["best"])
 
@@ -228,8 +294,25 @@ class Trainer:
     def _interrupt(self, signum: int, frame: Any) -> None:
         if self._stop:
             raise KeyboardInterrupt
-        self._stop = True
-        tqdm.write("stopping after this iteration; press Ctrl-C again to stop at once")
+        self._stop, self.status = True, 128 + signum
+        _quietly(tqdm.write, "stopping after this iteration; press Ctrl-C again to stop at once")
+
+
+def _quietly(show: Callable[..., object], *arguments: Any) -> None:
+    """Show something on a terminal that may be gone."""
+    with suppress(OSError):
+        show(*arguments)
+
+
+def _check_memory(vec: MultiliftVec, steps: int) -> None:
+    """Refuse a batch that is larger than this machine's memory."""
+    numbers = 2 * vec.state_size + vec.num_drones * (2 * vec.observation_size + 2 * vec.action_size + 6)
+    needed, there = 4 * steps * numbers, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise ConfigError(
+            f"a batch of {steps} steps takes {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
+            "train.horizon or env.num_envs"
+        )
 
 
 def adapted_rate(rate: float, kl: float, desired: float) -> float:
@@ -245,25 +328,39 @@ def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Trainer:
     Raises:
         ConfigError: what cannot be trained; no folder is made then.
     """
-    stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}-s{config.seed}"
-    trainer, again = Trainer(config, runs / stem), 1
-    while trainer.folder.exists():
-        again += 1
-        trainer.folder = runs / f"{stem}-{again}"
-    (trainer.folder / "checkpoints").mkdir(parents=True)
+    trainer = Trainer(config, runs)
+    try:
+        runs.mkdir(parents=True, exist_ok=True)
+        trainer.folder = _make_folder(runs, f"{name}-{time.strftime('%Y%m%d-%H%M%S')}-s{config.seed}")
+        (trainer.folder / "checkpoints").mkdir()
+    except OSError as error:
+        raise ConfigError(f"cannot make a run in {runs}/ ({reason(error)}); train in another folder") from error
     (trainer.folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
     write_versions(trainer.folder)
     return trainer
+
+
+def _make_folder(runs: Path, stem: str) -> Path:
+    """Return a new folder of this name, or of the next one that is free."""
+    for again in itertools.count(1):
+        folder = runs / (stem if again == 1 else f"{stem}-{again}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            break
+    return folder
 
 
 def resume_run(folder: Path, overrides: dict[str, Any]) -> Trainer:
     """Return a trainer that goes on from the last checkpoint of `folder`.
 
     Raises:
-        CheckpointError: there is none that can be read.
+        CheckpointError: there is none that can be read, or another process trains this run.
         ConfigError: an override that a run in progress cannot take.
     """
-    content = load_checkpoint(folder / "checkpoints" / "last.pt")
+    lock_run(folder)
+    path = folder / "checkpoints" / "last.pt"
+    content = load_checkpoint(path)
+    check_policy(content, str(path))
     config = build_config(content["config"], overrides)
     trainer = Trainer(config, folder, content)
     (folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+import tempfile
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+from multilift_marl._interrupt import end_quiet_import
 from multilift_marl._jit import compiled
 from multilift_marl.config.load import check_names, explain, parse_overrides
-from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install
+from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install, reason, shorten
 from multilift_marl.tasks import TASKS
 
 _EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  # of all other packages: train
@@ -17,7 +22,7 @@ _EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  #
 
 def run_command(
     main: Callable[[dict[str, Any]], int], usage: str, own: Iterable[str], arguments: Sequence[str] | None,
-    configurable: bool = True,
+    configurable: bool = True, names: Collection[str] = (),
 ) -> int:  # fmt: skip
     """Run a command on key=value arguments and return its exit status; a user's error is one sentence on stderr.
 
@@ -27,8 +32,11 @@ def run_command(
         own: its keys beside those of a configuration.
         arguments: None for those of this process.
         configurable: whether its help lists the keys of a configuration.
+        names: those of its keys that name files and the like, taken as they are.
     """
+    end_quiet_import()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    _open_streams()
     try:
         if any(argument in ("-h", "--help") for argument in arguments):
             print(usage)
@@ -36,26 +44,74 @@ def run_command(
                 _explain_configuration()
             status = 0
         else:
-            values = parse_overrides(arguments)
+            values = parse_overrides(arguments, names)
             check_names(values, own)
             status = main(values)
         sys.stdout.flush()
         return status
     except (ConfigError, CheckpointError, RenderingError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return _refuse(str(error))
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package == "multilift_marl":
             raise
-        print(f"error: {error.name} is missing; {pip_install(_EXTRAS.get(package, 'train'))}", file=sys.stderr)
-        return 2
+        return _refuse(f"{error.name} is missing; {pip_install(_EXTRAS.get(package, 'train'))}")
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
     except BrokenPipeError:  # head, say, has read enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what the interpreter flushes at its end
+        _give_up_output()
         return 141
+    except MemoryError:
+        return _refuse("this needs more memory than there is; lower env.num_envs or train.horizon")
+    except OSError as error:
+        if error.filename is None:  # the output, on a full disk or a terminal that is gone
+            _give_up_output()
+        place = "the output" if error.filename is None else str(error.filename)
+        return _refuse(f"cannot read or write {place} ({reason(error)}); make room, or use another folder")
+
+
+def _refuse(message: str) -> int:
+    """Print a user's error as one line, and return its exit status."""
+    with suppress(OSError):
+        print(f"error: {shorten(message, 2000)}", file=sys.stderr, flush=True)
+    return 2
+
+
+def _open_streams() -> None:
+    """Have output that can be written to: none where it is closed, and escapes for what its encoding does not know."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _give_up_output() -> None:
+    """Send to nowhere what the interpreter flushes at its end."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def whole_number(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
+    """Return the value of a command's own key; a ConfigError if it is no whole number from `least` to `most`."""
+    whole = isinstance(value, int | float) and not isinstance(value, bool) and value == value // 1
+    if not whole or not least <= value <= most:
+        raise ConfigError(f"{key} must be a whole number from {least} to {most}, but is {shorten(repr(value))}")
+    return int(value)
+
+
+def make_folder(folder: Path) -> Path:
+    """Return a folder that can be written to, made where there is none; a ConfigError if that cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"cannot write into {shorten(folder)} ({reason(error)}); give another folder by out=<folder>"
+        ) from error
+    return folder
 
 
 def announce_compiling() -> None:

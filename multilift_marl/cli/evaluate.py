@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from multilift_marl.cli.common import announce_compiling, run_command
+from multilift_marl.cli.common import announce_compiling, make_folder, run_command, whole_number
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.control.scripted import SCRIPTED, fitting_scripts, make_scripted
@@ -46,10 +47,12 @@ _DEFAULTS = {
     "baseline": "formation_integral", "video": False, "camera": "side", "trail": 2.0, "out": None,
 }  # fmt: skip
 
+_NAMES = ("run", "policy", "config", "checkpoint", "baseline", "camera", "out")
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate; return the exit status."""
-    return run_command(_evaluate, _USAGE, _DEFAULTS, arguments)
+    return run_command(_evaluate, _USAGE, _DEFAULTS, arguments, names=_NAMES)
 
 
 def _evaluate(values: dict[str, Any]) -> int:
@@ -66,15 +69,14 @@ def _evaluate(values: dict[str, Any]) -> int:
         makers |= {name: _script(name) for name in (*fitting_scripts(probe), own["baseline"]) if name != flown.name}
     for make in makers.values():  # refuses what does not fit, before there is a folder
         make(probe)
-    out = Path(own["out"]) if own["out"] else flown.folder / "eval" / time.strftime("%Y%m%d-%H%M%S")
-    out.mkdir(parents=True, exist_ok=True)
+    out = make_folder(Path(own["out"]) if own["out"] else flown.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
 
     episodes = {name: _fly(config, maker, name, own) for name, maker in makers.items()}
     judged = episodes.pop(flown.name)
     report = make_report(config, own["seed"], judged, episodes)
-    write_report(out / "metrics.json", report)
     print(f"\n{flown.source}: {own['episodes']} episodes, seed {own['seed']}; mean (95 % interval)\n")
     print(format_table(report, flown.name))
+    write_report(out / "metrics.json", report)
     print(f"\nwrote {out / 'metrics.json'}")
     _draw(config, makers, flown, own, out)
     return 0
@@ -117,18 +119,8 @@ def _find_script(own: dict[str, Any]) -> _Flown:
 
 
 def _check(own: dict[str, Any]) -> None:
-    for key in ("episodes", "seed"):
-        text = own[key]
-        whole = isinstance(text, int | float | str) and not isinstance(text, bool)
-        try:
-            number = float(text) if whole else float("nan")
-        except ValueError:
-            number = float("nan")
-        if not number.is_integer() or number < (1 if key == "episodes" else 0):
-            raise ConfigError(
-                f"{key} must be a whole number, at least {1 if key == 'episodes' else 0}, but is {text!r}"
-            )
-        own[key] = int(number)
+    own["episodes"] = whole_number("episodes", own["episodes"], 1, 1_000_000)
+    own["seed"] = whole_number("seed", own["seed"], 0)
     if own["baseline"] not in (*SCRIPTED, "none"):
         raise ConfigError(f"unknown baseline '{own['baseline']}'{nearest(str(own['baseline']), [*SCRIPTED, 'none'])}")
     if not isinstance(own["video"], bool):
@@ -146,7 +138,7 @@ def _find_policy(run: str, checkpoint: str) -> _Flown:
     from multilift_marl.agents.policy import load_policy, shipped_policies
 
     torch.set_num_threads(1)  # for networks this small, more of them only wait for each other
-    if run in shipped_policies() and not Path(run).exists():
+    if run in shipped_policies() and not os.path.exists(run):
         if checkpoint != "best":
             raise ConfigError(f"checkpoint={checkpoint} means nothing to the shipped policy '{run}'; leave it out")
         policy, folder = load_policy(run), Path("runs") / f"shipped-{run}"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from multilift_marl.cli.common import run_command
+from multilift_marl.cli.common import make_folder, run_command
 from multilift_marl.errors import ConfigError
 
 _USAGE = """Write a trained policy as an ONNX network and a contract of its inputs and outputs (docs/export.md).
@@ -22,7 +23,7 @@ _DEFAULTS = {"run": "latest", "out": None}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Export; return the exit status."""
-    return run_command(_export, _USAGE, _DEFAULTS, arguments, configurable=False)
+    return run_command(_export, _USAGE, _DEFAULTS, arguments, configurable=False, names=_DEFAULTS)
 
 
 def _export(values: dict[str, Any]) -> int:
@@ -33,11 +34,8 @@ def _export(values: dict[str, Any]) -> int:
     from multilift_marl.agents.export import CONTRACT, NETWORK, export_policy
 
     policy, home = _find_policy(str(own["run"]))
-    out = Path(str(own["out"])) if own["out"] is not None else home / "export"
-    try:
-        contract = export_policy(policy, out)
-    except OSError as error:
-        raise ConfigError(f"cannot write into {out} ({error.strerror}); give another folder by out=<folder>") from error
+    out = make_folder(Path(own["out"]) if own["out"] is not None else home / "export")
+    contract = export_policy(policy, out)
     sizes = [len(contract["observation"]["names"]), len(contract["action"]["numbers"])]
     print(
         f"{policy.source}: {contract['task']}, {sizes[0]} numbers to {sizes[1]} for each drone, "
@@ -53,9 +51,9 @@ def _find_policy(run: str) -> tuple[Any, Path]:
     from multilift_marl.agents.checkpoint import find_run
     from multilift_marl.agents.policy import load_policy, shipped_policies
 
-    if run in shipped_policies() and not Path(run).exists():
+    if run in shipped_policies() and not os.path.exists(run):
         return load_policy(run), Path("runs") / f"shipped-{run}"
-    if Path(run).is_file():
+    if os.path.isfile(run):
         return load_policy(run), Path(run).parent
     folder = find_run(run)
     return load_policy(folder), folder

@@ -22,10 +22,12 @@ _USAGE = """Train a team.
 
 _RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.episodes", "env.num_threads")
 
+_NAMES = ("config", "resume")
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train; return the exit status."""
-    return run_command(_train, _USAGE, ("config", "resume"), arguments)
+    return run_command(_train, _USAGE, _NAMES, arguments, names=_NAMES)
 
 
 def _train(values: dict[str, Any]) -> int:
@@ -49,7 +51,7 @@ def _train(values: dict[str, Any]) -> int:
             return 0
         print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
     else:
-        name = str(values.pop("config", "hover"))
+        name = values.pop("config", "hover")
         config = load_config(name, values)
         _ = config.system  # refuse an impossible system before the long wait
         announce_compiling()
@@ -60,7 +62,7 @@ def _train(values: dict[str, Any]) -> int:
     minutes = trainer.seconds / 60
     if not finished:
         print(f"stopped after {minutes:.1f} min of training; go on with: python train.py resume={folder}")
-        return 130
+        return trainer.status
     baseline = "formation_integral" if trainer.config.control.action == "reference" else "none"
     print(
         f"trained {trainer.frames:,} steps in {minutes:.1f} min: success {trainer.best[0]:.1%}, "

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from multilift_marl.errors import ConfigError
+from multilift_marl.errors import ConfigError, reason, shorten
 
 _MARK = "#sha256="
 _DIGITS = 16  # of the hash
@@ -27,11 +27,17 @@ def pin_file(reference: str) -> str:
 
     A run folder or a checkpoint then names what was flown, wherever it is read. A reference that has a hash is returned
     as it is; one of a file that is missing has none.
+
+    Raises:
+        ValueError: there cannot be such a file, or it cannot be read.
     """
     if _MARK in reference:
         return reference
-    path = Path(reference).expanduser().resolve()
-    return f"{path}{_MARK}{_hash(path.read_bytes())}" if path.is_file() else str(path)
+    try:
+        path = Path(reference).expanduser().resolve()
+        return f"{path}{_MARK}{_hash(path.read_bytes())}" if path.is_file() else str(path)
+    except (OSError, RuntimeError, ValueError) as error:  # of names too long, ~nobody, and names with a NUL
+        raise ValueError(f"must name a file that can be read ({reason(error)})") from None
 
 
 def read_pinned(key: str, reference: str) -> tuple[Path, bytes]:
@@ -46,9 +52,12 @@ def read_pinned(key: str, reference: str) -> tuple[Path, bytes]:
     """
     name, _, expected = reference.partition(_MARK)
     path = Path(name)
-    if not path.is_file():
+    try:
+        content = path.read_bytes() if path.is_file() else None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot read {key}={shorten(name)} ({reason(error)}); give the path of another") from error
+    if content is None:
         raise ConfigError(f"{key}={name} is missing; put the file back, or give the path of another by {key}=<path>")
-    content = path.read_bytes()
     if expected and _hash(content) != expected:
         raise ConfigError(
             f"{key}={name} has changed since this configuration was made (its sha256 began with {expected}); put the "

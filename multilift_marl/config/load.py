@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Section
-from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest
+from multilift_marl.config.yaml_text import parse_yaml, read_yaml, write_yaml
+from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest, reason, shorten
 
+_MOST_SECTIONS = 5  # of a key's name; what is deeper is unknown anyway
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -57,7 +57,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
     merged = _merge({}, values)
     free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
     for dotted, value in (overrides or {}).items():
-        *sections, key = dotted.split(".")
+        *sections, key = dotted.split(".", _MOST_SECTIONS)
         change, node = {key: value}, merged
         for part in sections:
             node = node.get(part, {})
@@ -125,27 +125,38 @@ def find_unknown(given: Iterable[str], own: Iterable[str]) -> tuple[str, str] | 
     return None
 
 
-def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:
+def parse_overrides(arguments: Iterable[str], names: Collection[str] = ()) -> dict[str, Any]:
     """Return {"a.b": value} of command-line arguments a.b=value, read as YAML.
 
+    Args:
+        arguments: of the command line.
+        names: keys whose values are names, of files and runs say: text as it is.
+
     Raises:
-        ConfigError: an argument of another form, or a value that is no YAML.
+        ConfigError: an argument of another form, a key given twice, an empty name, or a value that is no YAML.
     """
-    overrides = {}
+    overrides: dict[str, Any] = {}
     for argument in arguments:
         key, separator, text = argument.partition("=")
         if not separator or not key:
             raise ConfigError(f"'{argument}' is not of the form key=value, such as train.frames=2e6")
+        if key in overrides:
+            raise ConfigError(f"{key} is given twice; leave out one of them")
+        if key in names:
+            if not text.strip():
+                raise ConfigError(f"{key}= is empty; give a name behind it, or leave it out")
+            overrides[key] = text
+            continue
         try:
-            overrides[key] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise ConfigError(f"the value of {key}={text} is not valid YAML") from None
+            overrides[key] = parse_yaml(text)
+        except ValueError as error:
+            raise ConfigError(f"the value of {key}={shorten(text)} is not valid YAML: {error}") from None
     return overrides
 
 
 def dump_config(config: Config) -> str:
     """Return the resolved configuration as YAML, complete: it loads back to an equal one."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    return write_yaml(config.model_dump(mode="json"))
 
 
 def explain(section: type[Section] = Config, prefix: str = "") -> str:
@@ -171,16 +182,18 @@ def _leaves(section: type[Section], prefix: str) -> Iterator[tuple[str, Any, str
 
 def _read(name: str | Path) -> dict[str, Any]:
     path = Path(name)
-    if path.suffix not in (".yaml", ".yml"):
-        path = config_dir() / f"{name}.yaml"
-        if not path.is_file():
-            raise ConfigError(f"no configuration named '{name}'{nearest(str(name), list_configs())}")
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if path.suffix not in (".yaml", ".yml"):
+            path = config_dir() / f"{name}.yaml"
+            if not path.is_file():
+                raise ConfigError(f"no configuration named '{shorten(name)}'{nearest(str(name), list_configs())}")
+        values = read_yaml(path)
+    except ConfigError:
+        raise
     except FileNotFoundError:
         raise ConfigError(f"no configuration file {path}: give the path of a YAML file or a shipped name") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"cannot read {path} as YAML: {' '.join(str(error).split())}") from None
+    except (OSError, ValueError) as error:  # ValueError: what is no YAML, and names with a NUL
+        raise ConfigError(f"cannot read {shorten(path)} as YAML: {reason(error)}") from None
     if values is None:
         return {}
     if not isinstance(values, dict):

@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from multilift_marl.errors import ConfigError
+from multilift_marl.errors import ConfigError, reason, shorten
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,12 @@ def read_mesh(path: str, size: Sequence[float] | None = None) -> Mesh:
     """
     if Path(path).suffix.lower() not in (".obj", ".stl"):
         raise ConfigError(f"payload.mesh={path!r} is no .obj or .stl file; give the path of one")
-    if not Path(path).is_file():
-        raise ConfigError(f"payload.mesh={path!r} is missing, there is no {Path(path).resolve()}; correct the path")
+    try:
+        missing = not Path(path).is_file()
+    except OSError as error:  # a name too long, say
+        raise ConfigError(f"cannot read payload.mesh={shorten(path)} ({reason(error)}); correct the path") from error
+    if missing:
+        raise ConfigError(f"payload.mesh={path!r} is missing, there is no {Path(path).absolute()}; correct the path")
     mesh = _measure(path, np.ones(3))
     return mesh if size is None else _measure(path, np.asarray(size) / mesh.edges)
 

@@ -35,9 +35,9 @@ class EnvConfig(Section):
     """Size and timing of the environment."""
 
     num_drones: Int = Field(4, ge=1, le=64, description="drones in a team")
-    num_envs: Int = Field(128, ge=1, description="environments stepped together")
-    num_threads: Int = Field(0, ge=0, description="threads that step them; 0: one for each CPU")
-    episode_seconds: Float = Field(8.0, gt=0, description="[s] time limit of an episode")
+    num_envs: Int = Field(128, ge=1, le=100_000, description="environments stepped together")
+    num_threads: Int = Field(0, ge=0, le=1024, description="threads that step them; 0: one for each CPU")
+    episode_seconds: Float = Field(8.0, gt=0, le=1e6, description="[s] time limit of an episode")
     policy_hz: Float = Field(50.0, gt=0, description="[Hz] rate of actions and observations")
     history: Int = Field(1, ge=1, le=50, description="steps that an observation holds, the newest first")
 
@@ -212,7 +212,7 @@ class TrainConfig(Section):
         "formation_redistributed",
     ] = Field("formation", description="script that an untrained policy flies and the learned one corrects")
     frames: Int = Field(5_000_000, ge=1, description="environment steps in all")
-    horizon: Int = Field(128, ge=1, description="steps of each environment between updates")
+    horizon: Int = Field(128, ge=1, le=100_000, description="steps of each environment between updates")
     epochs: Int = Field(4, ge=1, description="passes over each batch")
     minibatches: Int = Field(4, ge=1, description="minibatches of each pass")
     learning_rate: Float = Field(6e-4, gt=0, description="[-] of Adam, at the start")
@@ -231,12 +231,16 @@ class TrainConfig(Section):
     value_weight: Float = Field(1.0, ge=0, description="[-] weight of the critic's loss")
     max_grad_norm: Float = Field(1.0, gt=0, description="[-] gradient clipping")
     target_kl: Float = Field(0.03, gt=0, description="[-] approximate KL that ends an update early")
-    hidden: tuple[Annotated[Int, Field(ge=1)], ...] = Field((64, 64), description="[-] widths of the hidden layers")
+    hidden: tuple[Annotated[Int, Field(ge=1, le=8192)], ...] = Field(
+        (64, 64), min_length=1, description="[-] widths of the hidden layers"
+    )
     initial_std: Float = Field(0.12, gt=0, description="[-] of the action distribution at the start")
     overrides: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field(
         {}, description="of the environment that it trains in, by dotted name"
     )
-    threads: Int = Field(2, ge=1, description="threads of the update; weights are bit-equal for the same number")
+    threads: Int = Field(
+        2, ge=1, le=1024, description="threads of the update; weights are bit-equal for the same number"
+    )
     checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
 
 
@@ -244,7 +248,7 @@ class EvalConfig(Section):
     """Evaluation during training, on seeds of its own."""
 
     every: Int = Field(25, ge=1, description="iterations between evaluations")
-    episodes: Int = Field(128, ge=1, description="episodes of each")
+    episodes: Int = Field(128, ge=1, le=1_000_000, description="episodes of each")
 
 
 class Config(Section):

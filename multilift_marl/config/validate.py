@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from multilift_marl.config.values import Section
-from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.errors import ConfigError, nearest, shorten
 
 S = TypeVar("S", bound=Section)
 
@@ -48,11 +48,11 @@ def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) 
         return f"{key}{source} must not be empty"
     if kind in ("missing", "too_long"):
         count = error["ctx"]["max_length"] if kind == "too_long" else 1 + max(e["loc"][-1] for e in about)
-        return f"{key}{source} must be a list of {count} numbers, but is {value!r}"
+        return f"{key}{source} must be a list of {count} numbers, but is {shorten(repr(value))}"
     if kind in ("model_type", "dict_type", "model_attributes_type"):
-        return f"{key}{source} must be a section with keys of its own, but is {value!r}"
+        return f"{key}{source} must be a section with keys of its own, but is {shorten(repr(value))}"
     message = error["msg"].removeprefix("Value error, ").replace("Input should", "must").replace("should", "must")
-    return f"{key}{source} {message}, but is {value!r}"
+    return f"{key}{source} {message}, but is {shorten(repr(value))}"
 
 
 def _find_key(location: tuple[Any, ...], model: type[Section]) -> tuple[type[Section], list[str]]:

@@ -18,7 +18,9 @@ def _integer(value: Any) -> Any:
             raise ValueError("must be a whole number") from None
         if not number.is_integer():
             raise ValueError("must be a whole number")
-        return int(number)
+        value = int(number)
+    if isinstance(value, int) and abs(value) >= 2**63:
+        raise ValueError("must be a whole number below 2**63")
     return value
 
 

@@ -16,12 +16,14 @@ from multilift_marl.control.pilot import Pilot
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.errors import ConfigError
+from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.failures import CAUSES, DIVERGED
 from multilift_marl.tasks.observations import observation_names, remember, state_size
 
 TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
+_KEPT = ("_action", "_observation", "_told", "_state", "seeds", "episodes", "steps", "_ended")  # arrays of its own
 
 
 class MultiliftVec:
@@ -177,33 +179,28 @@ class MultiliftVec:
         saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
         saved |= self.pilot.state_dict()
         saved |= {f"imperfections.{key}": array.copy() for key, array in self._starts.imperfections.arrays().items()}
-        for name in ("_action", "_observation", "_told", "_state", "seeds", "episodes", "steps", "_ended"):
-            saved[name] = getattr(self, name).copy()
+        saved |= {name: getattr(self, name).copy() for name in _KEPT}
+        saved["task_name"] = fingerprint(self.task.name, self.num_envs)
         return saved
 
     def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
         """Continue bit for bit from what `state_dict` returned, at any number of threads.
 
         Raises:
-            ValueError: it is of other environments: an array is missing or of another shape.
+            ValueError: it is of other environments, or not what `state_dict` returned; nothing is changed then.
         """
-        for key, array in self.state_dict().items():
-            found = np.shape(saved[key]) if key in saved else None
-            if found != array.shape:
-                shapes = f"has shape {found}, expected {array.shape}; use the configuration it was saved with"
-                wrong = "is missing" if found is None else shapes
-                raise ValueError(f"the saved state does not fit these environments: '{key}' {wrong}")
+        check_saved(saved, self.state_dict(), "world.diverged", "world.system", "task_name")
         groups: dict[str, Rows] = {"world": {}, "task": {}, "imperfections": {}}
         for key, array in saved.items():
             group, _, name = key.partition(".")
             if group in groups:
                 groups[group][name] = array
-            elif not name:
-                getattr(self, key)[:] = array
         self.world.load_state_dict(groups["world"])
         self.task.load_state_dict(groups["task"])
         self.pilot.load_state_dict(saved)
         self._starts.load_state_dict(groups["imperfections"])
+        for name in _KEPT:
+            getattr(self, name)[:] = saved[name]
 
     def __reduce__(
         self,

@@ -132,9 +132,9 @@ class MultiliftEnv(EnvBase):
         """Continue bit for bit from what `get_state` returned: the next full reset returns the restored episodes.
 
         Raises:
-            ValueError: it is of other environments.
+            ValueError: see `MultiliftVec.load_state_dict`.
         """
-        self.vec.load_state_dict({key: tensor.numpy() for key, tensor in saved.items()})
+        self.vec.load_state_dict({key: np.asarray(tensor) for key, tensor in saved.items()})
         self._resumed = True
 
 

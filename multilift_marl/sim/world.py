@@ -33,6 +33,7 @@ from multilift_marl.sim.parameters import (
     write_model,
 )
 from multilift_marl.sim.rows import make_places, read_rows, write_rows
+from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.standing import hover_drone, make_drones
 from multilift_marl.sim.state import Air, Plant, Record, SystemState
@@ -271,10 +272,16 @@ class World:
         saved["rows"] = np.concatenate([shard.batch.state for shard in self.shards])
         saved["warning"] = np.concatenate([shard.batch.warning for shard in self.shards])
         saved["diverged"] = self.diverged.copy()
+        saved["system"] = fingerprint(self.system, self.num_envs)
         return saved
 
     def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
-        """Continue bit for bit from what `state_dict` returned, at any number of threads."""
+        """Continue bit for bit from what `state_dict` returned, at any number of threads.
+
+        Raises:
+            ValueError: it is of another system, or not what `state_dict` returned; nothing is changed then.
+        """
+        check_saved(saved, self.state_dict(), "diverged", "system")
         parameters = {name: saved[f"parameters.{name}"] for name in Parameters._fields}
         self.set_parameters(np.ones(self.num_envs, bool), **parameters)
         for prefix, group in self._groups().items():

@@ -135,8 +135,9 @@ def _read_arrays(path: Path, content: bytes) -> np.ndarray:
 def _load(path: Path, content: bytes) -> Any:
     """Return the array of a file, or its arrays by name."""
     try:
-        return np.load(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, OSError, EOFError):
+        loaded = np.load(io.BytesIO(content), allow_pickle=False)
+        return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
+    except Exception:  # numpy, zipfile and zlib raise many kinds for damaged files
         raise ConfigError(f"{KEY}={path} is damaged or no array of numbers; save it by numpy.save again") from None
 
 

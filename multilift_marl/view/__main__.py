@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Any
 
-from multilift_marl.cli.common import announce_compiling, run_command
+from multilift_marl.cli.common import announce_compiling, run_command, whole_number
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
-from multilift_marl.errors import ConfigError
 from multilift_marl.view.page import HOST, Page
 from multilift_marl.view.session import Session
 
@@ -31,13 +30,13 @@ _DEFAULTS = {"task": None, "run": None, "policy": None, "seed": 1000, "port": 80
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until interrupted; return the exit status."""
-    return run_command(_view, _USAGE, _DEFAULTS, arguments)
+    return run_command(_view, _USAGE, _DEFAULTS, arguments, names=("task", "run", "policy"))
 
 
 def _view(values: dict[str, Any]) -> int:
     announce_compiling()
     page = Page(*make_session(values))
-    print(f"watch at http://{HOST}:{page.port} (Ctrl-C ends it)", flush=True)
+    print(f"watch at {page.address} (Ctrl-C ends it)", flush=True)
     with closing(page), suppress(KeyboardInterrupt):
         page.run()
     return 0
@@ -51,8 +50,7 @@ def make_session(values: dict[str, Any]) -> tuple[Session, int]:
     """
     own = {key: values.pop(key, default) for key, default in _DEFAULTS.items()}
     for key, most in (("seed", 2**63 - 1), ("port", 65535)):
-        if not isinstance(own[key], int) or isinstance(own[key], bool) or not 0 <= own[key] <= most:
-            raise ConfigError(f"{key} must be a whole number from 0 to {most}, but is {own[key]!r}")
+        own[key] = whole_number(key, own[key], 0, most)
     learned: dict[str, Any] = {}
     if own["run"] is not None:
         learned["run"] = _load(str(own["run"]))

@@ -13,6 +13,7 @@ import numpy as np
 
 from multilift_marl.errors import RenderingError, pip_install
 from multilift_marl.rendering import Stage
+from multilift_marl.view.guard import Guard, guarded_servers
 from multilift_marl.view.session import Session
 
 HOST = "127.0.0.1"
@@ -26,7 +27,7 @@ _SLOTS = 64  # geoms of one shape that are sent at first; doubled as needed
 
 
 class Page:
-    """Serves a session on 127.0.0.1.
+    """Serves a session on 127.0.0.1, to who has its address.
 
     Args:
         session: what is watched.
@@ -34,6 +35,7 @@ class Page:
 
     Attributes:
         port: on which it is served.
+        address: to be opened in a browser; its token is known to who started the viewer alone.
         controls: buttons and fields by name, viser's handles.
 
     Raises:
@@ -49,9 +51,11 @@ class Page:
         self._session, self._shapes = session, trimesh.creation
         self._stage = Stage(session.vec, trail=_TRAIL)
         _check_port(port)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's own greeting
+        guard = Guard()
+        with contextlib.redirect_stdout(io.StringIO()), guarded_servers(guard):  # stdout: viser's own greeting
             self._server = viser.ViserServer(HOST, port, label="multilift_marl", verbose=False)
         self.port = self._server.get_port()
+        self.address = f"http://{HOST}:{self.port}/?token={guard.token}"
         if port not in (0, self.port):  # taken in the meantime: viser goes on to the next one
             self.close()
             raise _taken(port)
