@@ -13,17 +13,16 @@ from torchrl.collectors import Collector
 from tqdm import tqdm
 
 from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import RunLog, write_versions
 from multilift_marl.agents.mappo import make_learner, update
 from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.config.schema import Config
-from multilift_marl.envs.core import TRAINING_EVALUATION
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError
-from multilift_marl.evaluation.metrics import summarize
-from multilift_marl.evaluation.rollout import fly_episodes
+from multilift_marl.evaluation.rollout import trace_episode
 
-_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best")
+_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best_policy")
 
 
 class Trainer:
@@ -33,6 +32,10 @@ class Trainer:
         config: what to train.
         folder: the run's folder; nothing is written there before `run` or `save`.
         checkpoint: content of the checkpoint to go on from.
+
+    Attributes:
+        evaluator: knows the best policy so far.
+        gain: what training gained over its script, once it has finished.
     """
 
     def __init__(self, config: Config, folder: Path, checkpoint: dict[str, Any] | None = None):
@@ -52,7 +55,8 @@ class Trainer:
             )
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
-        self.best = (-1.0, -float("inf"))  # success, negative error
+        self.evaluator = Evaluator(config)
+        self.gain: Gain | None = None
         self._returns = np.zeros(self.env.vec.num_envs)  # of the episodes in flight
         self._stop = False
         if checkpoint is not None:
@@ -77,26 +81,37 @@ class Trainer:
         """Train to the end; return False if the user stopped it. Ctrl-C saves and stops, a second one stops at once."""
         previous = signal.signal(signal.SIGINT, self._interrupt)
         log = RunLog(self.folder, self.iteration, self.frames)
+        log.write_text("configuration", dump_config(self.config), self.frames)
         name = f"{self.config.task} {self.config.train.algorithm}"
         bar = tqdm(total=self.iterations, initial=self.iteration, desc=name, unit="it", dynamic_ncols=True)
         shown: dict[str, str] = {}
         try:
+            self._restore_best()
             while not (self.finished or self._stop):
                 start = time.perf_counter()
-                values = self.step()
+                first = self.evaluator.best is None  # the untrained policy, which flies the script
+                values = {} if first else self.step()
                 if "return" in values:
                     shown["return"] = f"{values['return']:.0f}"
                 last = self.finished
                 if self.iteration % self.config.eval.every == 0 or last:
+                    bar.set_description(f"{name}, evaluating")
                     values |= self.evaluate()
+                    bar.set_description(name)
                     shown["success"] = f"{values['eval/success_rate']:.0%}"
-                    shown["error"] = f"{100 * values['eval/payload_position_error_m']:.1f} cm"
+                    shown["error"] = f"{100 * values['eval/payload_position_error_m']:.2f} cm"
+                    shown["best"] = f"{values['eval/best_iteration']:.0f}"
+                    if values["eval/best_iteration"] == self.iteration:
+                        log.write_picture("flight", self._draw_best(), self.frames)
+                if last:
+                    self.gain = self.evaluator.measure_gain(self.iteration)
+                    values |= self.gain.values()
                 log.write({"iteration": self.iteration, "frames": self.frames}, values)
                 self.seconds += time.perf_counter() - start
-                if self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
+                if first or self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
                     self.save("last")
                 bar.set_postfix(shown)
-                bar.update()
+                bar.update(not first)
         finally:
             bar.close()
             log.close()
@@ -143,19 +158,9 @@ class Trainer:
         return self.iteration * self.frames_per_batch
 
     def evaluate(self) -> dict[str, float]:
-        """Fly the deterministic policy on the seeds of evaluation during training; keep the best checkpoint."""
-        from multilift_marl.agents.policy import LearnedPolicy  # a copy, without exploration
-
-        policy = LearnedPolicy(self._content(), "the run")
-        episodes = fly_episodes(
-            self.config, policy.bind, self.config.eval.episodes, self.config.seed, TRAINING_EVALUATION
-        )
-        summary = summarize(episodes)
-        names = ("success_rate", "payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")
-        values = {f"eval/{name}": summary[name]["mean"] for name in names}
-        score = (values["eval/success_rate"], -values["eval/payload_position_error_m"])
-        if score > self.best:
-            self.best = score
+        """Fly the policy without exploration on seeds of evaluation during training; keep it if it is the best."""
+        values = self.evaluator.evaluate(self._content())
+        if values["eval/best_iteration"] == self.iteration:
             self.save("best")
         return values
 
@@ -172,6 +177,7 @@ class Trainer:
             "observation_names": list(vec.observation_names),
             "action_names": list(vec.action_names),
             "frames": self.frames,
+            "iteration": self.iteration,
         }
 
     def _training_state(self) -> dict[str, Any]:
@@ -182,14 +188,15 @@ class Trainer:
             "rng": torch.get_rng_state(),
             "env": self.env.get_state(),
             "returns": torch.from_numpy(self._returns.copy()),
-            "iteration": self.iteration,
             "seconds": self.seconds,
-            "best": list(self.best),
+            "best_policy": self.evaluator.best,
         }
 
     def _restore(self, content: dict[str, Any]) -> None:
         if missing := [key for key in _NEEDED if key not in content]:
-            raise CheckpointError(f"the checkpoint cannot be resumed, '{missing[0]}' is missing; give a training run's")
+            raise CheckpointError(
+                f"the checkpoint cannot be resumed, '{missing[0]}' is missing; give a training run's, of this version"
+            )
         try:
             self._load(content)
         except (RuntimeError, ValueError) as error:
@@ -203,25 +210,48 @@ class Trainer:
         self.learner.optimizer.load_state_dict(content["optimizer"])
         self.env.set_state(content["env"])
         self._returns[:] = content["returns"].numpy()
-        self.iteration, self.seconds, self.best = content["iteration"], content["seconds"], tuple(content["best"])
+        self.iteration, self.seconds = content["iteration"], content["seconds"]
+        self.evaluator.best = content["best_policy"]
+
+    def _restore_best(self) -> None:
+        """Write the best policy of a resumed run, which may have found another one after its last checkpoint."""
+        best, path = self.evaluator.best, self.folder / "checkpoints" / "best.pt"
+        if best is not None and not (path.is_file() and load_checkpoint(path).get("iteration") == best["iteration"]):
+            save_checkpoint(path, best)
+
+    def _draw_best(self) -> Path:
+        """Return the path of a picture of the first episode, flown by the best policy."""
+        from multilift_marl.evaluation.plots import plot_paths  # matplotlib takes a while
+
+        policy, path = self.evaluator.best_policy(), self.folder / "flight.png"
+        trace = trace_episode(self.config, policy.bind, 0, self.config.seed)
+        plot_paths(path, trace, f"best policy so far, iteration {self.iteration}")
+        return path
 
     def _episodes(self, batch: Any) -> dict[str, float]:
-        """Return statistics of the rollouts: reward terms, and of the episodes that ended: return, success, causes."""
+        """Return statistics of the rollouts: reward terms, and of whole episodes that ended: return, success, failure.
+
+        Nothing counts before an episode's length has passed: until then those end that the staggered start cut short,
+        and of the whole ones that follow only the failures.
+        """
+        vec = self.env.vec
         rewards = batch["next", "agents", "reward"].mean(dim=(-2, -1)).double().numpy()
         done = batch["next", "done"].squeeze(-1).numpy()
+        elapsed = self.iteration * done.shape[1] + np.arange(done.shape[1])
+        counted = done & (elapsed >= vec.max_steps)
         finished = []
         for t in range(rewards.shape[1]):
             self._returns += rewards[:, t]
-            finished += self._returns[done[:, t]].tolist()
+            finished += self._returns[counted[:, t]].tolist()
             self._returns[done[:, t]] = 0.0
         info = batch["next", "info"]
         terms = info["reward_terms"].mean(dim=(0, 1)).tolist()
-        values = {f"reward/{name}": term for name, term in zip(self.env.vec.reward_terms, terms, strict=True)}
+        values = {f"reward/{name}": term for name, term in zip(vec.reward_terms, terms, strict=True)}
         values["reward/total"] = float(rewards.mean())
         if finished:
             values["return"] = float(np.mean(finished))
-            values["success"] = info["success"].sum().item() / len(finished)
-            values["failure"] = info["failure"].sum().item() / len(finished)
+            for name in ("success", "failure"):
+                values[name] = float(info[name].squeeze(-1).numpy()[counted].mean())
         values["diverged"] = info["diverged"].sum().item()
         return values
 
