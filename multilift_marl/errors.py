@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import logging
 from collections.abc import Callable, Iterable
+from functools import cache
 
 
 class ConfigError(ValueError):
@@ -29,6 +31,15 @@ def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str) -
     names = sorted(names)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     return f"; did you mean '{full(close[0])}'?" if close else f"; known: {', '.join(names)}"
+
+
+@cache
+def warn_once(part: str, message: str) -> None:
+    """Log a warning of a part of the package, to the logger multilift_marl.<part>, the same one once in a process.
+
+    Where nobody has set up logging, Python shows it on stderr.
+    """
+    logging.getLogger(f"multilift_marl.{part}").warning(message)
 
 
 def pip_install(extra: str) -> str:
