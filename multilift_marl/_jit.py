@@ -8,7 +8,7 @@ from typing import Any, TypeVar, TypeVarTuple, cast
 
 from numba import config, njit, typeof
 
-from multilift_marl._kernel_cache import cache_folder, make_cache
+from multilift_marl._kernel_cache import make_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 Arguments = TypeVarTuple("Arguments")
@@ -37,9 +37,3 @@ def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Ca
     compiled: Any = function  # Numba's dispatcher
     compiled.compile(types)
     return functools.partial(compiled.overloads[types].entry_point, *arguments)
-
-
-def compiled() -> bool:
-    """Return whether kernels of these sources were ever compiled here."""
-    folder = cache_folder()
-    return folder is not None and any(folder.glob("*.kernel"))

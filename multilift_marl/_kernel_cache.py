@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import logging
 import os
 import pickle
 import shutil
 import sys
 import tempfile
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,7 +27,8 @@ from numba.core.caching import CompileResultCacheImpl, NullCache, _CacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
-LOGGER = logging.getLogger("multilift_marl.kernels")
+from multilift_marl.errors import warn_once
+
 PACKAGE = Path(__file__).parent
 KEPT = 20  # folders of other sources, those used last
 _WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "__init__.py")
@@ -64,10 +64,10 @@ def cache_folder() -> Path | None:
             continue
         _forget_others(home, folder)
         return folder
-    LOGGER.warning(
-        "compiled kernels cannot be kept: %s cannot be written; every start compiles anew, up to a minute. Set "
-        "NUMBA_CACHE_DIR to a folder that can be",
-        " and ".join(str(home) for home in homes),
+    warn_once(
+        "kernels",
+        f"compiled kernels cannot be kept: {' and '.join(str(home) for home in homes)} cannot be written; every start "
+        "compiles anew, up to a minute. Set NUMBA_CACHE_DIR to a folder that can be",
     )
     return None
 
@@ -139,8 +139,14 @@ class KernelCache(NumbaCache):
         return self._folder / f"{name}-{code.co_firstlineno}-{digest}.kernel"
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what was compiled for these types; None if nothing sound is there."""
-        key = self._index_key(sig, target_context.codegen())
+        """Return what was compiled for these types; None, and a line that says so, if it must be compiled now."""
+        found = self._read(self._index_key(sig, target_context.codegen()), target_context)
+        if found is None:
+            warn_once("kernels", "compiling kernels of the simulation for the first time, which takes up to a minute")
+        return found
+
+    def _read(self, key: Any, target_context: Any) -> Any:
+        """Return what was compiled, None if nothing sound is there."""
         try:
             checksum, content = _split(self._path(key).read_bytes())
             if hashlib.sha256(content).digest() != checksum:
@@ -159,7 +165,8 @@ class KernelCache(NumbaCache):
         try:
             write_whole(self._path(key), hashlib.sha256(content).digest() + content)
         except OSError as error:
-            _warn_once(f"compiled kernels cannot be kept in {self._folder}: {error.strerror}; compiled anew next time")
+            reason = f"{error.strerror}; compiled anew next time"
+            warn_once("kernels", f"compiled kernels cannot be kept in {self._folder}: {reason}")
 
     def flush(self) -> None:
         """Forget nothing: a file belongs to one version of the sources."""
@@ -188,11 +195,6 @@ def write_whole(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):
             os.unlink(unfinished)
         raise
-
-
-@lru_cache
-def _warn_once(message: str) -> None:
-    LOGGER.warning(message)
 
 
 @cache

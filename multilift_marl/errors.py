@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import logging
 from collections.abc import Callable, Iterable
+from functools import cache
 
 
 class ConfigError(ValueError):
@@ -39,6 +41,15 @@ def shorten(value: object, most: int = 80) -> str:
     """Return a value as text of one line, cut where it is long."""
     text = "".join(char if char.isprintable() else repr(char)[1:-1] for char in str(value)[: 2 * most])
     return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+@cache
+def warn_once(part: str, message: str) -> None:
+    """Log a warning of a part of the package, to the logger multilift_marl.<part>, the same one once in a process.
+
+    Where nobody has set up logging, Python shows it on stderr.
+    """
+    logging.getLogger(f"multilift_marl.{part}").warning(message)
 
 
 def pip_install(extra: str) -> str:

@@ -39,7 +39,7 @@ def checkpoint(task="hover", **overrides):
     spread = torch.logspace(-2, 1, len(names))
     actor.normalizer.update(spread * (torch.randn(1000, len(names)) + torch.randn(len(names))))
     with torch.no_grad():
-        actor.team.net[-1].weight *= 100.0
+        torch.nn.init.orthogonal_(actor.team.net[-1].weight)
     return {
         "config": config.model_dump(mode="json"), "actor": actor.state_dict(), "observation_names": list(names),
         "action_names": actions, "frames": 1234,

@@ -16,7 +16,7 @@ def make_actor(kind: str) -> Actor:
     actor = Actor(kind, 11, 4, (16, 16), 0.3, torch.zeros(4, 11))
     actor.normalizer.update(torch.randn(100, 11))
     with torch.no_grad():
-        actor.team.net[-1].weight *= 100.0  # as after training
+        torch.nn.init.orthogonal_(actor.team.net[-1].weight)  # as after training
     return actor
 
 

@@ -14,7 +14,6 @@ from conftest import SMALL, make_trainer
 
 from multilift_marl.agents.checkpoint import load_checkpoint
 from multilift_marl.agents.logging import RunLog, read_metrics
-from multilift_marl.cli import common
 from multilift_marl.cli.train import main as train
 from multilift_marl.config import load_config
 from multilift_marl.errors import ConfigError
@@ -35,7 +34,7 @@ def test_interrupt_saves_and_resume_finishes(tmp_path):
     assert "python train.py resume=" in output
     folder = next(tmp_path.glob("runs/*"))
     done = load_checkpoint(folder / "checkpoints" / "last.pt")["iteration"]
-    assert len(read_metrics(folder)) == done
+    assert len(read_metrics(folder)) == done + 1  # the untrained policy's, too
     frames = (done + 2) * 8 * 16
     again = subprocess.run(
         [sys.executable, str(ROOT / "train.py"), "resume=latest", f"train.frames={frames}"],
@@ -43,7 +42,7 @@ def test_interrupt_saves_and_resume_finishes(tmp_path):
     )  # fmt: skip
     assert again.returncode == 0, again.stderr
     assert "python evaluate.py run=" in again.stdout
-    assert len(read_metrics(folder)) == done + 2
+    assert len(read_metrics(folder)) == done + 3
 
 
 @pytest.mark.parametrize(
@@ -114,13 +113,6 @@ def raise_full(*arguments, **keywords):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_the_first_time_the_wait_for_the_compiler_is_announced(monkeypatch, capsys):
-    for compiled, said in ((True, 0), (False, 1)):
-        monkeypatch.setattr(common, "compiled", lambda compiled=compiled: compiled)
-        common.announce_compiling()
-        assert capsys.readouterr().out.count("compiling the simulation, which takes about a minute") == said
-
-
 def test_help_explains_every_key(capsys):
     assert train(["--help"]) == 0
     text = capsys.readouterr().out
@@ -129,8 +121,30 @@ def test_help_explains_every_key(capsys):
 
 
 @pytest.mark.parametrize(
+    ("arguments", "starts", "end", "absent"),
+    [
+        (["config=hover"], "env.num_envs 160", "(default 128)", "Task track"),
+        (["config=hover"], "train.overrides.<name> {'reward.precision': 1.0}", "name (default -)", "Task track"),
+        (["config=hover"], "payload.drag_area 0.09", "smaller faces)", "reward.alignment"),
+        (["config=pose", "wind.wash=true"], "wind.wash True", "(default False)", "Task hover"),
+        (["config=pose", "reward.position=7"], "reward.position 7.0", "weight", "Task hover"),
+        (["config=track_circle"], "task_options.path ['circle']", "(default ['figure8'])", "Task hover"),
+        (["train.warmup=0"], "train.warmup 0", "(default 12)", "Task pose"),
+        ([], "env.num_envs 128", "stepped together", "(default 128)"),
+    ],
+)
+def test_help_shows_the_values_of_what_is_asked_for(capsys, arguments, starts, end, absent):
+    assert train([*arguments, "--help"]) == 0
+    text = capsys.readouterr().out
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert [line for line in lines if line.startswith(starts) and line.endswith(end)], text
+    assert absent not in text
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["config=hovr", "--help"], "no configuration named 'hovr'; did you mean 'hover'?"),
         (["config=hovr"], "no configuration named 'hovr'; did you mean 'hover'?"),
         (["train.frmes=10"], "unknown key 'train.frmes'; did you mean 'train.frames'?"),
         (["confg=hover"], "unknown key 'confg'; did you mean 'config'?"),

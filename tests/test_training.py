@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 from conftest import load_script, make_trainer
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
 from multilift_marl.agents.logging import RunLog, read_metrics
 from multilift_marl.agents.mappo import update
 from multilift_marl.agents.networks import Normalizer
@@ -45,7 +47,8 @@ def test_ten_iterations_equal_five_a_stop_and_five_more(tmp_path, kind):
         whole.learner.loss.state_dict().items(), resumed.learner.loss.state_dict().values(), strict=True
     ):
         assert torch.equal(one, two), name
-    columns = ("frames", "return", "reward/total", "approx_kl", "eval/return")
+    columns = ("frames", "return", "reward/total", "approx_kl", "eval/return", "eval/best_iteration",
+               "final/learned_return")  # fmt: skip
     rows, again = read_metrics(whole.folder), read_metrics(half.folder)
     assert [[row[c] for c in columns] for row in rows] == [[row[c] for c in columns] for row in again]
 
@@ -87,12 +90,29 @@ def test_run_folder_holds_what_a_reader_needs(tmp_path):
     assert load_config(folder / "config.yaml") == trainer.config
     versions = json.loads((folder / "versions.json").read_text())
     assert {"git_commit", "cpu", "packages"} <= set(versions)
-    assert list(folder.glob("events.out.tfevents.*"))
     row = read_metrics(folder)[-1]
     for column in ("return", "success", "reward/position", "approx_kl", "clip_fraction", "explained_variance",
                    "entropy", "fps", "share_sampling", "share_learning", "eval/success_rate"):  # fmt: skip
         assert row[column] != "", column
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {"best.pt", "last.pt"}
+    events = EventAccumulator(str(folder), {"tensors": 0}).Reload()
+    groups = {"episodes", "reward", "update", "speed", "eval", "final"}
+    assert {tag.partition("/")[0] for tag in events.Tags()["scalars"]} == groups
+    assert events.Tags()["images"] == ["flight"]
+    (text,) = events.Tensors("configuration/text_summary")
+    assert "    learning_rate: " in text.tensor_proto.string_val[0].decode()
+
+
+def test_a_resumed_run_has_the_best_policy_of_its_checkpoint(tmp_path):
+    trainer = make_trainer(tmp_path)
+    trainer.evaluate()
+    trainer.save("last")
+    best = trainer.folder / "checkpoints" / "best.pt"
+    kept = load_checkpoint(best)
+    save_checkpoint(best, kept | {"iteration": 4})  # found after the last checkpoint, and lost with what came then
+    resumed = resume_run(trainer.folder, {"train.frames": 128})
+    resumed.run()
+    assert resumed.evaluator.best["iteration"] == load_checkpoint(best)["iteration"] != 4
 
 
 def test_time_outs_are_bootstrapped_and_failures_are_not(tmp_path):

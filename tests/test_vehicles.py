@@ -183,6 +183,30 @@ def test_position_is_limited_relative_to_attitude_and_the_configured_frequency_i
     assert gains_of("falcon", position_frequency=3.0).k_p == 9.0
     assert sqrt(gains_of("crazyflie_id").k_p) == pytest.approx(0.7 * 6.8867 / 5, rel=1e-4)
     assert gains_of("falcon", attitude_frequency=10.0).k_v == pytest.approx(2 * 10 / 5)
+    assert gains_of("falcon", attitude_frequency=30.0).k_R == gains_of("falcon", attitude_frequency=None).k_R
+
+
+@pytest.mark.parametrize(
+    ("asked", "warnings"),
+    [
+        ({"attitude_frequency": 31.0}, ["control.attitude_frequency=31 is above 0.7 / motor lag: 21.2 rad/s is used"]),
+        ({"position_frequency": 6.5}, ["control.position_frequency=6.5 is above 1/5 of attitude's: 4 rad/s is used"]),
+        (
+            {"attitude_frequency": 5.5},
+            [
+                "control.position_frequency=4 is above 1/5 of attitude's: 1.1 rad/s is used",
+                "control.yaw_frequency=8 is above attitude's: 5.5 rad/s is used",
+            ],
+        ),
+        ({"attitude_frequency": None, "position_frequency": None}, []),
+        ({"position_frequency": 3.5}, []),
+        ({}, []),
+    ],
+)
+def test_a_gain_that_is_limited_says_so_once(caplog, asked, warnings):
+    for _ in range(2):
+        gains_of("falcon", **asked)
+    assert [record.getMessage().partition(";")[0] for record in caplog.records] == warnings
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -10,13 +10,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 from torch.utils.tensorboard import SummaryWriter
 
 from multilift_marl.agents.versions import package_versions
 
+_GROUPS = {  # of TensorBoard's tags; names that have none and are not here belong to the update
+    "episodes": ("return", "success", "failure", "diverged"),
+    "speed": ("fps", "share_sampling", "share_learning"),
+}
+
 
 class RunLog:
-    """Writes each iteration's numbers to TensorBoard and to metrics.csv.
+    """Writes each iteration's numbers to TensorBoard, in groups, and to metrics.csv.
 
     Args:
         folder: the run's folder.
@@ -49,10 +55,20 @@ class RunLog:
             self._writer = SummaryWriter(str(self._path.parent))
         for name, value in values.items():
             try:
-                self._writer.add_scalar(name, value, row["frames"])
+                self._writer.add_scalar(_tag(name), value, row["frames"])
             except OSError:  # TensorBoard's writer never recovers: the next row begins a file of its own
                 self._writer = None
                 raise
+
+    def write_text(self, tag: str, text: str, frames: int) -> None:
+        """Show a text, as it is, in TensorBoard."""
+        if self._writer is not None:
+            self._writer.add_text(tag, "\n".join("    " + line for line in text.splitlines()), frames)
+
+    def write_picture(self, tag: str, path: Path, frames: int) -> None:
+        """Show a picture file in TensorBoard."""
+        if self._writer is not None:
+            self._writer.add_image(tag, iio.imread(path), frames, dataformats="HWC")
 
     def close(self) -> None:
         """Flush and close the event file."""
@@ -69,6 +85,13 @@ class RunLog:
             writer.writerows(self._rows)
         aside.replace(self._path)
         self._behind = False
+
+
+def _tag(name: str) -> str:
+    """Return TensorBoard's tag of a number: its name, behind that of a group."""
+    if "/" in name:
+        return name
+    return next((f"{group}/{name}" for group, names in _GROUPS.items() if name in names), f"update/{name}")
 
 
 def read_metrics(folder: Path) -> list[dict[str, str]]:

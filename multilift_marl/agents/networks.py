@@ -129,7 +129,7 @@ class TeamNet(nn.Module):
 class Actor(nn.Module):
     """Gaussian policy of a drone, the same for all: observations (..., N, D) to mean and deviation (..., N, A).
 
-    Its mean is that of a linear script, `base` (A, D), plus a network whose last layer starts near zero: an untrained
+    Its mean is that of a linear script, `base` (A, D), plus a network whose last layer starts at zero: an untrained
     team flies the script.
 
     Args:
@@ -148,7 +148,7 @@ class Actor(nn.Module):
     ):  # fmt: skip
         super().__init__()
         self.normalizer = Normalizer(observation_size)
-        self.team = TeamNet(kind, observation_size, hidden, action_size, gain=0.01)
+        self.team = TeamNet(kind, observation_size, hidden, action_size, gain=0.0)
         self.register_buffer("base", base)
         self.log_std = nn.Parameter(torch.full((action_size,), math.log(initial_std)))
 

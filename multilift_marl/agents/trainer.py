@@ -26,18 +26,18 @@ from multilift_marl.agents.checkpoint import (
     save_checkpoint,
     unlock_run,
 )
+from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import RunLog, write_versions
 from multilift_marl.agents.mappo import make_learner, update
-from multilift_marl.agents.policy import LearnedPolicy, check_policy
+from multilift_marl.agents.policy import check_policy
 from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.config.schema import Config
-from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
+from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason
-from multilift_marl.evaluation.metrics import summarize
-from multilift_marl.evaluation.rollout import fly_episodes
+from multilift_marl.evaluation.rollout import trace_episode
 
-_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best")
+_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best_policy")
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -51,6 +51,8 @@ class Trainer:
 
     Attributes:
         status: exit status of a process whose training was stopped.
+        evaluator: knows the best policy so far.
+        gain: what training gained over its script, once it has finished.
     """
 
     def __init__(self, config: Config, folder: Path, checkpoint: dict[str, Any] | None = None):
@@ -71,9 +73,10 @@ class Trainer:
             )
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
-        self.best = (-1.0, -float("inf"))  # success, negative error
+        self.evaluator = Evaluator(config)
+        self.gain: Gain | None = None
         self._returns = np.zeros(self.env.vec.num_envs)  # of the episodes in flight
-        self._stop, self._warned, self.status = False, False, 128 + signal.SIGINT
+        self._stop, self._warned, self._best_saved, self.status = False, False, True, 128 + signal.SIGINT
         if checkpoint is not None:
             self._restore(checkpoint)
         self.collector = Collector(
@@ -110,31 +113,44 @@ class Trainer:
                     stack.callback(signal.signal, number, signal.signal(number, self._interrupt))
             log = RunLog(self.folder, self.iteration, self.frames)
             stack.callback(log.close)
+            self._attempt(partial(log.write_text, "configuration", dump_config(self.config), self.frames))
             name = f"{self.config.task} {self.config.train.algorithm}"
             bar = tqdm(total=self.iterations, initial=self.iteration, desc=name, unit="it", dynamic_ncols=True)
             stack.callback(_quietly, bar.close)
-            self._train(log, bar)
+            self._train(log, bar, name)
         return not self._stop
 
-    def _train(self, log: RunLog, bar: tqdm) -> None:
+    def _train(self, log: RunLog, bar: tqdm, name: str) -> None:
         shown: dict[str, str] = {}
         unsaved = False
+        self._best_saved = self._attempt(self._restore_best)
         while not (self.finished or self._stop):
             start = time.perf_counter()
-            values = self.step()
+            first = self.evaluator.best is None  # the untrained policy, which flies the script
+            values = {} if first else self.step()
             if "return" in values:
                 shown["return"] = f"{values['return']:.0f}"
             last = self.finished
             if self.iteration % self.config.eval.every == 0 or last:
+                _quietly(bar.set_description, f"{name}, evaluating")
                 values |= self.evaluate()
+                _quietly(bar.set_description, name)
                 shown["success"] = f"{values['eval/success_rate']:.0%}"
-                shown["error"] = f"{100 * values['eval/payload_position_error_m']:.1f} cm"
+                shown["error"] = f"{100 * values['eval/payload_position_error_m']:.2f} cm"
+                shown["best"] = f"{values['eval/best_iteration']:.0f}"
+                if values["eval/best_iteration"] == self.iteration:
+                    self._attempt(lambda: log.write_picture("flight", self._draw_best(), self.frames))
+            if last:
+                self.gain = self.evaluator.measure_gain(self.iteration)
+                values |= self.gain.values()
             self._attempt(partial(log.write, {"iteration": self.iteration, "frames": self.frames}, values))
             self.seconds += time.perf_counter() - start
-            if unsaved or self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
+            if not self._best_saved:
+                self._best_saved = self._attempt(self._restore_best)
+            if unsaved or first or self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
                 unsaved = not self._attempt(partial(self.save, "last"))
             _quietly(bar.set_postfix, shown)
-            _quietly(bar.update)
+            _quietly(bar.update, not first)
         if unsaved:
             spare = Path(tempfile.gettempdir()) / f"{self.folder.name}-last.pt"
             self.save("last", spare)
@@ -194,19 +210,10 @@ class Trainer:
         return self.iteration * self.frames_per_batch
 
     def evaluate(self) -> dict[str, float]:
-        """Fly the deterministic policy on the seeds of evaluation during training; keep the best checkpoint."""
-        policy = LearnedPolicy(self._content(), "the run")  # a copy, without exploration
-        episodes = fly_episodes(
-            self.config, policy.bind, self.config.eval.episodes, self.config.seed, TRAINING_EVALUATION
-        )
-        summary = summarize(episodes)
-        names = ("success_rate", "payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")
-        values = {f"eval/{name}": summary[name]["mean"] for name in names}
-        score = (values["eval/success_rate"], -values["eval/payload_position_error_m"])
-        if score > self.best:
-            before, self.best = self.best, score
-            if not self._attempt(partial(self.save, "best")):
-                self.best = before
+        """Fly the policy without exploration on seeds of evaluation during training; keep it if it is the best."""
+        values = self.evaluator.evaluate(self._content())
+        if values["eval/best_iteration"] == self.iteration:
+            self._best_saved = self._attempt(partial(self.save, "best"))
         return values
 
     def save(self, name: str, path: Path | None = None) -> None:
@@ -223,6 +230,7 @@ class Trainer:
             "observation_names": list(vec.observation_names),
             "action_names": list(vec.action_names),
             "frames": self.frames,
+            "iteration": self.iteration,
         }
 
     def _training_state(self) -> dict[str, Any]:
@@ -233,14 +241,15 @@ class Trainer:
             "rng": torch.get_rng_state(),
             "env": self.env.get_state(),
             "returns": torch.from_numpy(self._returns.copy()),
-            "iteration": self.iteration,
             "seconds": self.seconds,
-            "best": list(self.best),
+            "best_policy": self.evaluator.best,
         }
 
     def _restore(self, content: dict[str, Any]) -> None:
         if missing := [key for key in _NEEDED if key not in content]:
-            raise CheckpointError(f"the checkpoint cannot be resumed, '{missing[0]}' is missing; give a training run's")
+            raise CheckpointError(
+                f"the checkpoint cannot be resumed, '{missing[0]}' is missing; give a training run's, of this version"
+            )
         try:
             self._load(content)
         except Exception as error:  # torch's optimizers raise many kinds
@@ -251,8 +260,11 @@ class Trainer:
     def _load(self, content: dict[str, Any]) -> None:
         environments, optimizer = content["env"], self.learner.optimizer
         own = self._training_state()
-        for key in ("loss", "rng", "returns", "iteration", "seconds", "best"):
+        for key in ("loss", "rng", "returns", "iteration", "seconds"):
             check_like(content[key], own[key], key)
+        if content["best_policy"] is not None:
+            check_policy(content["best_policy"], "'best_policy'")
+            check_like(content["best_policy"]["actor"], self.learner.actor.state_dict(), "best_policy.actor")
         check_like(content["actor"], self.learner.actor.state_dict(), "actor")
         torch.Generator().set_state(content["rng"])  # refuses what is no state
         if content["iteration"] < 0:
@@ -269,25 +281,48 @@ class Trainer:
             like = {"step": torch.zeros(()), "exp_avg": parameter.data, "exp_avg_sq": parameter.data}
             check_like(moments, like, "optimizer.state")
         self._returns[:] = content["returns"].numpy()
-        self.iteration, self.seconds, self.best = content["iteration"], content["seconds"], tuple(content["best"])
+        self.iteration, self.seconds = content["iteration"], content["seconds"]
+        self.evaluator.best = content["best_policy"]
+
+    def _restore_best(self) -> None:
+        """Write the best policy of a resumed run, which may have found another one after its last checkpoint."""
+        best, path = self.evaluator.best, self.folder / "checkpoints" / "best.pt"
+        if best is not None and not (path.is_file() and load_checkpoint(path).get("iteration") == best["iteration"]):
+            save_checkpoint(path, best)
+
+    def _draw_best(self) -> Path:
+        """Return the path of a picture of the first episode, flown by the best policy."""
+        from multilift_marl.evaluation.plots import plot_paths  # matplotlib takes a while
+
+        policy, path = self.evaluator.best_policy(), self.folder / "flight.png"
+        trace = trace_episode(self.config, policy.bind, 0, self.config.seed)
+        plot_paths(path, trace, f"best policy so far, iteration {self.iteration}")
+        return path
 
     def _episodes(self, batch: Any) -> dict[str, float]:
-        """Return statistics of the rollouts: reward terms, and of the episodes that ended: return, success, causes."""
+        """Return statistics of the rollouts: reward terms, and of whole episodes that ended: return, success, failure.
+
+        Nothing counts before an episode's length has passed: until then those end that the staggered start cut short,
+        and of the whole ones that follow only the failures.
+        """
+        vec = self.env.vec
         rewards = batch["next", "agents", "reward"].mean(dim=(-2, -1)).double().numpy()
         done = batch["next", "done"].squeeze(-1).numpy()
+        elapsed = self.iteration * done.shape[1] + np.arange(done.shape[1])
+        counted = done & (elapsed >= vec.max_steps)
         finished = []
         for t in range(rewards.shape[1]):
             self._returns += rewards[:, t]
-            finished += self._returns[done[:, t]].tolist()
+            finished += self._returns[counted[:, t]].tolist()
             self._returns[done[:, t]] = 0.0
         info = batch["next", "info"]
         terms = info["reward_terms"].mean(dim=(0, 1)).tolist()
-        values = {f"reward/{name}": term for name, term in zip(self.env.vec.reward_terms, terms, strict=True)}
+        values = {f"reward/{name}": term for name, term in zip(vec.reward_terms, terms, strict=True)}
         values["reward/total"] = float(rewards.mean())
         if finished:
             values["return"] = float(np.mean(finished))
-            values["success"] = info["success"].sum().item() / len(finished)
-            values["failure"] = info["failure"].sum().item() / len(finished)
+            for name in ("success", "failure"):
+                values[name] = float(info[name].squeeze(-1).numpy()[counted].mean())
         values["diverged"] = info["diverged"].sum().item()
         return values
 

@@ -12,17 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from multilift_marl._interrupt import end_quiet_import
-from multilift_marl._jit import compiled
-from multilift_marl.config.load import check_names, explain, parse_overrides
+from multilift_marl.config.load import check_names, explain, load_config, parse_overrides
+from multilift_marl.config.schema import Config
+from multilift_marl.config.validate import validate
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install, reason, shorten
-from multilift_marl.tasks import TASKS
+from multilift_marl.tasks import TASKS, find_task
 
 _EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  # of all other packages: train
 
 
 def run_command(
     main: Callable[[dict[str, Any]], int], usage: str, own: Iterable[str], arguments: Sequence[str] | None,
-    configurable: bool = True, names: Collection[str] = (),
+    configuration: str | None = "config", names: Collection[str] = (),
 ) -> int:  # fmt: skip
     """Run a command on key=value arguments and return its exit status; a user's error is one sentence on stderr.
 
@@ -31,7 +32,7 @@ def run_command(
         usage: the head of its help.
         own: its keys beside those of a configuration.
         arguments: None for those of this process.
-        configurable: whether its help lists the keys of a configuration.
+        configuration: its key that names a configuration, whose keys and values its help lists; None: it has none.
         names: those of its keys that name files and the like, taken as they are.
     """
     end_quiet_import()
@@ -39,9 +40,10 @@ def run_command(
     _open_streams()
     try:
         if any(argument in ("-h", "--help") for argument in arguments):
-            print(usage)
-            if configurable:
-                _explain_configuration()
+            values = parse_overrides(argument for argument in arguments if argument not in ("-h", "--help"))
+            check_names(values, own)
+            explained = "" if configuration is None else _explain_configuration(values, own, configuration)
+            print(f"{usage}{explained}")
             status = 0
         else:
             values = parse_overrides(arguments, names)
@@ -114,14 +116,15 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
-def announce_compiling() -> None:
-    """Say why nothing seems to happen, where nothing has been compiled before."""
-    if not compiled():
-        print("compiling the simulation, which takes about a minute the first time", flush=True)
-
-
-def _explain_configuration() -> None:
-    print(f"\nConfiguration keys (default, meaning; - stands for none):\n{explain()}")
-    for name, task in TASKS.items():
-        print(f"\nTask {name}:\n{explain(task.Options, 'task_options.')}")
-        print("\n".join(f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in task.REWARD.items()))
+def _explain_configuration(values: dict[str, Any], own: Iterable[str], key: str) -> str:
+    """Return the keys of a configuration: with their values where arguments say which, else with their defaults."""
+    given = {name: value for name, value in values.items() if name not in own}
+    config = load_config(str(values.get(key) or "hover"), given) if given or values.get(key) else None
+    what = "default" if config is None else "value"
+    lines = [f"\n\nConfiguration keys ({what}, meaning; - stands for none):\n{explain(config or Config)}"]
+    for name, task in TASKS.items() if config is None else [(config.task, find_task(config.task))]:
+        options = task.Options if config is None else validate(task.Options, config.task_options, "task_options")
+        weights = task.REWARD | ({} if config is None else config.reward)
+        lines.append(f"\nTask {name}:\n{explain(options, 'task_options.')}")
+        lines += [f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in weights.items()]
+    return "\n".join(lines)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from multilift_marl.cli.common import announce_compiling, make_folder, run_command, whole_number
+from multilift_marl.cli.common import make_folder, run_command, whole_number
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.control.scripted import SCRIPTED, fitting_scripts, make_scripted
@@ -62,7 +62,6 @@ def _evaluate(values: dict[str, Any]) -> int:
     flown = _find_script(own) if own["policy"] is not None else _find_policy(str(own["run"]), str(own["checkpoint"]))
     config = build_config(flown.config.model_dump(), {"env.num_threads": 0} | values)
     _ = config.system
-    announce_compiling()
     probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
     makers = {flown.name: flown.make}
     if own["baseline"] != "none":
@@ -180,10 +179,14 @@ def _draw(config: Config, makers: dict[str, Any], flown: _Flown, own: dict[str, 
 
 def _film(config: Config, maker: Any, own: dict[str, Any], path: Path) -> None:
     """Film the first episode, every other policy step."""
+    from tqdm import tqdm
+
     from multilift_marl import rendering
 
     tools: list[Any] = []  # made with the first frame, so that no empty file is left where there is no OpenGL
     with ExitStack() as stack:
+        steps = round(config.env.episode_seconds * config.env.policy_hz)
+        bar = stack.enter_context(tqdm(total=steps // 2, desc="filming", unit="frame", leave=False))
 
         def shoot(vec: Any) -> None:
             if not tools:
@@ -192,6 +195,7 @@ def _film(config: Config, maker: Any, own: dict[str, Any], path: Path) -> None:
             renderer, video = tools
             if vec.steps[0] % 2 == 0:
                 video.append(renderer.frame())
+                bar.update()
 
         trace_episode(config, maker, 0, own["seed"], shoot)
     print(f"wrote {path}")

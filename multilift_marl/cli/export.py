@@ -23,7 +23,7 @@ _DEFAULTS = {"run": "latest", "out": None}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Export; return the exit status."""
-    return run_command(_export, _USAGE, _DEFAULTS, arguments, configurable=False, names=_DEFAULTS)
+    return run_command(_export, _USAGE, _DEFAULTS, arguments, configuration=None, names=_DEFAULTS)
 
 
 def _export(values: dict[str, Any]) -> int:

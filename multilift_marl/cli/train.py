@@ -6,11 +6,14 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from multilift_marl.cli.common import announce_compiling, run_command
+from multilift_marl.cli.common import run_command
 from multilift_marl.config.load import load_config
 from multilift_marl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from multilift_marl.agents.trainer import Trainer
 
 _USAGE = """Train a team.
 
@@ -18,7 +21,9 @@ _USAGE = """Train a team.
   python train.py resume=<run|latest>              go on with a run from its last checkpoint
 
   config   a shipped configuration's name or the path of a YAML file (default hover)
-  resume   a run folder; takes only train.frames, train.checkpoint_every, eval.* and env.num_threads beside it"""
+  resume   a run folder; takes only train.frames, train.checkpoint_every, eval.* and env.num_threads beside it
+
+With --help, config=<name> and other keys show the values that they stand for."""
 
 _RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.episodes", "env.num_threads")
 
@@ -43,7 +48,6 @@ def _train(values: dict[str, Any]) -> int:
                     f"'{key}' cannot change when a run is resumed: start a new run, or give one of "
                     f"{', '.join(_RESUMABLE)}"
                 )
-        announce_compiling()
         trainer = resume_run(folder, values)
         if trainer.finished:
             more = f"python train.py resume={folder} train.frames={2 * trainer.frames}"
@@ -54,7 +58,6 @@ def _train(values: dict[str, Any]) -> int:
         name = values.pop("config", "hover")
         config = load_config(name, values)
         _ = config.system  # refuse an impossible system before the long wait
-        announce_compiling()
         trainer = new_run(config, Path(name).stem)
         folder = trainer.folder
         print(f"training {config.train.frames:,} steps in {folder}")
@@ -65,12 +68,29 @@ def _train(values: dict[str, Any]) -> int:
         return trainer.status
     baseline = "formation_integral" if trainer.config.control.action == "reference" else "none"
     print(
-        f"trained {trainer.frames:,} steps in {minutes:.1f} min: success {trainer.best[0]:.1%}, "
-        f"payload error {-100 * trainer.best[1]:.2f} cm (best evaluation during training)\n"
+        f"trained {trainer.frames:,} steps in {minutes:.1f} min\n"
+        f"{_compare(trainer)}\n"
         f"curves:   tensorboard --logdir {folder}\n"
         f"evaluate: python evaluate.py run={folder} episodes=200 seed=1000 baseline={baseline} video=true"
     )
     return 0
+
+
+def _compare(trainer: Trainer) -> str:
+    """Return what training gained over its script, in words."""
+    gain, best = trainer.gain, trainer.evaluator.best
+    assert gain is not None and best is not None
+    script, learned = (
+        f"position error {100 * team['payload_position_error_m']:.2f} cm, success {team['success_rate']:.1%}"
+        for team in (gain.script, gain.learned)
+    )
+    text = (
+        f"script {trainer.config.train.residual}: {script} -> learned: {learned} (best of iteration "
+        f"{best['iteration']}, on {trainer.config.eval.episodes} fresh episodes)"
+    )
+    if best["iteration"] == 0:
+        return f"{text}\nlearning gained nothing: no policy was better than the untrained one, which flies the script"
+    return text if gain.better else f"{text}\nlearning gained nothing: the difference is not beyond the noise"
 
 
 if __name__ == "__main__":

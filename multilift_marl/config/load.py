@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -159,13 +160,25 @@ def dump_config(config: Config) -> str:
     return write_yaml(config.model_dump(mode="json"))
 
 
-def explain(section: type[Section] = Config, prefix: str = "") -> str:
-    """Return every key of a section with its default and meaning, for --help."""
-    return "\n".join(f"  {key:<32} {_plain(default):<14} {text}" for key, default, text in _leaves(section, prefix))
+def explain(section: type[Section] | Section = Config, prefix: str = "") -> str:
+    """Return every key of a section with its default and meaning, for --help.
+
+    Of a section with values these are shown, and the default behind the meaning where it is another.
+    """
+    kind = section if isinstance(section, type) else type(section)
+    lines = []
+    for key, default, text in _leaves(kind, prefix):
+        value = default
+        if isinstance(section, Section):
+            path = key.removeprefix(prefix).removesuffix(".<name>")  # of names that are free: all of them
+            value = reduce(getattr, path.split("."), section)
+        changed = "" if value == default else f" (default {_plain(default)})"
+        lines.append(f"  {key:<32} {_plain(value):<14} {text}{changed}")
+    return "\n".join(lines)
 
 
 def _plain(value: Any) -> str:
-    if value is None:
+    if value is None or value == {}:
         return "-"
     return str(list(value) if isinstance(value, tuple) else value)
 
@@ -175,7 +188,7 @@ def _leaves(section: type[Section], prefix: str) -> Iterator[tuple[str, Any, str
         if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
             yield from _leaves(field.annotation, f"{prefix}{name}.")
         elif typing.get_origin(field.annotation) is dict:
-            yield f"{prefix}{name}.<name>", None, field.description or ""
+            yield f"{prefix}{name}.<name>", {}, field.description or ""
         else:
             yield prefix + name, field.default, field.description or ""
 

@@ -138,9 +138,13 @@ class ControlConfig(Section):
     max_yaw_rate: Float = Field(1.5, gt=0, description="[rad/s] of a full action of `velocity`, `acceleration`, `ctbr`")
     reference_frequency: Float = Field(6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference")
     reference_speed: Float = Field(1.0, gt=0, description="[m/s] speed limit of the smoothed reference")
-    position_frequency: Float = Field(4.0, gt=0, description="[rad/s] of the position loop; at most 1/5 of attitude's")
+    position_frequency: Float | None = Field(
+        4.0, gt=0, description="[rad/s] of the position loop; at most 1/5 of attitude's; None: that"
+    )
     position_damping: Float = Field(1.0, gt=0, description="[-] its damping ratio")
-    attitude_frequency: Float = Field(20.0, gt=0, description="[rad/s] of roll and pitch; at most 0.7/motor lag")
+    attitude_frequency: Float | None = Field(
+        20.0, gt=0, description="[rad/s] of roll and pitch; at most 0.7/motor lag; None: that"
+    )
     attitude_damping: Float = Field(0.8, gt=0, description="[-] its damping ratio")
     drag_feedforward: bool = Field(False, description="feed the drones' nominal drag in still air forward")
     yaw_frequency: Float = Field(8.0, gt=0, description="[rad/s] natural frequency of yaw")

@@ -15,7 +15,7 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
-from multilift_marl.control.gains import Gains
+from multilift_marl.control.gains import Gains, limited
 from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale, sub, tmul, vec
 from multilift_marl.sim.standing import make_drones
 
@@ -60,7 +60,7 @@ def make_rejection(control: ControlConfig, system: System, g: Gains, dt: float) 
     """Return the numbers of `control.disturbance`, "integral" or "indi", for control steps of dt [s]."""
     own_share = g.mass / (g.mass + max(g.load_share.max(), 0.0))
     slowest = BANDWIDTH[control.disturbance] * np.sqrt(g.k_p) * own_share
-    frequency = np.minimum(control.disturbance_frequency, slowest)
+    frequency = limited(control, "disturbance_frequency", slowest, "what the load lets through")
     return Rejection(
         dt=dt,
         share=np.array([1 - exp(-each * dt) for each in frequency]),

@@ -10,6 +10,7 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.config.system import System
 from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.errors import warn_once
 from multilift_marl.math3d import row
 from multilift_marl.sim.standing import make_drones
 
@@ -76,12 +77,15 @@ def drone_gains(g, n):
 def make_gains(control: ControlConfig, system: System) -> Gains:
     """Return gains for natural frequencies and damping ratios.
 
-    Attitude is no faster than the motors allow (0.7/τ of the slower lag), position no faster than attitude allows.
+    Attitude is no faster than the motors allow (0.7/τ of the slower lag), position and yaw no faster than attitude
+    allows.
     """
     vehicles, drones = system.vehicles, make_drones(system)
-    tilt = [min(control.attitude_frequency, 0.7 / vehicle.rotor_time_constant) for vehicle in vehicles]
-    position = np.array([min(control.position_frequency, fastest / POSITION_RATIO) for fastest in tilt])
-    frequency = np.array([[fastest, fastest, min(control.yaw_frequency, fastest)] for fastest in tilt])
+    motors = np.array([0.7 / vehicle.rotor_time_constant for vehicle in vehicles])
+    tilt = limited(control, "attitude_frequency", motors, "0.7 / motor lag")
+    position = limited(control, "position_frequency", tilt / POSITION_RATIO, "1/5 of attitude's", "attitude_frequency")
+    yaw = limited(control, "yaw_frequency", tilt, "attitude's", "attitude_frequency")
+    frequency = np.stack([tilt, tilt, yaw], axis=1)
     return Gains(
         mass=drones.mass,
         inertia=np.array([vehicle.inertia for vehicle in vehicles], float),
@@ -97,3 +101,22 @@ def make_gains(control: ControlConfig, system: System) -> Gains:
         hooks=drones.hooks,
         hooked=drones.hooked,
     )
+
+
+def limited(control: ControlConfig, name: str, bound: np.ndarray, what: str, *others: str) -> np.ndarray:
+    """Return a frequency of `control`, at most its bound (N,) [rad/s]; a warning tells where that is less than asked.
+
+    Args:
+        control: where it is None, the bound is taken.
+        name: of the frequency.
+        bound: of each drone.
+        what: the bound is, in words.
+        others: names of what the bound depends on; nothing was asked for where these and `name` have their defaults.
+    """
+    asked = getattr(control, name)
+    if asked is None:
+        return bound
+    used, fields = np.minimum(asked, bound), ControlConfig.model_fields
+    if used.min() < asked and any(getattr(control, each) != fields[each].default for each in (name, *others)):
+        warn_once("control", f"control.{name}={asked:g} is above {what}: {used.min():.3g} rad/s is used; lower it")
+    return used

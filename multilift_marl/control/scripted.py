@@ -202,7 +202,7 @@ class FormationNarrow(Formation):
 
 
 class FormationRedistributed(FormationIntegral):
-    """The formation with its integral; once a drone is lost, the slots give way, then go where the others hold the payload.
+    """The formation with its integral; after a loss, the slots give way, then go where the others hold the payload.
 
     Where that is, the task computes by statics, and tells; see `control/redistribution.py`.
 

@@ -66,6 +66,17 @@ def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> d
     }
 
 
+def is_better(policy: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
+    """Return whether a policy is better than another one beyond the noise of the same episodes.
+
+    That is in success or, succeeding no less often, in position error: the 95 % interval of the paired difference
+    leaves out zero.
+    """
+    names = ("success_rate", "payload_position_error_m")
+    success, error = compare({name: policy[name] for name in names}, other).values()
+    return success["ci95"][0] > 0 or (success["mean"] >= 0 and error["ci95"][1] < 0)
+
+
 def _mean(values: np.ndarray) -> dict[str, Any]:
     return {"mean": float(values.mean()), "ci95": list(bootstrap(values))}
 

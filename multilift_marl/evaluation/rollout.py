@@ -48,9 +48,9 @@ class Trace(NamedTuple):
 
 def fly_episodes(
     config: Config, make_policy: Callable[[MultiliftVec], Policy], episodes: int, seed: int,
-    purpose: int = EVALUATION, progress: Callable[[int], Any] | None = None,
+    purpose: int = EVALUATION, progress: Callable[[int], Any] | None = None, first: int = 0,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Fly episodes 0 to `episodes` - 1 of an evaluation seed, the same at any batch size.
+    """Fly episodes `first` to `first` + `episodes` - 1 of an evaluation seed, the same at any batch size.
 
     Args:
         config: the environment.
@@ -59,6 +59,7 @@ def fly_episodes(
         seed: evaluation seed.
         purpose: of the seeds.
         progress: called with the number of episodes finished.
+        first: number of the first episode.
 
     Returns:
         Metrics of each episode by name, (episodes,) each, units in their names; see docs/evaluation.md. Errors of a
@@ -69,13 +70,13 @@ def fly_episodes(
         ValueError: the policy's actions do not fit the environment.
     """
     parts = []
-    for first in range(0, episodes, _BATCH):
-        count = min(_BATCH, episodes - first)
+    for done in range(0, episodes, _BATCH):
+        count = min(_BATCH, episodes - done)
         part = build_config(config.model_dump(), {"env.num_envs": count})
-        vec = MultiliftVec(part, purpose, first_env=first)
+        vec = MultiliftVec(part, purpose, first_env=first + done)
         parts.append(_fly_batch(vec, make_policy(vec), seed))
         if progress is not None:
-            progress(first + count)
+            progress(done + count)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Any
 
-from multilift_marl.cli.common import announce_compiling, run_command, whole_number
+from multilift_marl.cli.common import run_command, whole_number
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
 from multilift_marl.view.page import HOST, Page
@@ -30,11 +30,11 @@ _DEFAULTS = {"task": None, "run": None, "policy": None, "seed": 1000, "port": 80
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until interrupted; return the exit status."""
-    return run_command(_view, _USAGE, _DEFAULTS, arguments, names=("task", "run", "policy"))
+    return run_command(_view, _USAGE, _DEFAULTS, arguments, configuration="task", names=("task", "run", "policy"))
 
 
 def _view(values: dict[str, Any]) -> int:
-    announce_compiling()
+    print("starting the viewer, which takes some seconds", flush=True)
     page = Page(*make_session(values))
     print(f"watch at {page.address} (Ctrl-C ends it)", flush=True)
     with closing(page), suppress(KeyboardInterrupt):

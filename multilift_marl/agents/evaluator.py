@@ -1,0 +1,100 @@
+"""Evaluations during training: how good the policy is, which one is the best, and what training gained over its script.
+
+All flights are on seeds of evaluation during training. Their episodes come in blocks: every evaluation flies block 0,
+so that its numbers can be compared over a training; the others have decided nothing before, so that no policy is called
+better for having been lucky.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.config.schema import Config
+from multilift_marl.control.scripted import LINEAR
+from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
+from multilift_marl.evaluation.metrics import is_better, summarize
+from multilift_marl.evaluation.rollout import Policy, fly_episodes
+
+_METRICS = ("success_rate", "payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")
+_BLOCK = 2**20  # episodes
+
+
+class Gain(NamedTuple):
+    """What training gained over the script that it began with, on the same fresh episodes."""
+
+    script: dict[str, float]
+    """Means by metric."""
+    learned: dict[str, float]
+    """The same of the best policy."""
+    better: bool
+    """Whether the best policy is better beyond the noise of these episodes."""
+
+    def values(self) -> dict[str, float]:
+        """Return the numbers to log, by name."""
+        teams = {"script": self.script, "learned": self.learned}
+        means = {f"final/{team}_{name}": mean for team, metrics in teams.items() for name, mean in metrics.items()}
+        return means | {"final/gained": float(self.better)}
+
+
+class Evaluator:
+    """Evaluates the policies of one training and keeps the best of them.
+
+    Args:
+        config: of the training.
+
+    Attributes:
+        best: what a checkpoint holds of the best policy, its `iteration`, and its `score` in its evaluation, success
+            and negative error; None before the first.
+    """
+
+    def __init__(self, config: Config):
+        self.config = config
+        self.best: dict[str, Any] | None = None
+
+    def evaluate(self, content: dict[str, Any]) -> dict[str, float]:
+        """Fly a policy without exploration; keep it if it is better than the best so far.
+
+        Args:
+            content: of the policy's checkpoint, and its `iteration`.
+
+        Returns:
+            The evaluation's numbers by name, the iteration of the best policy among them.
+        """
+        start, policy = time.perf_counter(), LearnedPolicy(content, "the run")
+        summary = summarize(self._fly(policy.bind, 0))
+        values = {f"eval/{name}": summary[name]["mean"] for name in _METRICS}
+        score = [values["eval/success_rate"], -values["eval/payload_position_error_m"]]
+        if self.best is None or (score > self.best["score"] and self._confirm(policy, content["iteration"])):
+            weights = {name: tensor.clone() for name, tensor in content["actor"].items()}  # learning changes them
+            self.best = content | {"actor": weights, "score": score}
+        return values | {
+            "eval/best_iteration": float(self.best["iteration"]),
+            "eval/seconds": time.perf_counter() - start,
+        }
+
+    def measure_gain(self, iterations: int) -> Gain:
+        """Fly the best policy and the script that training of so many iterations began with."""
+        learned = self._fly(self.best_policy().bind, iterations + 1)
+        script = self._fly(LINEAR[self.config.train.residual], iterations + 1)
+        means = [{name: float(flown[name].mean()) for name in _METRICS} for flown in (script, learned)]
+        return Gain(*means, is_better(learned, script))
+
+    def best_policy(self) -> LearnedPolicy:
+        """Return the best policy so far."""
+        assert self.best is not None
+        return LearnedPolicy(self.best, "the run's best")
+
+    def _confirm(self, candidate: LearnedPolicy, iteration: int) -> bool:
+        """Return whether a policy beats the best one on fresh episodes, too."""
+        return is_better(self._fly(candidate.bind, iteration), self._fly(self.best_policy().bind, iteration))
+
+    def _fly(self, make_policy: Callable[[MultiliftVec], Policy], block: int) -> dict[str, np.ndarray]:
+        """Return the metrics of each episode of a block."""
+        config = self.config
+        episodes, first = config.eval.episodes, block * _BLOCK
+        return fly_episodes(config, make_policy, episodes, config.seed, TRAINING_EVALUATION, first=first)
