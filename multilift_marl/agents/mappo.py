@@ -180,3 +180,10 @@ def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
         "stopped_early": float(stop),
         "learning_seconds": time.perf_counter() - start,
     }
+
+
+def adapted_rate(rate: float, kl: float, desired: float) -> float:
+    """Return a learning rate that brings the KL of the next update closer to what is desired (Rudin et al. 2022)."""
+    if kl > 2 * desired:
+        return max(rate / 1.5, 1e-5)
+    return min(rate * 1.5, 1e-2) if kl < desired / 2 else rate

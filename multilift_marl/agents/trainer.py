@@ -28,7 +28,7 @@ from multilift_marl.agents.checkpoint import (
 )
 from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import RunLog, write_versions
-from multilift_marl.agents.mappo import make_learner, update
+from multilift_marl.agents.mappo import adapted_rate, make_learner, update
 from multilift_marl.agents.policy import check_policy
 from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.config.schema import Config
@@ -348,13 +348,6 @@ def _check_memory(vec: MultiliftVec, steps: int) -> None:
             f"a batch of {steps} steps takes {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
             "train.horizon or env.num_envs"
         )
-
-
-def adapted_rate(rate: float, kl: float, desired: float) -> float:
-    """Return a learning rate that brings the KL of the next update closer to what is desired (Rudin et al. 2022)."""
-    if kl > 2 * desired:
-        return max(rate / 1.5, 1e-5)
-    return min(rate * 1.5, 1e-2) if kl < desired / 2 else rate
 
 
 def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Trainer:
