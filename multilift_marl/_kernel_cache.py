@@ -30,8 +30,8 @@ from numba.core.serialize import dumps
 
 LOGGER = logging.getLogger("multilift_marl.kernels")
 PACKAGE = Path(__file__).parent
-KEPT = 3  # folders of other sources, the newest
-_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "__init__.py")
+KEPT = 50  # folders of other sources, the newest
+_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "plugins.py", "__init__.py")
 
 
 @cache

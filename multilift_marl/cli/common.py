@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from multilift_marl._jit import compiled
 from multilift_marl.config.load import check_names, explain, parse_overrides
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install
-from multilift_marl.tasks import TASKS
+from multilift_marl.plugins import import_modules
+from multilift_marl.tasks import find_task, list_tasks
 
 _EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  # of all other packages: train
 
@@ -31,6 +33,7 @@ def run_command(
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         if any(argument in ("-h", "--help") for argument in arguments):
+            import_modules(parse_overrides(a for a in arguments if a.startswith("import=")).get("import"))
             print(usage)
             if configurable:
                 _explain_configuration()
@@ -38,6 +41,7 @@ def run_command(
         else:
             values = parse_overrides(arguments)
             check_names(values, own)
+            import_modules(values.get("import"))  # first of all: checkpoints, too, may need them
             status = main(values)
         sys.stdout.flush()
         return status
@@ -58,6 +62,12 @@ def run_command(
         return 141
 
 
+def title(values: Mapping[str, Any]) -> str:
+    """Return what the folder of a run is named by: the configuration, and the task where another one is given."""
+    parts = [Path(str(values[key])).stem for key in ("config", "task") if values.get(key) is not None]
+    return "-".join(dict.fromkeys(parts)) or "hover"
+
+
 def announce_compiling() -> None:
     """Say why nothing seems to happen, where nothing has been compiled before."""
     if not compiled():
@@ -66,6 +76,7 @@ def announce_compiling() -> None:
 
 def _explain_configuration() -> None:
     print(f"\nConfiguration keys (default, meaning; - stands for none):\n{explain()}")
-    for name, task in TASKS.items():
+    for name in list_tasks():
+        task = find_task(name)
         print(f"\nTask {name}:\n{explain(task.Options, 'task_options.')}")
         print("\n".join(f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in task.REWARD.items()))

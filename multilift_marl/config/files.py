@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from multilift_marl.errors import ConfigError
 
 _MARK = "#sha256="
@@ -20,6 +22,40 @@ def pin_files(values: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(pinned.get(key), str):
             pinned[key] = pin_file(pinned[key])
     return pinned
+
+
+def pin_vehicles(preset: str | tuple[str, ...]) -> str | tuple[str, ...]:
+    """Return names of vehicles, of which those that are YAML files are pinned; see `pin_file`."""
+    if not isinstance(preset, str):
+        return tuple(pin_file(each) if is_yaml(each) else each for each in preset)
+    return pin_file(preset) if is_yaml(preset) else preset
+
+
+def is_yaml(reference: str | Path) -> bool:
+    """Return whether a reference, pinned or not, is the path of a YAML file rather than a name."""
+    return str(reference).partition(_MARK)[0].endswith((".yaml", ".yml"))
+
+
+def parse_yaml(content: bytes, source: Path, expected: str = "sections such as 'env:'") -> dict[str, Any]:
+    """Return the keys and values of a YAML file.
+
+    Args:
+        content: of the file.
+        source: its path, for messages.
+        expected: what it should hold, for messages.
+
+    Raises:
+        ConfigError: it holds something else.
+    """
+    try:
+        values = yaml.safe_load(content.decode("utf-8"))
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"cannot read {source} as YAML: {' '.join(str(error).split())}") from None
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{source} holds {type(values).__name__} where {expected} are expected")
+    return values
 
 
 def pin_file(reference: str) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from multilift_marl.config.files import pin_files
+from multilift_marl.config.files import pin_files, pin_vehicles
 from multilift_marl.config.values import (
     Delays,
     Drag,
@@ -52,7 +52,9 @@ class SimConfig(Section):
 class VehicleConfig(Section):
     """The quadrotors: a preset, and what differs from it (None: as the preset); lists hold one for each drone."""
 
-    preset: str | tuple[str, ...] = Field("falcon", description="falcon, crazyflie, crazyflie_id, hummingbird or iris")
+    preset: Annotated[str | tuple[str, ...], AfterValidator(pin_vehicles)] = Field(
+        "falcon", description="falcon, crazyflie, crazyflie_id, hummingbird, iris, or one's own: a name or a YAML file"
+    )
     mass: PerDrone | None = Field(None, description="[kg] of the whole drone")
     inertia: Moments | tuple[Moments, ...] | None = Field(None, description="[kg m²] principal moments")
     arm: PerDrone | None = Field(None, description="[m] from the centre of mass to a rotor axis")
@@ -249,6 +251,9 @@ class EvalConfig(Section):
 class Config(Section):
     """The whole configuration."""
 
+    imports: tuple[str, ...] = Field(
+        (), alias="import", description="modules of one's own, names or .py files (docs/plugins.md)"
+    )
     task: str = Field("hover", description="name of the task")
     seed: Int = Field(0, ge=0, lt=2**63, description="seed of everything random")
     env: EnvConfig = EnvConfig()
