@@ -15,6 +15,7 @@ import multilift_marl as ml
 from multilift_marl import plugins
 from multilift_marl.agents.checkpoint import load_checkpoint
 from multilift_marl.agents.trained import ExportedPolicy
+from multilift_marl.agents.trainer import new_run
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.cli.export import main as export
 from multilift_marl.cli.train import main as train
@@ -95,9 +96,10 @@ def test_a_users_task_vehicle_and_policy_are_trained_and_judged_from_the_command
 
 
 def test_a_run_says_which_module_it_misses_and_takes_it_from_where_it_is_now(folder, monkeypatch, capsys):
-    small = SMALL | {"train.frames": 128, "eval.episodes": 1}
-    assert train(["import=mine", "task=near", *arguments(small)]) == 0
-    run = next((folder / "runs").glob("near-*"))
+    config = load_config("hover", SMALL | {"import": "mine", "task": "near", "train.frames": 128, "eval.episodes": 1})
+    trainer = new_run(config, "near", folder / "runs")
+    trainer.save("last")
+    run = trainer.folder
     (folder / "moved").mkdir()
     shutil.move(folder / "mine.py", folder / "moved" / "mine.py")
     for name in (TASKS, load.CONFIGS):
@@ -111,7 +113,7 @@ def test_a_run_says_which_module_it_misses_and_takes_it_from_where_it_is_now(fol
         message = f"error: import={folder / 'mine.py'} is missing; put the file back, or say where it is by import="
         assert capsys.readouterr().err.startswith(message)
     there = f"import={folder / 'moved' / 'mine.py'}"
-    assert train([f"resume={run}", there, "train.frames=256"]) == 0
+    assert train([f"resume={run}", there]) == 0
     assert load_checkpoint(run / "checkpoints" / "last.pt")["config"]["import"] == [str(folder / "moved" / "mine.py")]
     assert evaluate([f"run={run}", there, "baseline=none", *SHORT]) == 0
 
@@ -133,10 +135,10 @@ def test_modules_come_by_name_by_file_and_from_packages_with_what_lies_beside_th
         ("json", ["json"]),
     ):
         config = load_config("hover", {"import": references})
-        assert [str(reference) for reference in config.imports] == [
+        assert list(getattr(config, "import")) == [
             str(folder / name) if name.endswith(".py") else name for name in found
         ]
-    assert load_config("rig.yaml", {"import": "kit.fleet"}).imports == tuple(
+    assert getattr(load_config("rig.yaml", {"import": "kit.fleet"}), "import") == tuple(
         str(folder / name) for name in ("mine.py", "kit/fleet.py")
     )
     assert build_config(config.model_dump()) == config
@@ -178,9 +180,8 @@ def test_modules_that_cannot_be_are_refused(folder, overrides, message):
 
 
 def test_the_task_that_is_missing_tells_how_to_bring_it(folder):
-    assert "unknown task 'near' (one's own needs import=<module>); known:" in refusal(
-        MultiliftVec, build_config({"task": "near"})
-    )
+    message = refusal(MultiliftVec, build_config({"task": "near"}))
+    assert message.startswith("unknown task 'near'; known: ") and message.endswith("; one's own needs import=<module>")
 
 
 # Tasks of installed packages

@@ -135,7 +135,7 @@ def check_names(given: Iterable[str], own: Iterable[str]) -> None:
     Raises:
         ConfigError: an unknown name.
     """
-    top = {*Config.by_key(), *own}
+    top = {*Config.model_fields, *own}
     keys: dict[str, list[str]] = {}
     for key, _, _ in _leaves(Config, ""):
         keys.setdefault(key.rpartition(".")[2], []).append(key)
@@ -181,7 +181,7 @@ def _plain(value: Any) -> str:
 
 
 def _leaves(section: type[Section], prefix: str) -> Iterator[tuple[str, Any, str]]:
-    for name, field in section.by_key().items():
+    for name, field in section.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
             yield from _leaves(field.annotation, f"{prefix}{name}.")
         elif typing.get_origin(field.annotation) is dict:

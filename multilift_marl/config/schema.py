@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, create_model
 
 from multilift_marl.config.files import pin_files, pin_vehicles
 from multilift_marl.config.values import (
@@ -248,12 +248,16 @@ class EvalConfig(Section):
     episodes: Int = Field(128, ge=1, description="episodes of each")
 
 
-class Config(Section):
+if TYPE_CHECKING:
+    _Imports = Section
+else:  # a class statement cannot have a field of this name, a word of Python
+    _modules = Field((), description="modules of one's own, names or .py files (docs/plugins.md)")
+    _Imports = create_model("_Imports", __base__=Section, **{"import": (tuple[str, ...], _modules)})
+
+
+class Config(_Imports):
     """The whole configuration."""
 
-    imports: tuple[str, ...] = Field(
-        (), alias="import", description="modules of one's own, names or .py files (docs/plugins.md)"
-    )
     task: str = Field("hover", description="name of the task")
     seed: Int = Field(0, ge=0, lt=2**63, description="seed of everything random")
     env: EnvConfig = EnvConfig()

@@ -80,10 +80,8 @@ def _find_vehicle(preset: str) -> Vehicle:
         path, content = read_pinned("vehicle.preset", preset)
         return _make_vehicle(path.stem, parse_yaml(content, path, "fields of a vehicle, such as 'mass: 0.7',"), path)
     if preset not in PRESETS:
-        raise ConfigError(
-            f"unknown vehicle.preset '{preset}' (one's own needs import=<module>, or is <file>.yaml)"
-            f"{nearest(preset, PRESETS)}"
-        )
+        cure = "; one's own needs import=<module>, or is a file, <name>.yaml"
+        raise ConfigError(f"unknown vehicle.preset '{preset}'{nearest(preset, PRESETS, otherwise=cure)}")
     return PRESETS[preset]
 
 

@@ -43,7 +43,7 @@ def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) 
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
         home = key.removesuffix(path[-1])
-        return f"unknown key '{key}'{source}{nearest(path[-1], section.by_key(), lambda near: home + near)}"
+        return f"unknown key '{key}'{source}{nearest(path[-1], section.model_fields, lambda near: home + near)}"
     if kind == "too_short":
         return f"{key}{source} must not be empty"
     if kind in ("missing", "too_long"):
@@ -60,7 +60,7 @@ def _find_key(location: tuple[Any, ...], model: type[Section]) -> tuple[type[Sec
     section, path = model, []
     for part in map(str, location):
         path.append(part)
-        annotation = section.by_key()[part].annotation if part in section.by_key() else None
+        annotation = section.model_fields[part].annotation if part in section.model_fields else None
         if typing.get_origin(annotation) is dict and len(location) > len(path):
             return section, [*path, str(location[len(path)])]
         if not (isinstance(annotation, type) and issubclass(annotation, Section)):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
-from pydantic.fields import FieldInfo
 
 
 def _integer(value: Any) -> Any:
@@ -87,9 +86,4 @@ Delays = Annotated[tuple[Delay, Delay], BeforeValidator(_range)]
 class Section(BaseModel):
     """A frozen group of parameters that rejects unknown keys and values of the wrong type."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, serialize_by_alias=True)
-
-    @classmethod
-    def by_key(cls) -> dict[str, FieldInfo]:
-        """Return the fields by the keys under which a configuration has them."""
-        return {field.alias or name: field for name, field in cls.model_fields.items()}
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

@@ -76,5 +76,6 @@ def find_task(name: str) -> type[Task]:
     if name in failures:
         raise ConfigError(failures[name])
     if name not in TASKS:
-        raise ConfigError(f"unknown task '{name}' (one's own needs import=<module>){nearest(name, TASKS)}")
+        cure = "; one's own needs import=<module>"
+        raise ConfigError(f"unknown task '{name}'{nearest(name, TASKS, otherwise=cure)}")
     return TASKS[name]
