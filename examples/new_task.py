@@ -1,10 +1,10 @@
 """A task of one's own, complete: the team lifts its payload by a metre and holds it there.
 
-In the package, `Lift` would be a file in multilift_marl/tasks/, its line in tasks/__init__.py the one below, and the
-configuration a file configs/lift.yaml. Everything else (doors, seeding, failures, observations, training, evaluation)
-works by itself.
+Everything else (doors, seeding, failures, observations, training, evaluation) works by itself. In the package, `Lift`
+would be a file in multilift_marl/tasks/ with a line in tasks/__init__.py, and CONFIG a file configs/lift.yaml.
 
 Run: python examples/new_task.py
+     python train.py import=examples/new_task.py config=lift
 """
 
 import numpy as np
@@ -12,10 +12,8 @@ from pydantic import Field
 
 import multilift_marl as ml
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.load import build_config
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.scripted import make_scripted
-from multilift_marl.tasks import TASKS
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.starts import StartRanges, start_near_target
 from multilift_marl.tasks.terms import mean_change, tolerance
@@ -67,13 +65,13 @@ def score(lo, hi, state, errors, action, previous, weights, near, dt, terms, goo
         good_time[e] = good_time[e] + dt if errors.distance[e] <= near else 0.0
 
 
-TASKS["lift"] = Lift
 CONFIG = {"task": "lift", "env": {"num_envs": 64, "episode_seconds": 6.0}, "randomization": {"payload_mass": 0.1}}
+ml.register_task(Lift, CONFIG)
 
 
 def main() -> float:
     """Fly the new task by a script and return its success."""
-    vec = ml.make_vec(build_config(CONFIG))
+    vec = ml.make_vec("lift")
     script = make_scripted("formation_integral", vec)
     observation, info = vec.reset(seed=0)
     for _ in range(vec.max_steps):

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from multilift_marl import _interrupt, sim  # noqa: F401 (_interrupt first: Ctrl-C may come while the rest is imported)
-from multilift_marl.config import load_config
+from multilift_marl.config.load import load_config, register_config
+from multilift_marl.config.teams import register_vehicle
 from multilift_marl.envs.core import make_vec
 from multilift_marl.envs.gymnasium_env import register as _register_with_gymnasium
 from multilift_marl.envs.multilift_v0 import parallel_env
 from multilift_marl.envs.multilift_v0 import register as _register_with_pettingzoo
 from multilift_marl.errors import pip_install
-from multilift_marl.tasks import list_tasks
+from multilift_marl.tasks import list_tasks, register_task
 
 if TYPE_CHECKING:
     from multilift_marl.agents.policy import load_policy
@@ -36,7 +37,18 @@ else:
 
 
 __version__ = "0.1.0"
-__all__ = ["list_tasks", "load_config", "load_policy", "make_vec", "parallel_env", "sim", "torchrl_env"]
+__all__ = [
+    "list_tasks",
+    "load_config",
+    "load_policy",
+    "make_vec",
+    "parallel_env",
+    "register_config",
+    "register_task",
+    "register_vehicle",
+    "sim",
+    "torchrl_env",
+]
 
 _register_with_gymnasium()
 _register_with_pettingzoo()

@@ -10,6 +10,7 @@ from numba import config, njit, typeof
 
 from multilift_marl._kernel_cache import make_cache
 
+_UNCOMPILED: bool = config.DISABLE_JIT  # type: ignore[attr-defined]
 F = TypeVar("F", bound=Callable[..., Any])
 Arguments = TypeVarTuple("Arguments")
 
@@ -20,7 +21,7 @@ def kernel(function: F) -> F:
     Arithmetic is exact IEEE, so results do not depend on how many environments are computed together.
     """
     dispatcher: Any = njit(nogil=True, error_model="numpy")(function)
-    if not config.DISABLE_JIT:  # else it is the function itself
+    if not _UNCOMPILED:  # else it is the function itself
         dispatcher._cache = make_cache(function)
     return cast(F, dispatcher)
 
@@ -31,7 +32,7 @@ def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Ca
     That look-up costs more than many kernels do: a named tuple of ten arrays takes about 2 µs. The arrays must stay the
     same objects in memory; what is in them may change.
     """
-    if config.DISABLE_JIT:
+    if _UNCOMPILED:
         return functools.partial(function, *arguments)  # type: ignore[return-value]
     types = tuple(typeof(argument) for argument in arguments)
     compiled: Any = function  # Numba's dispatcher

@@ -31,7 +31,7 @@ from multilift_marl.errors import warn_once
 
 PACKAGE = Path(__file__).parent
 KEPT = 20  # folders of other sources, those used last
-_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "__init__.py")
+_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "plugins.py", "__init__.py")
 
 
 @cache
@@ -117,13 +117,13 @@ class _Nowhere(_CacheLocator):
 
 
 class _Results(CompileResultCacheImpl):  # how Numba turns a compiled function into what can be pickled, and back
-    _locator_classes = (_Nowhere,)
+    _locator_classes = (_Nowhere,)  # type: ignore[assignment]
 
 
 class KernelCache(NumbaCache):
     """The files of one kernel, with the interface of `numba.core.caching.Cache`."""
 
-    _impl_class = _Results
+    _impl_class = _Results  # type: ignore[assignment]
 
     def __init__(self, function: Callable[..., Any], folder: Path):
         super().__init__(function)

@@ -24,17 +24,18 @@ class RenderingError(RuntimeError):
     """Pictures were asked for and cannot be made."""
 
 
-def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str) -> str:
+def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str, otherwise: str = "") -> str:
     """Return "; did you mean 'x'?" for the closest of `names`, or the list of them where none is close.
 
     Args:
         name: what was given.
         names: what is known.
         full: turns the closest into what is to be written in its place.
+        otherwise: the cure where none is close.
     """
     names = sorted(names)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    return f"; did you mean '{full(close[0])}'?" if close else f"; known: {', '.join(names)}"
+    return f"; did you mean '{full(close[0])}'?" if close else f"; known: {', '.join(names)}{otherwise}"
 
 
 def shorten(value: object, most: int = 80) -> str:

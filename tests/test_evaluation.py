@@ -211,8 +211,8 @@ def test_command_flies_a_script_in_place_of_a_policy(tmp_path, capsys, monkeypat
     ("arguments", "message"),
     [
         (["policy=formatoin"], "unknown policy 'formatoin'; did you mean 'formation'?"),
-        (["policy=formation", "run=latest"], "policy=formation is a script and has no run"),
-        (["policy=formation", "checkpoint=last"], "policy=formation is a script and has no checkpoint"),
+        (["policy=formation", "run=latest"], "policy=formation takes the place of a run and has no run"),
+        (["policy=formation", "checkpoint=last"], "policy=formation takes the place of a run and has no checkpoint"),
         (["run=hover", "config=hover"], "a run brings its own configuration"),
         (["policy=formation", "config=pose_eas"], "no configuration named 'pose_eas'; did you mean 'pose_easy'?"),
         (["policy=formation", "control.action=ctbr", "baseline=none"], "cannot fly control.action=ctbr"),

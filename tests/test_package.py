@@ -97,7 +97,8 @@ def test_code_is_clean(command):
 
 def test_public_names():
     assert set(ml.__all__) == {
-        "list_tasks", "load_config", "load_policy", "make_vec", "parallel_env", "sim", "torchrl_env"
+        "list_tasks", "load_config", "load_policy", "make_vec", "parallel_env", "register_config", "register_task",
+        "register_vehicle", "sim", "torchrl_env",
     }  # fmt: skip
     for name in ml.__all__:
         assert getattr(ml, name).__doc__

@@ -15,7 +15,7 @@ import numpy as np
 
 import multilift_marl as ml
 from multilift_marl._jit import bind, kernel
-from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.trained import TrainedPolicy
 from multilift_marl.control.formation import Goal
 from multilift_marl.envs import multilift_v0
 from multilift_marl.envs.core import MultiliftVec
@@ -43,7 +43,7 @@ config = ml.load_config("hover")
 assert_type(config.env.num_drones, int)
 world = ml.sim.World(config.system, 2)
 assert_type(world.step(np.zeros((2, 4, 4))).payload_position, np.ndarray)
-policy = assert_type(ml.load_policy("hover"), LearnedPolicy)
+policy = assert_type(ml.load_policy("hover"), TrainedPolicy)
 assert_type(policy.act(np.zeros((4, 37))), np.ndarray)
 assert_type(ml.list_tasks(), list[str])
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.trained import FORMAT
 from multilift_marl.agents.versions import package_versions
 from multilift_marl.config.schema import Config
 from multilift_marl.control.actions import ACTIONS, Team
@@ -19,8 +20,6 @@ from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.base import INTEGRAL_LIMIT
 from multilift_marl.tasks.observations import FRAMES, list_components, observation_names
-
-FORMAT = "multilift_marl policy 1"
 
 
 def make_contract(policy: LearnedPolicy) -> dict[str, Any]:

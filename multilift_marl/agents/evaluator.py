@@ -81,8 +81,8 @@ class Evaluator:
         """Fly the best policy and the script that training of so many iterations began with."""
         learned = self._fly(self.best_policy().bind, iterations + 1)
         script = self._fly(LINEAR[self.config.train.residual], iterations + 1)
-        means = [{name: float(flown[name].mean()) for name in _METRICS} for flown in (script, learned)]
-        return Gain(*means, is_better(learned, script))
+        before, after = ({name: float(flown[name].mean()) for name in _METRICS} for flown in (script, learned))
+        return Gain(before, after, is_better(learned, script))
 
     def best_policy(self) -> LearnedPolicy:
         """Return the best policy so far."""

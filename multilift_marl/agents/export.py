@@ -20,6 +20,8 @@ from torch import nn
 from multilift_marl.agents.contract import make_contract
 from multilift_marl.agents.networks import Actor
 from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.trained import TrainedPolicy
+from multilift_marl.errors import ConfigError
 
 NETWORK, CONTRACT = "policy.onnx", "policy.json"
 _TOLERANCE = 1e-5  # of actions, between torch and onnxruntime
@@ -38,7 +40,7 @@ class _Mean(nn.Module):
         return self.actor(observation)[0].clamp(-1, 1)
 
 
-def export_policy(policy: LearnedPolicy, folder: str | Path) -> dict[str, Any]:
+def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
     """Write policy.onnx and policy.json into a folder, which is made where there is none.
 
     The network takes `observation` (batch, drones, D) float32 and returns `action` (batch, drones, A) in [-1, 1], for
@@ -52,10 +54,12 @@ def export_policy(policy: LearnedPolicy, folder: str | Path) -> dict[str, Any]:
         The contract, as in policy.json; see docs/export.md.
 
     Raises:
-        CheckpointError, ConfigError: see `make_contract`.
+        CheckpointError, ConfigError: see `make_contract`; or the policy is an exported one.
         OSError: the folder cannot be written.
         RuntimeError: onnxruntime's actions are not the policy's.
     """
+    if not isinstance(policy, LearnedPolicy):
+        raise ConfigError(f"{policy.source} is exported already; give the run or the checkpoint that it comes from")
     contract = make_contract(policy)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

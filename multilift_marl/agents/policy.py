@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from multilift_marl.agents.checkpoint import check_like, load_checkpoint, save_checkpoint
 from multilift_marl.agents.networks import Actor
+from multilift_marl.agents.trained import ExportedPolicy, TrainedPolicy
 from multilift_marl.config.load import build_config
-from multilift_marl.errors import CheckpointError, ConfigError
-
-if TYPE_CHECKING:
-    from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import CheckpointError
 
 _SHIPPED = Path(__file__).resolve().parents[1] / "policies"
 _KEPT = {"config": dict, "actor": dict, "observation_names": list, "action_names": list, "frames": int}
 """What a policy needs of a checkpoint."""
 
 
-class LearnedPolicy:
+class LearnedPolicy(TrainedPolicy):
     """The deterministic policy of a checkpoint, the same network for every drone and any number of them.
 
     Args:
@@ -43,9 +40,9 @@ class LearnedPolicy:
 
     def __init__(self, content: dict[str, Any], source: str):
         check_policy(content, source)
-        self.config = build_config(content["config"])
-        self.observation_names, self.action_names = tuple(content["observation_names"]), tuple(content["action_names"])
-        self.source, self.frames = source, content["frames"]
+        names = content["observation_names"], content["action_names"]
+        super().__init__(build_config(content["config"]), *names, source)
+        self.frames = content["frames"]
         size, train = (len(self.observation_names), len(self.action_names)), self.config.train
         with torch.random.fork_rng(devices=[]):  # initial weights, overwritten at once, must not cost random numbers
             self.actor = Actor(train.actor, *size, train.hidden, train.initial_std, torch.zeros(size[1], size[0]))
@@ -64,54 +61,24 @@ class LearnedPolicy:
         Raises:
             ValueError: observations of another size than the policy was trained with.
         """
-        observation = np.asarray(observation, np.float32)
-        if observation.shape[-1] != len(self.observation_names):
-            raise ValueError(
-                f"observation has {observation.shape[-1]} numbers, the policy of {self.source} was trained with "
-                f"{len(self.observation_names)}; use the environment configuration that it was trained in"
-            )
-        return self.actor(torch.from_numpy(observation))[0].clamp(-1, 1).numpy()
-
-    def bind(self, vec: MultiliftVec) -> LearnedPolicy:
-        """Return this policy, checked to fit the environments `vec`.
-
-        Raises:
-            ConfigError: it was trained with other actions or observations, see `misfit`.
-        """
-        if reason := self.misfit(vec):
-            raise ConfigError(f"the policy of {self.source} {reason}")
-        return self
-
-    def misfit(self, vec: MultiliftVec) -> str:
-        """Return why the policy cannot fly `vec`, as the rest of a sentence, "" if it can."""
-        trained, asked = self.config.control.action, vec.config.control.action
-        if trained != asked:
-            return f"was trained with control.action={trained} and cannot fly {asked}; set control.action={trained}"
-        parts = {"actions": (self.action_names, vec.action_names)}
-        parts["observations"] = (self.observation_names, vec.observation_names)
-        for kind, names in parts.items():
-            for i, (mine, its) in enumerate(zip_longest(*names, fillvalue="nothing")):
-                if mine != its:
-                    return (
-                        f"was trained in task {self.config.task} and cannot fly this {vec.task.name}: number {i} of "
-                        f"the {kind} is {mine} there and {its} here; fly what it was trained in, or another policy"
-                    )
-        return ""
-
-    def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget nothing: the policy has no memory of its own."""
+        return self.actor(torch.from_numpy(self._checked(observation)))[0].clamp(-1, 1).numpy()
 
 
-def load_policy(name: str | Path) -> LearnedPolicy:
+def load_policy(name: str | Path) -> TrainedPolicy:
     """Return a trained policy.
 
     Args:
-        name: a run folder (its best checkpoint is taken), a checkpoint file, or the name of a shipped policy ("hover").
+        name: a run folder (its best checkpoint is taken), a checkpoint file, the .onnx file of an exported policy, or
+            the name of a shipped policy ("hover").
 
     Raises:
         CheckpointError: missing, truncated or foreign.
+        ConfigError: its configuration is of another version, or a module that it needs is missing.
+        ModuleNotFoundError: an exported policy needs onnxruntime, the `export` extra.
     """
     path = Path(name)
+    if path.suffix == ".onnx":
+        return ExportedPolicy(path)
     if path.is_dir():
         best = path / "checkpoints" / "best.pt"
         path = best if best.is_file() else path / "checkpoints" / "last.pt"

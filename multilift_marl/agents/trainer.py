@@ -130,7 +130,7 @@ class Trainer:
             values = {} if first else self.step()
             if "return" in values:
                 shown["return"] = f"{values['return']:.0f}"
-            last = self.finished
+            last = self.iteration >= self.iterations
             if self.iteration % self.config.eval.every == 0 or last:
                 _quietly(bar.set_description, f"{name}, evaluating")
                 values |= self.evaluate()

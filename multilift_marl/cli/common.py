@@ -6,7 +6,7 @@ import io
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from multilift_marl.config.load import check_names, explain, load_config, parse_
 from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install, reason, shorten
-from multilift_marl.tasks import TASKS, find_task
+from multilift_marl.plugins import import_modules
+from multilift_marl.tasks import find_task, list_tasks
 
 _EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  # of all other packages: train
 
@@ -40,14 +41,16 @@ def run_command(
     _open_streams()
     try:
         if any(argument in ("-h", "--help") for argument in arguments):
-            values = parse_overrides(argument for argument in arguments if argument not in ("-h", "--help"))
+            values = parse_overrides((each for each in arguments if each not in ("-h", "--help")), names)
             check_names(values, own)
+            import_modules(values.get("import"))
             explained = "" if configuration is None else _explain_configuration(values, own, configuration)
             print(f"{usage}{explained}")
             status = 0
         else:
             values = parse_overrides(arguments, names)
             check_names(values, own)
+            import_modules(values.get("import"))  # first of all: checkpoints, too, may need them
             status = main(values)
         sys.stdout.flush()
         return status
@@ -122,9 +125,16 @@ def _explain_configuration(values: dict[str, Any], own: Iterable[str], key: str)
     config = load_config(str(values.get(key) or "hover"), given) if given or values.get(key) else None
     what = "default" if config is None else "value"
     lines = [f"\n\nConfiguration keys ({what}, meaning; - stands for none):\n{explain(config or Config)}"]
-    for name, task in TASKS.items() if config is None else [(config.task, find_task(config.task))]:
+    for name in list_tasks() if config is None else [config.task]:
+        task = find_task(name)
         options = task.Options if config is None else validate(task.Options, config.task_options, "task_options")
         weights = task.REWARD | ({} if config is None else config.reward)
         lines.append(f"\nTask {name}:\n{explain(options, 'task_options.')}")
         lines += [f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in weights.items()]
     return "\n".join(lines)
+
+
+def title(values: Mapping[str, Any]) -> str:
+    """Return what the folder of a run is named by: the configuration, and the task where another one is given."""
+    parts = [Path(str(values[key])).stem for key in ("config", "task") if values.get(key) is not None]
+    return "-".join(dict.fromkeys(parts)) or "hover"

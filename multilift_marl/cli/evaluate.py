@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from multilift_marl.cli.common import make_folder, run_command, whole_number
+from multilift_marl.cli.common import make_folder, run_command, title, whole_number
+from multilift_marl.cli.policies import find_policy
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
-from multilift_marl.control.scripted import SCRIPTED, fitting_scripts, make_scripted
+from multilift_marl.control.scripted import fitting_scripts
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError, nearest
 from multilift_marl.evaluation.report import format_table, make_report, write_report
@@ -28,13 +29,17 @@ _USAGE = """Judge a team on fixed seeds, beside the scripted ones on the same ep
   python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
   run         a run folder, its name, "latest", or the name of a shipped policy ("hover")     (latest)
-  policy      script in place of a run: formation, formation_integral, formation_feedback, formation_gusts,
-              formation_lead, formation_narrow, formation_redistributed, payload_geometric    (none)
-  config      environment of that script, a configuration's name or path                      (hover)
+  policy      in place of a run: a script (formation, formation_integral, formation_feedback, formation_gusts,
+              formation_lead, formation_narrow, formation_redistributed, payload_geometric), one's own class
+              (module:Class, file.py:Class), an exported policy (.onnx), a checkpoint (.pt)   (none)
+  config      environment of that policy, a configuration's name or path; task=<other> keeps its vehicles, payload,
+              cables and control, see python train.py --help            (what it was trained in, of scripts hover)
+  import      a module of one's own with tasks or vehicles (docs/plugins.md)                  (as the run)
   checkpoint  best, last, or a file                                                           (best)
   episodes    how many                                                                        (200)
   seed        evaluation seed: episode i is the same for every policy                         (1000)
-  baseline    script in the plots beside the policy; none: fly the policy alone               (formation_integral)
+  baseline    drawn beside the policy, named like it, or a run folder or shipped policy; none: fly the policy alone
+                                                                                              (formation_integral)
   video       true: also an mp4 of the first episode                                          (false)
   camera      of the video: side, top or chase                                                (side)
   trail       seconds of flight that drones and payload draw behind them in the video         (2)
@@ -59,18 +64,22 @@ def _evaluate(values: dict[str, Any]) -> int:
     _check_source(values)
     own = {key: values.pop(key, default) for key, default in _DEFAULTS.items()}
     _check(own)
-    flown = _find_script(own) if own["policy"] is not None else _find_policy(str(own["run"]), str(own["checkpoint"]))
+    own["baseline"] = str(own["baseline"])
+    baseline = find_policy(own["baseline"], "baseline", ["none"]) if own["baseline"] != "none" else None
+    flown = _find_run(own) if own["policy"] is None else _find_named(own, values)
     config = build_config(flown.config.model_dump(), {"env.num_threads": 0} | values)
     _ = config.system
     probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
     makers = {flown.name: flown.make}
-    if own["baseline"] != "none":
-        makers |= {name: _script(name) for name in (*fitting_scripts(probe), own["baseline"]) if name != flown.name}
+    if baseline is not None:
+        makers |= {name: find_policy(name).bind for name in fitting_scripts(probe) if name != flown.name}
+        makers.setdefault(own["baseline"], baseline.bind)
     for make in makers.values():  # refuses what does not fit, before there is a folder
         make(probe)
     out = make_folder(Path(own["out"]) if own["out"] else flown.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
 
-    episodes = {name: _fly(config, maker, name, own) for name, maker in makers.items()}
+    order = sorted(makers, key=lambda name: ":" not in name)  # one's own first: should they fail, nothing is lost
+    episodes = {name: _fly(config, makers[name], name, own) for name in order}
     judged = episodes.pop(flown.name)
     report = make_report(config, own["seed"], judged, episodes)
     print(f"\n{flown.source}: {own['episodes']} episodes, seed {own['seed']}; mean (95 % interval)\n")
@@ -93,35 +102,32 @@ class _Flown(NamedTuple):
     """That its evaluations belong to."""
 
 
-def _script(name: str) -> Callable[[MultiliftVec], Any]:
-    return lambda vec: make_scripted(name, vec)
-
-
 def _check_source(values: dict[str, Any]) -> None:
-    """Refuse keys of a run beside a script, and the other way round."""
-    script = values.get("policy") is not None
-    wrong = [key for key in (("run", "checkpoint") if script else ("config",)) if key in values]
-    if wrong and script:
-        raise ConfigError(f"policy={values['policy']} is a script and has no {wrong[0]}; leave out one of the two")
+    """Refuse keys of a run beside another policy, and the other way round."""
+    named = values.get("policy") is not None
+    wrong = [key for key in (("run", "checkpoint") if named else ("config",)) if key in values]
+    if wrong and named:
+        raise ConfigError(f"policy={values['policy']} takes the place of a run and has no {wrong[0]}; leave out one")
     if wrong:
         raise ConfigError("a run brings its own configuration: leave out config, or fly a script by policy=formation")
 
 
-def _find_script(own: dict[str, Any]) -> _Flown:
-    name, config = str(own["policy"]), str(own["config"] or "hover")
-    if name not in SCRIPTED:
-        raise ConfigError(
-            f"unknown policy '{name}'{nearest(name, SCRIPTED)}: give a script, or a learned team by run=<run>"
-        )
-    folder = Path("runs") / f"{name}-{Path(config).stem}"
-    return _Flown(name, f"{name} on {config}", load_config(config), _script(name), folder)
+def _find_named(own: dict[str, Any], values: dict[str, Any]) -> _Flown:
+    name = str(own["policy"])
+    policy = find_policy(name)
+    if policy.config is None or own["config"] is not None:
+        config = load_config(str(own["config"] or "hover"), values)
+        where = title(values | {"config": own["config"]})
+    else:
+        config, where = policy.config, policy.config.task
+    module, _, kind = name.rpartition(":")
+    label = f"{Path(module).name.removesuffix('.py')}.{kind}" if module else Path(name).stem
+    return _Flown(name, f"{name} on {where}", config, policy.bind, Path("runs") / f"{label}-{where}")
 
 
 def _check(own: dict[str, Any]) -> None:
     own["episodes"] = whole_number("episodes", own["episodes"], 1, 1_000_000)
     own["seed"] = whole_number("seed", own["seed"], 0)
-    if own["baseline"] not in (*SCRIPTED, "none"):
-        raise ConfigError(f"unknown baseline '{own['baseline']}'{nearest(str(own['baseline']), [*SCRIPTED, 'none'])}")
     if not isinstance(own["video"], bool):
         raise ConfigError(f"video must be true or false, but is {own['video']!r}")
     if own["camera"] not in CAMERAS:
@@ -130,7 +136,8 @@ def _check(own: dict[str, Any]) -> None:
         raise ConfigError(f"trail must be a number of seconds from 0 to 1000, but is {own['trail']!r}")
 
 
-def _find_policy(run: str, checkpoint: str) -> _Flown:
+def _find_run(own: dict[str, Any]) -> _Flown:
+    run, checkpoint = str(own["run"]), str(own["checkpoint"])
     import torch
 
     from multilift_marl.agents.checkpoint import find_run
@@ -164,7 +171,7 @@ def _draw(config: Config, makers: dict[str, Any], flown: _Flown, own: dict[str, 
     plots.plot_errors(out / "errors.png", traces)
     plots.plot_tensions(out / "tensions.png", traces[flown.name], f"{flown.name}, episode 0")
     plots.plot_paths(out / "paths.png", traces[flown.name], f"{flown.name}, episode 0")
-    if flown.name not in SCRIPTED:
+    if own["policy"] is None:
         from multilift_marl.agents.logging import read_metrics
 
         if rows := read_metrics(flown.folder):

@@ -16,9 +16,10 @@ _USAGE = """Write a trained policy as an ONNX network and a contract of its inpu
   python -m multilift_marl.export run=latest [out=<folder>]
 
   run   a run folder (its best checkpoint), "latest", a checkpoint file, or the name of a shipped policy     (latest)
-  out   folder for policy.onnx and policy.json         (<run>/export, of a shipped policy runs/shipped-<name>/export)"""
+  out   folder for policy.onnx and policy.json         (<run>/export, of a shipped policy runs/shipped-<name>/export)
+  import  where a module of one's own is now, that the run was trained with"""
 
-_DEFAULTS = {"run": "latest", "out": None}
+_DEFAULTS = {"run": "latest", "out": None, "import": None}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

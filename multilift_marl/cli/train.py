@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from multilift_marl.cli.common import run_command
+from multilift_marl.cli.common import run_command, title
 from multilift_marl.config.load import load_config
 from multilift_marl.errors import ConfigError
 
@@ -20,12 +19,15 @@ _USAGE = """Train a team.
   python train.py config=hover [key=value ...]     a new run in runs/<config>-<time>-s<seed>/
   python train.py resume=<run|latest>              go on with a run from its last checkpoint
 
-  config   a shipped configuration's name or the path of a YAML file (default hover)
-  resume   a run folder; takes only train.frames, train.checkpoint_every, eval.* and env.num_threads beside it
+  config   a configuration's name or the path of a YAML file (default hover)
+  task     another task than the configuration's: config=rigs/auto6 task=track has the values of track, over them
+           env.num_drones, sim, vehicle, payload, cable, control and wind of rigs/auto6, over them the keys given here
+  import   a module of one's own, name or .py file: tasks, vehicles, configurations (docs/plugins.md)
+  resume   a run folder; takes only train.frames, train.checkpoint_every, eval.*, env.num_threads, import beside it
 
 With --help, config=<name> and other keys show the values that they stand for."""
 
-_RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.episodes", "env.num_threads")
+_RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.episodes", "env.num_threads", "import")
 
 _NAMES = ("config", "resume")
 
@@ -55,10 +57,10 @@ def _train(values: dict[str, Any]) -> int:
             return 0
         print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
     else:
-        name = values.pop("config", "hover")
-        config = load_config(name, values)
+        name = title(values)
+        config = load_config(str(values.pop("config", "hover")), values)
         _ = config.system  # refuse an impossible system before the long wait
-        trainer = new_run(config, Path(name).stem)
+        trainer = new_run(config, name)
         folder = trainer.folder
         print(f"training {config.train.frames:,} steps in {folder}")
     finished = trainer.run()

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from multilift_marl.config.yaml_text import parse_yaml
 from multilift_marl.errors import ConfigError, reason, shorten
 
 _MARK = "#sha256="
@@ -20,6 +21,43 @@ def pin_files(values: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(pinned.get(key), str):
             pinned[key] = pin_file(pinned[key])
     return pinned
+
+
+def pin_vehicles(preset: str | tuple[str, ...]) -> str | tuple[str, ...]:
+    """Return names of vehicles, of which those that are YAML files are pinned; see `pin_file`."""
+    if not isinstance(preset, str):
+        return tuple(pin_file(each) if is_yaml(each) else each for each in preset)
+    return pin_file(preset) if is_yaml(preset) else preset
+
+
+def is_yaml(reference: str | Path) -> bool:
+    """Return whether a reference, pinned or not, is the path of a YAML file rather than a name."""
+    return str(reference).partition(_MARK)[0].endswith((".yaml", ".yml"))
+
+
+def parse_mapping(content: bytes, source: Path, expected: str) -> dict[str, Any]:
+    """Return the keys and values of a YAML file.
+
+    Args:
+        content: of the file.
+        source: its path, for messages.
+        expected: what it should hold, for messages.
+
+    Raises:
+        ConfigError: it holds something else.
+    """
+    try:
+        values = parse_yaml(content.decode())
+    except ValueError as error:
+        raise ConfigError(f"cannot read {shorten(source)} as YAML: {reason(error)}") from None
+    return as_mapping(values, source, expected)
+
+
+def as_mapping(values: Any, source: Path, expected: str) -> dict[str, Any]:
+    """Return what a YAML file holds, {} if nothing; a ConfigError if that is no mapping. See `parse_mapping`."""
+    if not isinstance(values, dict | None):
+        raise ConfigError(f"{source} holds {type(values).__name__} where {expected} are expected")
+    return values or {}
 
 
 def pin_file(reference: str) -> str:

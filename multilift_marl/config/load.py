@@ -8,14 +8,19 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+from multilift_marl.config.files import as_mapping, is_yaml
 from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Section
 from multilift_marl.config.yaml_text import parse_yaml, read_yaml, write_yaml
 from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest, reason, shorten
+from multilift_marl.plugins import import_modules, load_entry_points
 
 _MOST_SECTIONS = 5  # of a key's name; what is deeper is unknown anyway
 _PACKAGE = Path(__file__).resolve().parents[1]
+CONFIGS: dict[str, Path | Mapping[str, Any]] = {}
+"""Configurations of one's own by name, see `register_config`."""
+_SYSTEM = ("sim", "vehicle", "payload", "cable", "control", "wind")  # what a rig keeps in another task, beside its size
 
 
 def config_dir() -> Path:
@@ -30,18 +35,45 @@ def list_configs() -> list[str]:
     return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
 
 
+def register_config(name: str, source: str | Path | Mapping[str, Any]) -> None:
+    """Make a configuration of one's own known by name: a rig, a preset of a task.
+
+    Args:
+        name: not that of a shipped configuration; of one's own, the latest counts.
+        source: the path of its YAML file, or its values by section.
+
+    Raises:
+        ConfigError: the name is taken, or there is no such file.
+    """
+    if name in list_configs() or is_yaml(name):
+        raise ConfigError(f"a configuration of one's own cannot have the name '{name}': choose one that is not taken")
+    if not isinstance(source, Mapping):
+        source = Path(source).absolute()
+        _read(source)
+    CONFIGS[name] = source
+
+
 def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None = None) -> Config:
     """Return typed defaults < the configuration `name` < `overrides`.
 
+    Where `overrides` name a `task` other than its own, that task's configuration (typed defaults if it has none) takes
+    its place, and of `name` only the system counts, which goes over it: env.num_drones, sim, vehicle, payload, cable,
+    control and wind. So a rig can be given any task.
+
     Args:
-        name: a shipped configuration's name or the path of a YAML file.
+        name: a shipped configuration's name, one's own, or the path of a YAML file.
         overrides: values by dotted name, such as {"payload.mass": 2.0}; mappings add to what is there, but an empty one
             drops it where names are free: {"train.overrides": {}}, {"task_options": {}}, {"reward": {}}.
 
     Raises:
         ConfigError: an unknown name or key, a wrong type or a value out of range.
     """
-    return build_config(_read(name), overrides, where=str(name))
+    overrides = overrides or {}
+    import_modules(overrides.get("import"))  # they may bring the configuration
+    values = _read(name)
+    if (task := overrides.get("task", values.get("task"))) != values.get("task"):
+        values = _merge(_read_preset(task), _system_part(values))
+    return build_config(values, overrides, where=str(name))
 
 
 def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, where: str = "") -> Config:
@@ -55,9 +87,9 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    merged = _merge({}, values)
+    merged, overrides = _merge({}, values), overrides or {}
     free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
-    for dotted, value in (overrides or {}).items():
+    for dotted, value in overrides.items():
         *sections, key = dotted.split(".", _MOST_SECTIONS)
         change, node = {key: value}, merged
         for part in sections:
@@ -69,6 +101,8 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
         for part in reversed(sections):
             change = {part: change}
         merged = _merge(merged, change)
+    if "import" in merged:
+        merged["import"] = _import_all(values.get("import"), overrides.get("import"))
     return validate(Config, merged, where=where)
 
 
@@ -196,10 +230,10 @@ def _leaves(section: type[Section], prefix: str) -> Iterator[tuple[str, Any, str
 def _read(name: str | Path) -> dict[str, Any]:
     path = Path(name)
     try:
-        if path.suffix not in (".yaml", ".yml"):
+        if not is_yaml(path):
             path = config_dir() / f"{name}.yaml"
             if not path.is_file():
-                raise ConfigError(f"no configuration named '{shorten(name)}'{nearest(str(name), list_configs())}")
+                return _read_own(str(name))
         values = read_yaml(path)
     except ConfigError:
         raise
@@ -207,11 +241,55 @@ def _read(name: str | Path) -> dict[str, Any]:
         raise ConfigError(f"no configuration file {path}: give the path of a YAML file or a shipped name") from None
     except (OSError, ValueError) as error:  # ValueError: what is no YAML, and names with a NUL
         raise ConfigError(f"cannot read {shorten(path)} as YAML: {reason(error)}") from None
-    if values is None:
-        return {}
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path} holds {type(values).__name__} where sections such as 'env:' are expected")
-    return values
+    return _locate(as_mapping(values, path, "sections such as 'env:'"), path.absolute().parent)
+
+
+def _read_own(name: str) -> dict[str, Any]:
+    """Return the values of a registered configuration."""
+    if name not in CONFIGS:
+        load_entry_points()
+    if name not in CONFIGS:
+        raise ConfigError(f"no configuration named '{shorten(name)}'{nearest(name, [*list_configs(), *CONFIGS])}")
+    source = CONFIGS[name]
+    return _read(source) if isinstance(source, Path) else dict(source)
+
+
+def _read_preset(task: Any) -> dict[str, Any]:
+    """Return the configuration that has the name of a task, {} if there is none."""
+    known = isinstance(task, str) and (task in CONFIGS or task in list_configs())
+    return _read(task) if known else {}
+
+
+def _system_part(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a configuration says of the system, whatever its task."""
+    part = {key: values[key] for key in (*_SYSTEM, "import") if key in values}
+    if isinstance(env := values.get("env"), Mapping) and "num_drones" in env:
+        part["env"] = {"num_drones": env["num_drones"]}
+    return part
+
+
+def _locate(values: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the values of a file in `folder` with modules and vehicles that lie beside it as absolute paths."""
+
+    def absolute(reference: Any, suffix: str = "") -> Any:
+        if isinstance(reference, list):
+            return [absolute(each, suffix) for each in reference]
+        beside = folder / f"{reference}{suffix}"
+        return str(beside) if isinstance(reference, str) and beside.is_file() else reference
+
+    located = dict(values)
+    if "import" in values:
+        located["import"] = absolute(absolute(values["import"]), ".py")
+    if isinstance(vehicle := values.get("vehicle"), Mapping) and "preset" in vehicle:
+        located["vehicle"] = {**vehicle, "preset": absolute(vehicle["preset"])}
+    return located
+
+
+def _import_all(stored: Any, more: Any) -> Any:
+    """Return the references of all modules, those asked for now imported first: they stand in for missing files."""
+    asked = import_modules(more), import_modules(stored)
+    wrong = [references for references in asked if not isinstance(references, tuple)]
+    return wrong[0] if wrong else import_modules([*asked[1], *asked[0]])
 
 
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, create_model
 
-from multilift_marl.config.files import pin_files
+from multilift_marl.config.files import pin_files, pin_vehicles
 from multilift_marl.config.values import (
     Delays,
     Drag,
@@ -52,7 +52,9 @@ class SimConfig(Section):
 class VehicleConfig(Section):
     """The quadrotors: a preset, and what differs from it (None: as the preset); lists hold one for each drone."""
 
-    preset: str | tuple[str, ...] = Field("falcon", description="falcon, crazyflie, crazyflie_id, hummingbird or iris")
+    preset: Annotated[str | tuple[str, ...], AfterValidator(pin_vehicles)] = Field(
+        "falcon", description="falcon, crazyflie, crazyflie_id, hummingbird, iris, or one's own: a name or a YAML file"
+    )
     mass: PerDrone | None = Field(None, description="[kg] of the whole drone")
     inertia: Moments | tuple[Moments, ...] | None = Field(None, description="[kg m²] principal moments")
     arm: PerDrone | None = Field(None, description="[m] from the centre of mass to a rotor axis")
@@ -255,7 +257,14 @@ class EvalConfig(Section):
     episodes: Int = Field(128, ge=1, le=1_000_000, description="episodes of each")
 
 
-class Config(Section):
+if TYPE_CHECKING:
+    _Imports = Section
+else:  # a class statement cannot have a field of this name, a word of Python
+    _modules = Field((), description="modules of one's own, names or .py files (docs/plugins.md)")
+    _Imports = create_model("_Imports", __base__=Section, **{"import": (tuple[str, ...], _modules)})
+
+
+class Config(_Imports):
     """The whole configuration."""
 
     task: str = Field("hover", description="name of the task")

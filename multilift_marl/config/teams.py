@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from multilift_marl.config.files import is_yaml, parse_mapping, read_pinned
+from multilift_marl.config.schema import VehicleConfig
+from multilift_marl.config.validate import validate
 from multilift_marl.config.vehicles import PRESETS, Vehicle
 from multilift_marl.errors import ConfigError, nearest
 
-if TYPE_CHECKING:
-    from multilift_marl.config.schema import VehicleConfig
-
+_SHIPPED = frozenset(PRESETS)
 _VECTORS = ("inertia", "rotor_azimuth", "rotor_spin", "drag")
 
 
@@ -35,6 +37,26 @@ def resolve_vehicles(config: VehicleConfig, n: int) -> tuple[Vehicle, ...]:
     return tuple(vehicles)
 
 
+def register_vehicle(name: str, **fields: Any) -> Vehicle:
+    """Make a vehicle of one's own known by name, `vehicle.preset=<name>`.
+
+    Args:
+        name: not that of a shipped vehicle; of one's own, the latest counts.
+        **fields: as in the section `vehicle` of a configuration, in its units; what is left out is that of `preset`, a
+            falcon unless another is named.
+
+    Returns:
+        The vehicle.
+
+    Raises:
+        ConfigError: an unknown field, a wrong value, a name that is taken, or a vehicle that cannot be or cannot hover.
+    """
+    if name in _SHIPPED or is_yaml(name):
+        raise ConfigError(f"a vehicle of one's own cannot have the name '{name}': choose one that is not taken")
+    PRESETS[name] = _make_vehicle(name, fields)
+    return PRESETS[name]
+
+
 def describe_team(vehicles: tuple[Vehicle, ...]) -> str:
     """Return how many of which vehicles, such as "2 × falcon, 1 × iris"."""
     return ", ".join(f"{count} × {name}" for name, count in Counter(vehicle.name for vehicle in vehicles).items())
@@ -52,13 +74,31 @@ def _one_each(value: Any, n: int, key: str) -> tuple[Any, ...]:
     return value
 
 
-def _resolve(fields: dict[str, Any]) -> Vehicle:
-    preset = fields.pop("preset")
+def _find_vehicle(preset: str) -> Vehicle:
+    """Return the vehicle of a name or of a YAML file."""
+    if is_yaml(preset):
+        path, content = read_pinned("vehicle.preset", preset)
+        return _make_vehicle(path.stem, parse_mapping(content, path, "fields of a vehicle, such as 'mass: 0.7',"), path)
     if preset not in PRESETS:
-        raise ConfigError(f"unknown vehicle.preset '{preset}'{nearest(preset, PRESETS)}")
+        cure = "; one's own needs import=<module>, or is a file, <name>.yaml"
+        raise ConfigError(f"unknown vehicle.preset '{preset}'{nearest(preset, PRESETS, otherwise=cure)}")
+    return PRESETS[preset]
+
+
+def _make_vehicle(name: str, fields: dict[str, Any], file: Path | str = "") -> Vehicle:
+    """Return a vehicle of `fields` as in the section `vehicle`, from a `file` if one is named."""
+    config = validate(VehicleConfig, fields, "vehicle", where=str(file))
+    if file and is_yaml(str(config.preset)):  # it might be the file itself
+        raise ConfigError(f"preset={fields['preset']} in {file} must be the name of a vehicle, not another file")
+    (vehicle,) = resolve_vehicles(config, 1)
+    return replace(vehicle, name=name)
+
+
+def _resolve(fields: dict[str, Any]) -> Vehicle:
+    base = _find_vehicle(fields.pop("preset"))
     if "rotor_azimuth" in fields:
         fields["rotor_azimuth"] = tuple(float(angle) for angle in np.deg2rad(fields["rotor_azimuth"]))
-    vehicle = replace(PRESETS[preset], **fields)
+    vehicle = replace(base, **fields)
     _check_vehicle(vehicle)
     return vehicle
 

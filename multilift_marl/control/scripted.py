@@ -9,6 +9,7 @@ import numpy as np
 
 from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.payload_geometric import PayloadGeometric
+from multilift_marl.control.policy import OwnPolicy, Policy
 from multilift_marl.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -249,13 +250,15 @@ def fitting_scripts(vec: MultiliftVec) -> list[str]:
     return [name for name, script in SCRIPTED.items() if not issubclass(script, Formation) or script.fits(vec)]
 
 
-def make_scripted(name: str, vec: MultiliftVec) -> Formation | PayloadGeometric:
-    """Return the scripted policy `name` for the environments `vec`.
+def make_scripted(name: str, vec: MultiliftVec) -> Policy:
+    """Return the scripted policy `name`, or that of one's own class module:Class, for the environments `vec`.
 
     Raises:
         ConfigError: there is no such script, or the environments have another action interface than scripts have, or
-            do not tell it what it needs.
+            do not tell it what it needs; or see `OwnPolicy`.
     """
+    if ":" in name:
+        return OwnPolicy(name, vec)
     if name not in SCRIPTED:
         raise ConfigError(f"unknown scripted policy '{name}'{nearest(name, SCRIPTED)}")
     check_interface(name, vec.config.control.action)

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from multilift_marl.config.load import build_config
 from multilift_marl.config.schema import Config
+from multilift_marl.control.policy import Policy
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.tasks.failures import MAX_DISTANCE
 
 SETTLED = 0.05  # [m] settling time counts until the payload stays within this
 PRECISE = (0.01, 1.0)  # [m], [deg] mean errors of an episode that counts as precise
 _BATCH = 256
-
-
-class Policy(Protocol):
-    """What can fly a team: learned or scripted."""
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (..., N, A) in [-1, 1] for observations (..., N, D)."""
-
-    def reset(self, mask: np.ndarray | None = None) -> None:
-        """Begin new episodes in the environments of the mask (E,) bool (None: all)."""
 
 
 class Trace(NamedTuple):

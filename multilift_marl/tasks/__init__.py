@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from multilift_marl.config.load import register_config
 from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.plugins import load_entry_points
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.gate import Gate
 from multilift_marl.tasks.hover import Hover
@@ -25,17 +31,51 @@ TASKS: dict[str, type[Task]] = {
 }
 
 
+_SHIPPED = frozenset(TASKS)
+T = TypeVar("T", bound=type[Task])
+
+
+def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None) -> T:
+    """Make a task of one's own known by its `name`; also as a decorator of the class.
+
+    Args:
+        task: the class; of several with one name, the latest counts.
+        config: its configuration, which is then known by the same name: a YAML file, or values by section; None for
+            typed defaults.
+
+    Returns:
+        The class.
+
+    Raises:
+        ConfigError: no task, one without a name, or with that of a shipped task or configuration.
+    """
+    name = getattr(task, "name", None)
+    if not (isinstance(task, type) and issubclass(task, Task) and isinstance(name, str)):
+        raise ConfigError(f"{task!r} is no task that could be registered: derive a class from Task and give it a name")
+    if name in _SHIPPED and task is not TASKS[name]:
+        raise ConfigError(f"a task of one's own cannot have the name '{name}': choose one that is not taken")
+    if name not in _SHIPPED:
+        register_config(name, {"task": name} if config is None else config)
+    TASKS[name] = task
+    return task
+
+
 def list_tasks() -> list[str]:
-    """Return the names of all tasks."""
+    """Return the names of all tasks, those of installed packages (entry points) with them."""
+    load_entry_points()
     return sorted(TASKS)
 
 
 def find_task(name: str) -> type[Task]:
-    """Return the class of a task by name.
+    """Return the class of a task by name, of installed packages too.
 
     Raises:
-        ConfigError: there is no such task.
+        ConfigError: there is no such task, or the package that has it fails.
     """
+    failures = {} if name in TASKS else load_entry_points()
+    if name in failures:
+        raise ConfigError(failures[name])
     if name not in TASKS:
-        raise ConfigError(f"unknown task '{name}'{nearest(name, TASKS)}")
+        cure = "; one's own needs import=<module>"
+        raise ConfigError(f"unknown task '{name}'{nearest(name, TASKS, otherwise=cure)}")
     return TASKS[name]

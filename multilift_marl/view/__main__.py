@@ -8,8 +8,10 @@ from contextlib import closing, suppress
 from typing import Any
 
 from multilift_marl.cli.common import run_command, whole_number
+from multilift_marl.cli.policies import NamedPolicy, find_policy
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.schema import Config
+from multilift_marl.control.scripted import SCRIPTED
 from multilift_marl.view.page import HOST, Page
 from multilift_marl.view.session import Session
 
@@ -18,14 +20,18 @@ _USAGE = f"""Watch a team in the browser, at an address of this machine alone ({
   python -m multilift_marl.view task=hover run=hover [key=value ...]
 
   task    a configuration's name or path                      (the run's own, or hover)
+  config  a rig or other configuration for that task; its vehicles, payload, cables and control count, see
+          python train.py --help
   run     a run folder, "latest", or the name of a shipped policy ("hover"); none: scripts only
-  policy  which flies first: run, or a script                 (run, or formation)
+  policy  which flies first: run, a script, module:Class, an exported policy (.onnx), a checkpoint (.pt)
+                                                              (run, or formation)
+  import  a module of one's own with tasks or vehicles (docs/plugins.md)
   seed    evaluation seed: the episodes are those of evaluate.py        (1000)
   port    of the address; 0 for any free one                  (8080)
 
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, cable.model=chain."""
 
-_DEFAULTS = {"task": None, "run": None, "policy": None, "seed": 1000, "port": 8080}
+_DEFAULTS = {"task": None, "config": None, "run": None, "policy": None, "seed": 1000, "port": 8080}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,17 +57,23 @@ def make_session(values: dict[str, Any]) -> tuple[Session, int]:
     own = {key: values.pop(key, default) for key, default in _DEFAULTS.items()}
     for key, most in (("seed", 2**63 - 1), ("port", 65535)):
         own[key] = whole_number(key, own[key], 0, most)
-    learned: dict[str, Any] = {}
+    learned: dict[str, NamedPolicy] = {}
     if own["run"] is not None:
         learned["run"] = _load(str(own["run"]))
-    config = _find_config(own["task"], learned, {**values, "env.num_envs": 1, "env.num_threads": 1})
-    policy = own["policy"] if own["policy"] is not None or not learned else "run"
-    return Session(config, learned, None if policy is None else str(policy), own["seed"]), own["port"]
+    policy = str(own["policy"]) if own["policy"] is not None else "run" if learned else None
+    if policy is not None and policy not in ("run", *SCRIPTED):
+        learned[policy] = find_policy(policy, others=learned)
+    config = _find_config(own, learned, {**values, "env.num_envs": 1, "env.num_threads": 1})
+    return Session(config, learned, policy, own["seed"]), own["port"]
 
 
-def _find_config(task: Any, learned: dict[str, Any], overrides: dict[str, Any]) -> Config:
-    if task is None and learned:
-        return build_config(learned["run"].config.model_dump(), overrides)
+def _find_config(own: dict[str, Any], learned: dict[str, NamedPolicy], overrides: dict[str, Any]) -> Config:
+    task, config = own["task"], own["config"]
+    if config is not None:
+        return load_config(str(config), overrides if task is None else {**overrides, "task": task})
+    trained = [policy.config for policy in learned.values() if policy.config is not None]
+    if task is None and trained:
+        return build_config(trained[0].model_dump(), overrides)
     return load_config("hover" if task is None else str(task), overrides)
 
 

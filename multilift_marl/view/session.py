@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.config.schema import Config
+from multilift_marl.control.policy import Policy
 from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.evaluation.rollout import Policy
 
 _MOST_STEPS = 20  # at once: a machine that is too slow falls behind in place of choking
 PUSH_SECONDS = 0.5

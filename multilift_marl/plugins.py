@@ -1,0 +1,182 @@
+"""Code of one's own, without a fork: modules named by `import`, entry points of packages, classes by module:Class."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from multilift_marl.errors import ConfigError, nearest
+
+_PACKAGE = str(Path(__file__).parent)
+GROUP = "multilift_marl.tasks"  # entry points of installed packages
+_imported: dict[str, ModuleType] = {}  # by the last part of their name
+
+
+def import_module(reference: str, key: str = "import") -> tuple[ModuleType, str]:
+    """Import a module of one's own.
+
+    A module of the current folder goes before one that is installed. A file is imported under its own name, that of a
+    package's file begins with the package's; it can import what lies beside it. A file that is missing, because a run
+    has moved to another machine, say, stands for a module of the same name that was imported before.
+
+    Args:
+        reference: a module's name, or the path of its .py file or of a package's folder.
+        key: of the configuration, for messages.
+
+    Returns:
+        The module, and the reference by which it is found from any folder: a path, or the name of an installed module.
+
+    Raises:
+        ConfigError: it is missing, fails, or has the name of another module.
+    """
+    path, is_path = _find_file(reference), reference.endswith(".py") or "/" in reference
+    if path is None and is_path:
+        return _stand_in(reference, key)
+    name = reference if path is None else _module_name(path)[1]
+    try:
+        module = importlib.import_module(name) if path is None else _import_file(path)
+    except (Exception, SystemExit) as error:  # a user's code may raise anything
+        absent = isinstance(error, ModuleNotFoundError) and error.name and f"{name}.".startswith(f"{error.name}.")
+        if absent and path is None:
+            raise ConfigError(
+                f"{key}={reference}: there is no such module, neither in this folder nor installed; give the path of "
+                "its .py file"
+            ) from error
+        raise ConfigError(f"{key}={reference} cannot be imported: {describe_error(error)}") from error
+    if path is not None and not _is_from(module, path):
+        raise ConfigError(
+            f"{key}={reference} has the name of another module, {getattr(module, '__file__', None) or name}; rename it"
+        )
+    _imported[name.rpartition(".")[2]] = module
+    return module, reference if path is None else str(path)
+
+
+def import_modules(references: Any) -> Any:
+    """Import modules of one's own; return their references for a configuration, see `import_module`, each once.
+
+    What is neither a name nor a list of names is returned as it is, for the configuration to refuse.
+    """
+    names = (references,) if isinstance(references, str) else () if references is None else references
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        return references
+    found = [import_module(name) for name in names]
+    return tuple({module.__name__: reference for module, reference in found}.values())
+
+
+def find_callable(reference: str, key: str) -> Callable[..., Any]:
+    """Return what module:name refers to, a class or a function; `key` is for messages.
+
+    Raises:
+        ConfigError: see `import_module`; or the module holds no such class.
+    """
+    place, _, name = reference.rpartition(":")
+    if not place or not name:
+        raise ConfigError(f"{key}={reference} is not of the form module:Class, such as my_policies:Hold")
+    module, _ = import_module(place, key)
+    found = getattr(module, name, None)
+    if not callable(found):
+        known = [each for each, value in vars(module).items() if isinstance(value, type)]
+        raise ConfigError(f"{key}={reference}: {place} holds no class '{name}'{nearest(name, known)}")
+    return found
+
+
+@cache
+def load_entry_points() -> dict[str, str]:
+    """Load the entry points of the group `multilift_marl.tasks`: tasks, or modules that register what they bring.
+
+    Returns:
+        Why some could not be loaded, by name; those are warned of, too.
+    """
+    failures = {}
+    for point in entry_points(group=GROUP):
+        try:
+            _register(point.load())
+        except (Exception, SystemExit) as error:  # a broken package must not keep others from working
+            failures[point.name] = f"{_origin(point)} cannot be loaded: {describe_error(error)}"
+            warnings.warn(failures[point.name], stacklevel=2)
+    return failures
+
+
+def describe_error(error: BaseException) -> str:
+    """Return in a phrase what a user's code raised, and where."""
+    if isinstance(error, SyntaxError):
+        file, line, text = error.filename, error.lineno, error.msg
+    else:
+        frames = traceback.extract_tb(error.__traceback__)
+        theirs = [frame for frame in frames if not frame.filename.startswith((_PACKAGE, "<"))]
+        last = (theirs or frames)[-1]
+        file, line, text = last.filename, last.lineno, " ".join(str(error).split())
+    return f"{type(error).__name__} in {Path(file or '?').name}, line {line}{f' ({text})' if text else ''}"
+
+
+def _register(found: Any) -> None:
+    from multilift_marl.tasks import register_task  # which imports this module's users
+
+    if not isinstance(found, ModuleType):
+        register_task(found)
+
+
+def _origin(point: EntryPoint) -> str:
+    package = point.dist.name if point.dist is not None else "an installed package"
+    return f"the task '{point.name}' of {package} ({point.value})"
+
+
+def _find_file(reference: str) -> Path | None:
+    """Return the file of a module in the current folder or by path; None if there is none."""
+    if reference.endswith(".py") or "/" in reference:
+        path = Path(os.path.abspath(Path(reference).expanduser()))
+        path = path / "__init__.py" if path.is_dir() else path
+        return path if path.is_file() else None
+    base = Path.cwd().joinpath(*reference.split("."))
+    for path in (base / "__init__.py", base.parent / f"{base.name}.py"):
+        if path.is_file() and _module_name(path)[1] == reference:
+            return path
+    return None
+
+
+def _module_name(path: Path) -> tuple[Path, str]:
+    """Return the folder from which a file is imported, and the name of its module there."""
+    folder, parts = path.parent, [] if path.stem == "__init__" else [path.stem]
+    while (folder / "__init__.py").is_file():
+        folder, parts = folder.parent, [folder.name, *parts]
+    return folder, ".".join(parts)
+
+
+def _import_file(path: Path) -> ModuleType:
+    """Import a file, whose folder goes first meanwhile, and last on Python's path from then on."""
+    folder, name = _module_name(path)
+    importlib.invalidate_caches()  # the file may be new
+    sys.path.insert(0, str(folder))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(folder))
+        if str(folder) not in sys.path:
+            sys.path.append(str(folder))
+
+
+def _is_from(module: ModuleType, path: Path) -> bool:
+    file = getattr(module, "__file__", None)
+    return file is not None and os.path.exists(file) and os.path.samefile(file, path)
+
+
+def _stand_in(reference: str, key: str) -> tuple[ModuleType, str]:
+    """Return the imported module that has the name of a missing file, see `import_module`."""
+    path = Path(reference)
+    name = path.parent.name if path.stem == "__init__" else path.stem
+    module = _imported.get(name) or sys.modules.get(name)
+    file = getattr(module, "__file__", None)
+    if module is None or file is None:
+        raise ConfigError(
+            f"{key}={reference} is missing; put the file back, or say where it is by {key}=<folder>/{path.name}"
+        )
+    return module, file
