@@ -15,10 +15,11 @@ import numpy as np
 
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.config.schema import Config
+from multilift_marl.control.policy import Policy
 from multilift_marl.control.scripted import LINEAR
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.evaluation.metrics import is_better, summarize
-from multilift_marl.evaluation.rollout import Policy, fly_episodes
+from multilift_marl.evaluation.rollout import fly_episodes
 
 _METRICS = ("success_rate", "payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")
 _BLOCK = 2**20  # episodes
