@@ -148,6 +148,54 @@ def test_wrong_values_are_named_and_quoted(key, value, complaint):
     assert re.match(rf"{re.escape(key)} {complaint}.*, but is ", message), message
 
 
+@pytest.mark.parametrize(
+    "key, value, complaint",
+    [
+        ("payload.mass", 1e-6, "must be from 0.0001 to 1e+07 kg"),
+        ("vehicle.mass", 1e-9, "must be from 0.0001 to 1e+07 kg"),
+        ("vehicle.arm", 1e-9, "must be from 0.001 to 10 m"),
+        ("vehicle.inertia", [1e-12, 1e-12, 1e-12], "must be from 1e-09 to 1e+07 kg m²"),
+        ("cable.density", [1.0, 1.0, 1.0, 1e-12], "must be from 1e-09 to 100 kg/m"),
+        ("sim.timestep", 1e-9, "must be greater than or equal to 0.00001"),
+        ("wind.velocity", [1e39, 0.0, 0.0], "must be from -60 to 60 m/s"),
+        ("randomization.payload_force", 1e300, "must be from 0 to 1e+06 N"),
+        ("control.max_yaw", 1e18, "must be from 0 to 3.14159 rad"),
+        ("control.max_velocity", 1e4, "must be from 0 to 50 m/s"),
+        ("control.max_acceleration", 1e4, "must be from 0 to 1000 m/s²"),
+        ("control.max_tilt_rate", 1e4, "must be from 0 to 100 rad/s"),
+        ("control.max_offset", 1e4, "must be from 0 to 100 m"),
+        ("reward.position", 1e300, "must be from -1e+06 to 1e+06"),
+    ],
+)
+def test_numbers_that_no_flight_can_have_are_named_with_their_bounds_and_unit(key, value, complaint):
+    message = refuse_values(**{key: value})
+    assert message.startswith(f"{key} {complaint}, but is "), message
+
+
+@pytest.mark.parametrize(
+    "overrides, culprit, cure",
+    [
+        ({"vehicle.mass": 0.005}, "vehicle.rotor_thrust_max", "raise the mass"),
+        ({"vehicle.drag": [200.0, 0.0, 0.0]}, "vehicle.drag", "lower the drag"),
+        ({"vehicle.inertia": [1e-6, 1e-6, 1e-6]}, "vehicle.inertia", "raise vehicle.inertia"),
+        ({"vehicle.thrust_coefficient": 1e-12}, "vehicle.rotor_inertia", "raise vehicle.thrust_coefficient"),
+        ({"wind.roll_moment": 50.0}, "wind.roll_moment", "lower them"),
+        ({"wind.velocity": [40.0, 0, 0], "wind.gust": [40.0, 0, 0]}, "wind.gust", "lower them"),
+        ({"randomization.payload_force": 5e3}, "randomization.payload_force", "lower it or raise payload.mass"),
+        ({"payload.mass": 4e-4, "randomization.payload_force": 0.0}, "payload.drag_area", "raise payload.mass"),
+        ({"payload.inertia": [1e-6] * 3}, "payload", "raise payload.inertia"),
+        ({"cable.stiffness": 10.0}, "cable.stiffness", "raise cable.stiffness"),
+        ({"cable.length": 0.01}, "cable.length", "raise cable.length"),
+        ({"cable.length": 1.0, "randomization.cable_length": 0.99}, "randomization.cable_length", "lower"),
+        ({"cable.model": "chain", "cable.density": 1e-9}, "cable.density", "lower cable.segments"),
+        ({"control.attitude_frequency": 200.0}, "control.attitude_frequency", "raise sim.control_hz"),
+    ],
+)
+def test_what_the_time_step_cannot_follow_is_refused(overrides, culprit, cure):
+    message = refuse_system(4, **overrides)
+    assert culprit in message and cure in message, message
+
+
 @pytest.mark.parametrize("value", ["much", True, math.nan])
 def test_wrong_weight_names_its_reward_term(value):
     assert "reward.position must be a" in refuse_values(reward__position=value)

@@ -6,7 +6,7 @@ from math import pi
 
 import numpy as np
 import pytest
-from conftest import floats, make, make_system, with_vehicle
+from conftest import floats, make, make_system, refuse_system, with_vehicle
 
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.formation import Reference, smooth, start_reference, wrap
@@ -80,6 +80,35 @@ def test_yaw_takes_the_short_way(command, expected):
 )
 def test_wrap(angle, expected):
     assert wrap(angle) == pytest.approx(expected)
+
+
+@pytest.mark.timeout(60, method="thread")  # of a loop that never ends
+@pytest.mark.parametrize("angle", [1e18, -1e18, 1e300])
+def test_wrap_of_any_angle_ends_within_pi(angle):
+    assert abs(wrap(angle)) <= pi
+
+
+def test_wrap_of_less_than_a_turn_too_much_is_exact():
+    """Trained policies fly on: within ± 3π every bit is that of a full turn added once, or of the angle itself."""
+    for angle in np.random.default_rng(0).uniform(-3 * pi, 3 * pi, 1000).tolist():
+        once = angle - 2 * pi if angle > pi else angle + 2 * pi if angle <= -pi else angle
+        assert wrap(angle) == once
+
+
+@pytest.mark.parametrize("frequency", [62.5, 1e-2])
+def test_the_fastest_and_the_slowest_filter_stay_smooth(frequency):
+    """A quarter of the control rate is the fastest that the configuration takes; from 130 rad/s on it would diverge."""
+    history = follow([0.2, -0.1, 0.1], 2.0, yaw=0.8, frequency=frequency)
+    assert np.abs(history.position[:, 0]).max() <= 0.2 * 1.02
+    assert np.abs(history.yaw).max() <= 0.8 * 1.02
+
+
+@pytest.mark.parametrize("rate", [50.0, 250.0])
+def test_a_filter_too_fast_for_the_control_rate_is_refused(rate):
+    rates = {"sim.control_hz": rate, "env.policy_hz": 50.0, "control.attitude_frequency": 10.0}
+    make_system(1, **rates, **{"control.reference_frequency": rate / 4})
+    message = refuse_system(1, **rates, **{"control.reference_frequency": 1.01 * rate / 4})
+    assert message.startswith("control.reference_frequency=") and "raise sim.control_hz" in message
 
 
 # Flight

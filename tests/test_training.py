@@ -165,6 +165,14 @@ def test_normalizer_equals_the_statistics_of_all_batches():
     torch.testing.assert_close(1 / normalizer.scale, everything.std(0, correction=0))
 
 
+def test_value_norm_keeps_999_thousandths_of_older_returns(tmp_path):
+    """A batch of zeros, then one of ones, have the mean (1 - β)/(1 - β²) = 1/(1 + β)."""
+    value_norm = make_trainer(tmp_path).learner.critic.value_norm
+    for returns in (torch.zeros(8, 1), torch.ones(8, 1)):
+        value_norm.update(returns)
+    torch.testing.assert_close(value_norm.denormalize(torch.zeros(1, 1)), torch.tensor([[1 / 1.999]]))
+
+
 def test_log_drops_rows_after_the_checkpoint(tmp_path):
     log = RunLog(tmp_path)
     for iteration in range(1, 6):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from functools import cached_property
+from math import pi
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, create_model
 
 from multilift_marl.config.files import pin_files, pin_vehicles
 from multilift_marl.config.values import (
+    Between,
     Delays,
     Drag,
     Float,
@@ -35,18 +37,26 @@ class EnvConfig(Section):
     """Size and timing of the environment."""
 
     num_drones: Int = Field(4, ge=1, le=64, description="drones in a team")
-    num_envs: Int = Field(128, ge=1, le=100_000, description="environments stepped together")
-    num_threads: Int = Field(0, ge=0, le=1024, description="threads that step them; 0: one for each CPU")
-    episode_seconds: Float = Field(8.0, gt=0, le=1e6, description="[s] time limit of an episode")
-    policy_hz: Float = Field(50.0, gt=0, description="[Hz] rate of actions and observations")
+    num_envs: Annotated[Int, Between(1, 1e5)] = Field(128, ge=1, description="environments stepped together")
+    num_threads: Annotated[Int, Between(0, 1024)] = Field(
+        0, ge=0, description="threads that step them; 0: one for each CPU"
+    )
+    episode_seconds: Annotated[Float, Between(0, 1e6, "s")] = Field(
+        8.0, gt=0, description="[s] time limit of an episode"
+    )
+    policy_hz: Annotated[Float, Between(1, 1e5, "Hz")] = Field(
+        50.0, gt=0, description="[Hz] rate of actions and observations"
+    )
     history: Int = Field(1, ge=1, le=50, description="steps that an observation holds, the newest first")
 
 
 class SimConfig(Section):
     """Time steps of physics and control."""
 
-    timestep: Float = Field(0.004, gt=0, le=0.02, description="[s] physics step")
-    control_hz: Float = Field(250.0, gt=0, description="[Hz] rate of the drones' controllers")
+    timestep: Float = Field(0.004, ge=1e-5, le=0.02, description="[s] physics step")
+    control_hz: Annotated[Float, Between(1, 1e5, "Hz")] = Field(
+        250.0, gt=0, description="[Hz] rate of the drones' controllers"
+    )
 
 
 class VehicleConfig(Section):
@@ -55,27 +65,47 @@ class VehicleConfig(Section):
     preset: Annotated[str | tuple[str, ...], AfterValidator(pin_vehicles)] = Field(
         "falcon", description="falcon, crazyflie, crazyflie_id, hummingbird, iris, or one's own: a name or a YAML file"
     )
-    mass: PerDrone | None = Field(None, description="[kg] of the whole drone")
-    inertia: Moments | tuple[Moments, ...] | None = Field(None, description="[kg m²] principal moments")
-    arm: PerDrone | None = Field(None, description="[m] from the centre of mass to a rotor axis")
-    rotor_azimuth: FourPerDrone | None = Field(
+    mass: Annotated[PerDrone | None, Between(1e-4, 1e7, "kg")] = Field(None, description="[kg] of the whole drone")
+    inertia: Annotated[Moments | tuple[Moments, ...] | None, Between(1e-9, 1e7, "kg m²")] = Field(
+        None, description="[kg m²] principal moments"
+    )
+    arm: Annotated[PerDrone | None, Between(1e-3, 10, "m")] = Field(
+        None, description="[m] from the centre of mass to a rotor axis"
+    )
+    rotor_azimuth: Annotated[FourPerDrone | None, Between(-360, 360, "deg")] = Field(
         None, description="[deg] directions of the arms, counter-clockwise from body x"
     )
     rotor_spin: FourPerDrone | None = Field(
         None, description="[-] 1 or -1, sign of each rotor's reaction torque about body z"
     )
-    thrust_coefficient: PerDrone | None = Field(None, description="[N s²] b in thrust = b · speed²")
-    torque_ratio: PerDrone | None = Field(None, description="[m] reaction torque over thrust")
-    rotor_time_constant_up: PerDrone | None = Field(None, description="[s] lag of a rising rotor speed")
-    rotor_time_constant_down: PerDrone | None = Field(None, description="[s] lag of a falling rotor speed")
-    rotor_speed_min: NotNegativePerDrone | None = Field(None, description="[rad/s] idle speed")
-    rotor_thrust_max: PerDrone | None = Field(None, description="[N] largest thrust of one rotor")
-    drag: Drag | tuple[Drag, ...] | None = Field(None, description="[kg/s] linear drag along the body axes")
-    rotor_radius: PerDrone | None = Field(None, description="[m] for wash and ground effect")
-    rolling_moment: NotNegativePerDrone | None = Field(
+    thrust_coefficient: Annotated[PerDrone | None, Between(1e-12, 1, "N s²")] = Field(
+        None, description="[N s²] b in thrust = b · speed²"
+    )
+    torque_ratio: Annotated[PerDrone | None, Between(1e-12, 10, "m")] = Field(
+        None, description="[m] reaction torque over thrust"
+    )
+    rotor_time_constant_up: Annotated[PerDrone | None, Between(1e-4, 10, "s")] = Field(
+        None, description="[s] lag of a rising rotor speed"
+    )
+    rotor_time_constant_down: Annotated[PerDrone | None, Between(1e-4, 10, "s")] = Field(
+        None, description="[s] lag of a falling rotor speed"
+    )
+    rotor_speed_min: Annotated[NotNegativePerDrone | None, Between(0, 1e6, "rad/s")] = Field(
+        None, description="[rad/s] idle speed"
+    )
+    rotor_thrust_max: Annotated[PerDrone | None, Between(1e-4, 1e9, "N")] = Field(
+        None, description="[N] largest thrust of one rotor"
+    )
+    drag: Annotated[Drag | tuple[Drag, ...] | None, Between(0, 1e4, "kg/s")] = Field(
+        None, description="[kg/s] linear drag along the body axes"
+    )
+    rotor_radius: Annotated[PerDrone | None, Between(1e-4, 10, "m")] = Field(
+        None, description="[m] for wash and ground effect"
+    )
+    rolling_moment: Annotated[NotNegativePerDrone | None, Between(0, 1, "kg m")] = Field(
         None, description="[kg m] moment of a rotor over its speed and that of the air across it"
     )
-    rotor_inertia: NotNegativePerDrone | None = Field(
+    rotor_inertia: Annotated[NotNegativePerDrone | None, Between(0, 1, "kg m²")] = Field(
         None, description="[kg m²] of one rotor about its axis; 0: no spin-up and no precession torque"
     )
 
@@ -87,21 +117,25 @@ class PayloadConfig(Section):
         "box", description="box, upright cylinder, mesh, or point: a mass without extent"
     )
     mesh: str | None = Field(None, description="path of an .obj or .stl file, a closed surface, for shape mesh")
-    mass: Float | None = Field(None, gt=0, description="[kg] None: 0.35 kg for each falcon, others by spare thrust")
-    size: tuple[Positive, Positive, Positive] | None = Field(
+    mass: Annotated[Float | None, Between(1e-4, 1e7, "kg")] = Field(
+        None, gt=0, description="[kg] None: 0.35 kg for each falcon, others by spare thrust"
+    )
+    size: Annotated[tuple[Positive, Positive, Positive] | None, Between(1e-3, 100, "m")] = Field(
         None,
         description="[m] edges of the box, or diameter twice and height of the cylinder; mesh: scaled to; None: fits",
     )
-    inertia: tuple[Positive, Positive, Positive] | None = Field(
+    inertia: Annotated[tuple[Positive, Positive, Positive] | None, Between(1e-9, 1e7, "kg m²")] = Field(
         None, description="[kg m²] principal moments about the centre of mass; None: of a uniform body"
     )
-    center_of_mass: Vector | None = Field(
+    center_of_mass: Annotated[Vector | None, Between(-100, 100, "m")] = Field(
         None, description="[m] of the centre of mass from the geometric centre; None: of a uniform body"
     )
-    anchors: tuple[Vector, ...] | None = Field(
+    anchors: Annotated[tuple[Vector, ...] | None, Between(-100, 100, "m")] = Field(
         None, description="[m] attachment of each cable from the geometric centre; None: the standard rig's"
     )
-    drag_area: Float = Field(0.09, ge=0, description="[m²] C_d A of the payload (cube C_d 1.05 on its smaller faces)")
+    drag_area: Annotated[Float, Between(0, 1000, "m²")] = Field(
+        0.09, ge=0, description="[m²] C_d A of the payload (cube C_d 1.05 on its smaller faces)"
+    )
 
 
 class CableConfig(Section):
@@ -110,17 +144,23 @@ class CableConfig(Section):
     model: Literal["massless", "chain"] = Field(
         "massless", description="massless: pull-only Kelvin-Voigt element; chain: masses, springs and dampers"
     )
-    length: PerDrone | None = Field(None, description="[m] natural length; None: 1 m, more if a point load needs it")
-    stiffness: PerDrone = Field(1e5, description="[N/m] of the whole cable")
-    damping: PerDrone = Field(1e3, description="[N s/m] of the whole cable")
-    breaking_load: PerDrone | None = Field(None, description="[N] tension that breaks a cable; None: none does")
+    length: Annotated[PerDrone | None, Between(1e-3, 1000, "m")] = Field(
+        None, description="[m] natural length; None: 1 m, more if a point load needs it"
+    )
+    stiffness: Annotated[PerDrone, Between(0.01, 1e9, "N/m")] = Field(1e5, description="[N/m] of the whole cable")
+    damping: Annotated[PerDrone, Between(1e-9, 1e9, "N s/m")] = Field(1e3, description="[N s/m] of the whole cable")
+    breaking_load: Annotated[PerDrone | None, Between(1e-3, 1e9, "N")] = Field(
+        None, description="[N] tension that breaks a cable; None: none does"
+    )
     segments: Links | tuple[Links, ...] = Field(10, description="links of a chain")
-    density: PerDrone = Field(0.01, description="[kg/m] of a chain")
-    bending_stiffness: Float = Field(0.0, ge=0, description="[N m/rad] between the links of a chain")
-    bending_damping: Float | None = Field(
+    density: Annotated[PerDrone, Between(1e-9, 100, "kg/m")] = Field(0.01, description="[kg/m] of a chain")
+    bending_stiffness: Annotated[Float, Between(0, 1000, "N m/rad")] = Field(
+        0.0, ge=0, description="[N m/rad] between the links of a chain"
+    )
+    bending_damping: Annotated[Float | None, Between(0, 1000, "N m s/rad")] = Field(
         None, ge=0, description="[N m s/rad] between the links of a chain; None: 90/s × mass of a node × link²"
     )
-    hook: VectorPerDrone = Field(
+    hook: Annotated[VectorPerDrone, Between(-10, 10, "m")] = Field(
         (0.0, 0.0, 0.0), description="[m] where the cable is tied to its drone, from its centre of mass, body frame"
     )
     angle: Float = Field(30.0, ge=0, lt=80, description="[deg] cables from the vertical in the resting formation")
@@ -132,31 +172,49 @@ class ControlConfig(Section):
     action: Literal["reference", "velocity", "acceleration", "acc_rates", "ctbr", "rotor"] = Field(
         "reference", description="what an action means (docs/control.md)"
     )
-    max_offset: Float = Field(0.5, gt=0, description="[m] slot offset of a full action, along each axis")
-    max_yaw: Float = Field(0.5, gt=0, description="[rad] yaw offset of a full action")
-    max_velocity: Float = Field(1.0, gt=0, description="[m/s] of a full action of `velocity`, along each axis")
-    max_acceleration: Float = Field(3.0, gt=0, description="[m/s²] of a full action of `acceleration`, `acc_rates`")
-    max_tilt_rate: Float = Field(4.0, gt=0, description="[rad/s] roll, pitch of a full action of `acc_rates`, `ctbr`")
-    max_yaw_rate: Float = Field(1.5, gt=0, description="[rad/s] of a full action of `velocity`, `acceleration`, `ctbr`")
-    reference_frequency: Float = Field(6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference")
-    reference_speed: Float = Field(1.0, gt=0, description="[m/s] speed limit of the smoothed reference")
-    position_frequency: Float | None = Field(
+    max_offset: Annotated[Float, Between(0, 100, "m")] = Field(
+        0.5, gt=0, description="[m] slot offset of a full action, along each axis"
+    )
+    max_yaw: Annotated[Float, Between(0, pi, "rad")] = Field(0.5, gt=0, description="[rad] yaw offset of a full action")
+    max_velocity: Annotated[Float, Between(0, 50, "m/s")] = Field(
+        1.0, gt=0, description="[m/s] of a full action of `velocity`, along each axis"
+    )
+    max_acceleration: Annotated[Float, Between(0, 1000, "m/s²")] = Field(
+        3.0, gt=0, description="[m/s²] of a full action of `acceleration`, `acc_rates`"
+    )
+    max_tilt_rate: Annotated[Float, Between(0, 100, "rad/s")] = Field(
+        4.0, gt=0, description="[rad/s] roll, pitch of a full action of `acc_rates`, `ctbr`"
+    )
+    max_yaw_rate: Annotated[Float, Between(0, 100, "rad/s")] = Field(
+        1.5, gt=0, description="[rad/s] of a full action of `velocity`, `acceleration`, `ctbr`"
+    )
+    reference_frequency: Annotated[Float, Between(0.01, 1e4, "rad/s")] = Field(
+        6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference"
+    )
+    reference_speed: Annotated[Float, Between(1e-3, 50, "m/s")] = Field(
+        1.0, gt=0, description="[m/s] speed limit of the smoothed reference"
+    )
+    position_frequency: Annotated[Float | None, Between(0.01, 1000, "rad/s")] = Field(
         4.0, gt=0, description="[rad/s] of the position loop; at most 1/5 of attitude's; None: that"
     )
-    position_damping: Float = Field(1.0, gt=0, description="[-] its damping ratio")
-    attitude_frequency: Float | None = Field(
+    position_damping: Annotated[Float, Between(0.01, 100)] = Field(1.0, gt=0, description="[-] its damping ratio")
+    attitude_frequency: Annotated[Float | None, Between(0.01, 1e4, "rad/s")] = Field(
         20.0, gt=0, description="[rad/s] of roll and pitch; at most 0.7/motor lag; None: that"
     )
-    attitude_damping: Float = Field(0.8, gt=0, description="[-] its damping ratio")
+    attitude_damping: Annotated[Float, Between(0.01, 100)] = Field(0.8, gt=0, description="[-] its damping ratio")
     drag_feedforward: bool = Field(False, description="feed the drones' nominal drag in still air forward")
-    yaw_frequency: Float = Field(8.0, gt=0, description="[rad/s] natural frequency of yaw")
+    yaw_frequency: Annotated[Float, Between(0.01, 1e4, "rad/s")] = Field(
+        8.0, gt=0, description="[rad/s] natural frequency of yaw"
+    )
     disturbance: Literal["none", "integral", "indi"] = Field(
         "none", description="rejection of unknown forces on a drone (docs/control.md)"
     )
-    disturbance_frequency: Float = Field(
+    disturbance_frequency: Annotated[Float, Between(0.01, 1000, "rad/s")] = Field(
         3.0, gt=0, description="[rad/s] bandwidth of that rejection; less where the load asks for it (docs/control.md)"
     )
-    disturbance_limit: Float = Field(0.5, gt=0, description="[-] largest force rejected, in weights of the drone")
+    disturbance_limit: Annotated[Float, Between(1e-3, 100)] = Field(
+        0.5, gt=0, description="[-] largest force rejected, in weights of the drone"
+    )
 
 
 class RandomizationConfig(Section):
@@ -164,20 +222,28 @@ class RandomizationConfig(Section):
 
     payload_mass: Share = Field(0.0, description="[-] mass and inertia scaled by 1 ± this, uniform")
     payload_inertia: Share = Field(0.0, description="[-] inertia, beside that, scaled by 1 ± this, uniform")
-    payload_center_of_mass: tuple[NotNegative, NotNegative, NotNegative] = Field(
+    payload_center_of_mass: Annotated[tuple[NotNegative, NotNegative, NotNegative], Between(0, 10, "m")] = Field(
         (0.0, 0.0, 0.0), description="[m] moved by ± this along each axis, uniform"
     )
     payload_drag: Share = Field(0.0, description="[-] drag of the payload scaled by 1 ± this, uniform")
-    payload_force: Float = Field(0.0, ge=0, description="[N] constant horizontal force, magnitude uniform up to this")
+    payload_force: Annotated[Float, Between(0, 1e6, "N")] = Field(
+        0.0, ge=0, description="[N] constant horizontal force, magnitude uniform up to this"
+    )
     cable_length: Share = Field(0.0, description="[-] length of each cable scaled by 1 ± this, uniform")
     cable_stiffness: Share = Field(0.0, description="[-] stiffness of each cable, likewise")
     vehicle_mass: Share = Field(0.0, description="[-] mass and inertia of each drone, likewise")
     vehicle_thrust_coefficient: Share = Field(0.0, description="[-] of each drone's rotors, likewise")
     vehicle_rotor_time_constant: Share = Field(0.0, description="[-] of each drone's rotors, up and down, likewise")
     vehicle_drag: Share = Field(0.0, description="[-] drag of each drone, likewise")
-    wind: Float = Field(0.0, ge=0, description="[m/s] horizontal mean wind, beside wind.velocity, uniform up to this")
-    observation_noise: Level = Field(0.0, description="none, standard or a factor on it: white noise, each policy step")
-    observation_bias: Level = Field(0.0, description="none, standard or a factor on it: constant in an episode")
+    wind: Annotated[Float, Between(0, 60, "m/s")] = Field(
+        0.0, ge=0, description="[m/s] horizontal mean wind, beside wind.velocity, uniform up to this"
+    )
+    observation_noise: Annotated[Level, Between(0, 100)] = Field(
+        0.0, description="none, standard or a factor on it: white noise, each policy step"
+    )
+    observation_bias: Annotated[Level, Between(0, 100)] = Field(
+        0.0, description="none, standard or a factor on it: constant in an episode"
+    )
     observation_delay: Delays = Field((0, 0), description="[policy steps] a number, or the range of a uniform draw")
     action_delay: Delays = Field((0, 0), description="[policy steps] a number, or the range of a uniform draw")
 
@@ -185,15 +251,25 @@ class RandomizationConfig(Section):
 class WindConfig(Section):
     """The air (docs/air.md)."""
 
-    velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s] mean wind in the world frame")
+    velocity: Annotated[Vector, Between(-60, 60, "m/s")] = Field(
+        (0.0, 0.0, 0.0), description="[m/s] mean wind in the world frame"
+    )
     turbulence: bool = Field(False, description="Dryden turbulence of MIL-F-8785C, as strong as the mean wind")
-    gust: Vector = Field((0.0, 0.0, 0.0), description='[m/s] amplitude of a "1 - cosine" gust in the world frame')
-    gust_start: Float = Field(2.0, ge=0, description="[s] when the gust begins, from the start of the episode")
-    gust_rise: Float = Field(0.5, gt=0, description="[s] in which it rises, and falls")
-    gust_hold: Float | None = Field(1.0, ge=0, description="[s] that it lasts in between; None: for good")
+    gust: Annotated[Vector, Between(-60, 60, "m/s")] = Field(
+        (0.0, 0.0, 0.0), description='[m/s] amplitude of a "1 - cosine" gust in the world frame'
+    )
+    gust_start: Annotated[Float, Between(0, 1e6, "s")] = Field(
+        2.0, ge=0, description="[s] when the gust begins, from the start of the episode"
+    )
+    gust_rise: Annotated[Float, Between(1e-3, 1e6, "s")] = Field(
+        0.5, gt=0, description="[s] in which it rises, and falls"
+    )
+    gust_hold: Annotated[Float | None, Between(0, 1e6, "s")] = Field(
+        1.0, ge=0, description="[s] that it lasts in between; None: for good"
+    )
     wash: bool = Field(False, description="rotor wash of each drone on the drones and the payload below it")
     ground_effect: bool = Field(False, description="more thrust near the ground (Cheeseman and Bennett 1955)")
-    roll_moment: Float = Field(
+    roll_moment: Annotated[Float, Between(-1000, 1000, "N s")] = Field(
         0.0, description="[N s] moment about body x for each m/s through the air along body y (report eqs 12-13)"
     )
 
@@ -277,7 +353,9 @@ class Config(_Imports):
     control: ControlConfig = ControlConfig()
     randomization: RandomizationConfig = RandomizationConfig()
     wind: WindConfig = WindConfig()
-    reward: dict[str, Float] = Field({}, description="weights of the task's reward terms")
+    reward: dict[str, Annotated[Float, Between(-1e6, 1e6)]] = Field(
+        {}, description="weights of the task's reward terms"
+    )
     task_options: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field({}, description="options of the task")
     train: TrainConfig = TrainConfig()
     eval: EvalConfig = EvalConfig()

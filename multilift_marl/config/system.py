@@ -9,6 +9,7 @@ import numpy as np
 
 from multilift_marl.config.feasibility import check_possible
 from multilift_marl.config.mesh import Mesh
+from multilift_marl.config.resolution import check_resolved
 from multilift_marl.config.rig import (
     check_body,
     find_mesh,
@@ -242,6 +243,7 @@ def resolve_system(config: Config) -> System:
     )
     _check_ranges(config.randomization, system)
     check_possible(system, config.randomization)
+    check_resolved(config, system)
     return system
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import no_info_after_validator_function
 
 
 def _integer(value: Any) -> Any:
@@ -60,6 +63,27 @@ def _level(value: Any) -> Any:
         return _real(value)
     except ValueError:
         raise ValueError("must be none, standard, or a factor on standard") from None
+
+
+@dataclass(frozen=True)
+class Between:
+    """Says of a number, or of all numbers in a list, that they are from `low` to `high` in `unit`; None passes."""
+
+    low: float
+    high: float
+    unit: str = ""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Check the value after all else is known to be right."""
+        return no_info_after_validator_function(self._check, handler(source))
+
+    def _check(self, value: Any) -> Any:
+        if isinstance(value, tuple):
+            for part in value:
+                self._check(part)
+        elif value is not None and not self.low <= value <= self.high:
+            raise ValueError(f"must be from {self.low:g} to {self.high:g} {self.unit}".rstrip())
+        return value
 
 
 def _range(value: Any) -> Any:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 GRAVITY = 9.81  # [m/s²]
+AIR_DENSITY = 1.225  # [kg/m³] at sea level, 15 °C (ISA)
 
 
 @dataclass(frozen=True)

@@ -291,8 +291,7 @@ def smooth_yaw(e, n, reference, frequency, dt):
 @kernel
 def wrap(angle):
     """Return the angle in (-π, π]."""
-    while angle > pi:
-        angle -= 2.0 * pi
-    while angle <= -pi:
-        angle += 2.0 * pi
-    return angle
+    angle = np.fmod(angle, 2.0 * pi)
+    if angle > pi:
+        return angle - 2.0 * pi
+    return angle + 2.0 * pi if angle <= -pi else angle

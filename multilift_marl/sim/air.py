@@ -12,9 +12,9 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import AIR_DENSITY
 from multilift_marl.math3d import column, mat, norm, put, row, scale, sub, tmul, vec
 
-AIR_DENSITY = 1.225  # [kg/m³] at sea level, 15 °C (ISA)
 SPREADING = 0.094  # [-] half-width of a round turbulent jet over the distance (Hussein, Capp and George, JFM 1994)
 GROWTH = SPREADING / sqrt(2.0 * log(2.0))  # half the velocity is where a quarter of the momentum flux is
 _REACH = 4.0  # [-] widths of a jet beyond which it is not felt

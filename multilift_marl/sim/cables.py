@@ -23,15 +23,16 @@ def limit_solref(stiffness: np.ndarray, damping: np.ndarray, tendon_invweight0: 
     It must be computed anew whenever masses change, because tendon_invweight0 does.
 
     Args:
-        stiffness: k (N,) [N/m].
-        damping: c (N,) [N s/m].
-        tendon_invweight0: (..., N) [1/kg].
+        stiffness: k (..., N) [N/m].
+        damping: c (..., N) [N s/m].
+        tendon_invweight0: (..., N) [1/kg]; each of the three may lack the axes before the last.
 
     Returns:
         (..., N, 2).
     """
     regulariser = (1 - IMPEDANCE) / IMPEDANCE * tendon_invweight0
-    return -np.stack([stiffness * regulariser * IMPEDANCE, damping * regulariser * IMPEDANCE], axis=-1)
+    law = np.broadcast_arrays(stiffness * regulariser * IMPEDANCE, damping * regulariser * IMPEDANCE)
+    return -np.stack(law, axis=-1)
 
 
 @kernel

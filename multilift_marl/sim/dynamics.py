@@ -14,8 +14,9 @@ from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.system import System
+from multilift_marl.config.vehicles import AIR_DENSITY
 from multilift_marl.math3d import add, clip, cross, mat, matrow, mul, norm, put, row, scale, sub, tmul, vec
-from multilift_marl.sim.air import AIR_DENSITY, air_moment, ground_gain, spread_wash
+from multilift_marl.sim.air import air_moment, ground_gain, spread_wash
 from multilift_marl.sim.gusts import blow
 from multilift_marl.sim.parameters import lag_shares
 from multilift_marl.sim.rows import field_offset

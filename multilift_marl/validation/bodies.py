@@ -9,8 +9,7 @@ import numpy as np
 
 from multilift_marl.config.load import load_config
 from multilift_marl.config.schema import Config
-from multilift_marl.config.vehicles import GRAVITY
-from multilift_marl.sim.air import AIR_DENSITY
+from multilift_marl.config.vehicles import AIR_DENSITY, GRAVITY
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.world import World
 from multilift_marl.validation.cables import hanging_load

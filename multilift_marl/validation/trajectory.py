@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.config.system import System
-from multilift_marl.sim.air import AIR_DENSITY
+from multilift_marl.config.vehicles import AIR_DENSITY
 from multilift_marl.sim.contact import drone_half_size
 
 RADIUS, HEIGHT = 5.0, 1.5  # [m] of the circle

@@ -1,0 +1,172 @@
+"""What time steps can follow: systems so light, stiff, fast or strong that their simulation would fail are refused.
+
+Every limit is a dimensionless number: how far something goes within a step, in units of what the step can resolve.
+Masses, moments of inertia, lengths and stiffnesses are the least that `randomization` draws, loads the largest.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from multilift_marl.config.vehicles import AIR_DENSITY, GRAVITY, Vehicle
+from multilift_marl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from multilift_marl.config.schema import Config, RandomizationConfig
+    from multilift_marl.config.system import System
+
+MAX_WIND = 60.0  # [m/s] mean wind and gusts together; bodies diverge at 100 m/s
+MAX_LOAD = 200.0  # [-] thrust over weight of a drone, hidden force over weight of the payload
+MAX_SPIN_UP = 50.0  # [rad/s] by which one physics step may change a body rate; rates diverge at 500 rad/s
+MAX_STRAIN = 0.1  # [-] of a resting cable; cables diverge at 0.2
+MAX_LIGHTNESS = 100.0  # [-] time step over the period of a chain's nodes, across their links, which substeps resolve
+MIN_LENGTH = 0.15  # [-] of a cable over the span of its drone
+_OWN_SPEED = 3.0  # [m/s] of a payload through the air, beside the wind's
+
+
+def check_resolved(config: Config, system: System) -> None:
+    """Refuse what the control step and the physics step cannot follow.
+
+    Raises:
+        ConfigError: what is too fast, and what to change.
+    """
+    ranges = config.randomization
+    _check_controller(config)
+    wind = _find_wind(config)
+    for i, vehicle in enumerate(system.vehicles):
+        try:
+            _check_drone(vehicle, ranges, wind, system)
+        except ConfigError as error:
+            raise error if len(set(system.vehicles)) == 1 else ConfigError(f"drone {i}: {error}") from None
+    _check_payload(ranges, wind, system)
+    _check_cables(ranges, system)
+
+
+def _check_controller(config: Config) -> None:
+    """Refuse filters and gains that are unstable at the rate of control."""
+    control, rate = config.control, config.sim.control_hz
+    if control.reference_frequency > rate / 4:
+        raise ConfigError(
+            f"control.reference_frequency={control.reference_frequency:g} rad/s is more than a quarter of "
+            f"sim.control_hz={rate:g}, at which its filter is no longer smooth; lower it or raise sim.control_hz"
+        )
+    for loop in ("attitude", "position"):
+        frequency, damping = getattr(control, f"{loop}_frequency"), getattr(control, f"{loop}_damping")
+        if 2 * damping * frequency > rate:
+            raise ConfigError(
+                f"control.{loop}_frequency={frequency:g} rad/s with control.{loop}_damping={damping:g} damps within "
+                f"less than one step of sim.control_hz={rate:g}; lower one of them or raise sim.control_hz"
+            )
+
+
+def _find_wind(config: Config) -> float:
+    """Return the largest speed of the air [m/s], turbulence aside; a ConfigError if it is too large."""
+    wind = float(np.linalg.norm(config.wind.velocity) + np.linalg.norm(config.wind.gust)) + config.randomization.wind
+    if wind > MAX_WIND:
+        raise ConfigError(
+            f"wind.velocity, randomization.wind and wind.gust add up to {wind:g} m/s, more than {MAX_WIND:g} m/s; "
+            "lower them"
+        )
+    return wind
+
+
+def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, system: System) -> None:
+    """Refuse a drone that its rotors or the air would throw about within a physics step."""
+    step, lightest = system.timestep, vehicle.mass * (1 - ranges.vehicle_mass)
+    strongest = vehicle.rotor_thrust_max * (1 + ranges.vehicle_thrust_coefficient)
+    inertia = np.array(vehicle.inertia) * (1 - ranges.vehicle_mass)
+    if 4 * strongest > MAX_LOAD * lightest * GRAVITY:
+        raise ConfigError(
+            f"vehicle.rotor_thrust_max={vehicle.rotor_thrust_max:g} N lifts more than {MAX_LOAD:g} × the weight of a "
+            f"drone of vehicle.mass={vehicle.mass:g} kg; lower the thrust or raise the mass"
+        )
+    drag = max(vehicle.drag) * (1 + ranges.vehicle_drag)
+    if drag * step > lightest:
+        raise ConfigError(
+            f"vehicle.drag of {max(vehicle.drag):g} kg/s stops a drone of vehicle.mass={vehicle.mass:g} kg within less "
+            f"than sim.timestep={step:g} s; lower the drag or the time step, or raise the mass"
+        )
+    arm = np.abs(vehicle.rotor_positions).sum(axis=0) / 2
+    torque = 2 * strongest * np.array([arm[1], arm[0], vehicle.torque_ratio])
+    spin_up = (torque / inertia).max() * step
+    if spin_up > MAX_SPIN_UP:
+        raise ConfigError(
+            f"its rotors turn a drone of vehicle.inertia {list(vehicle.inertia)} kg m² by {spin_up:.3g} rad/s faster "
+            f"within sim.timestep={step:g} s, more than {MAX_SPIN_UP:g} rad/s; raise vehicle.inertia, or lower "
+            "vehicle.rotor_thrust_max, vehicle.arm or vehicle.torque_ratio"
+        )
+    gyroscopic = 2 * vehicle.rotor_inertia * vehicle.rotor_speed_max / inertia.min()
+    if gyroscopic * step > 1:
+        raise ConfigError(
+            f"rotors of vehicle.rotor_inertia={vehicle.rotor_inertia:g} kg m² at {vehicle.rotor_speed_max:.3g} rad/s "
+            f"let a drone of vehicle.inertia {list(vehicle.inertia)} kg m² nutate at {gyroscopic:.3g} rad/s, faster "
+            f"than sim.timestep={step:g} s resolves; lower vehicle.rotor_inertia or raise vehicle.thrust_coefficient"
+        )
+    rolling = 4 * vehicle.rolling_moment * vehicle.rotor_speed_max + abs(system.air.roll_moment)
+    spin_up = rolling * (wind + _OWN_SPEED) / inertia.min() * step
+    if spin_up > MAX_SPIN_UP:
+        raise ConfigError(
+            f"vehicle.rolling_moment and wind.roll_moment turn a drone by {spin_up:.3g} rad/s faster within "
+            f"sim.timestep={step:g} s at {wind + _OWN_SPEED:g} m/s, more than {MAX_SPIN_UP:g} rad/s; lower them"
+        )
+
+
+def _check_payload(ranges: RandomizationConfig, wind: float, system: System) -> None:
+    """Refuse a payload that air, hidden force or cables would throw about within a physics step."""
+    step, lightest = system.timestep, system.payload_mass * (1 - ranges.payload_mass)
+    if ranges.payload_force > MAX_LOAD * lightest * GRAVITY:
+        raise ConfigError(
+            f"randomization.payload_force={ranges.payload_force:g} N is more than {MAX_LOAD:g} × the weight of the "
+            f"lightest payload, {lightest * GRAVITY:.3g} N; lower it or raise payload.mass"
+        )
+    drag = 0.5 * AIR_DENSITY * system.payload_drag_area * (1 + ranges.payload_drag)
+    if drag * (wind + _OWN_SPEED) * step > lightest:
+        raise ConfigError(
+            f"payload.drag_area={system.payload_drag_area:g} m² stops the lightest payload, {lightest:g} kg, within "
+            f"less than sim.timestep={step:g} s at {wind + _OWN_SPEED:g} m/s; lower the area, the wind or the time "
+            "step, or raise payload.mass"
+        )
+    if system.payload_shape == "point":
+        return
+    least = system.payload_inertia.min() * (1 - ranges.payload_mass) * (1 - ranges.payload_inertia)
+    reach = np.linalg.norm(system.anchors, axis=1)
+    stiffest = (1 + ranges.payload_mass) * float(reach @ np.linalg.norm(system.formation_force, axis=1))
+    swing = np.sqrt(stiffest / least)
+    if swing * step > 1:
+        raise ConfigError(
+            f"a payload whose least moment of inertia is {least:.3g} kg m² turns to and fro between its cables at "
+            f"{swing:.3g} rad/s, faster than sim.timestep={step:g} s resolves; raise payload.inertia or payload.size, "
+            "or lower sim.timestep"
+        )
+
+
+def _check_cables(ranges: RandomizationConfig, system: System) -> None:
+    """Refuse cables too soft, too short or, of chains, too light."""
+    tension = np.linalg.norm((1 + ranges.payload_mass) * system.formation_force, axis=1)
+    shortest = (1 - ranges.cable_length) * system.cable_length
+    strain = tension / ((1 - ranges.cable_stiffness) * system.cable_stiffness * shortest)
+    if np.any(strain > MAX_STRAIN):
+        i = int(np.argmax(strain))
+        raise ConfigError(
+            f"cable {i} would stretch by {100 * strain[i]:.3g} % at rest under the heaviest payload, more than "
+            f"{100 * MAX_STRAIN:g} %; raise cable.stiffness={system.cable_stiffness[i]:g} N/m or lower payload.mass"
+        )
+    least = MIN_LENGTH * np.array([vehicle.span for vehicle in system.vehicles])
+    if np.any(shortest < least):
+        i = int(np.argmin(shortest - least))
+        raise ConfigError(
+            f"cable {i} may be {shortest[i]:.3g} m long, less than {MIN_LENGTH:g} × the span of its drone, "
+            f"{system.vehicles[i].span:.3g} m; raise cable.length or lower randomization.cable_length"
+        )
+    if system.cable_model != "chain":
+        return
+    node, link = system.cable_mass / (system.cable_segments - 1), shortest / system.cable_segments
+    lightness = system.timestep * np.sqrt(tension / (node * link * shortest / system.cable_length))
+    if np.any(lightness > MAX_LIGHTNESS):
+        i = int(np.argmax(lightness))
+        raise ConfigError(
+            f"nodes of {node[i]:.3g} kg in chain {i} are too light for sim.timestep={system.timestep:g} s; raise "
+            "cable.density, or lower cable.segments or sim.timestep"
+        )
