@@ -94,15 +94,13 @@ class Trainer:
                 if "return" in values:
                     shown["return"] = f"{values['return']:.0f}"
                 last = self.finished
-                if self.iteration % self.config.eval.every == 0 or last:
+                if first or self.iteration % self.config.eval.every == 0 or last:
                     bar.set_description(f"{name}, evaluating")
                     values |= self.evaluate()
                     bar.set_description(name)
                     shown["success"] = f"{values['eval/success_rate']:.0%}"
                     shown["error"] = f"{100 * values['eval/payload_position_error_m']:.2f} cm"
                     shown["best"] = f"{values['eval/best_iteration']:.0f}"
-                    if values["eval/best_iteration"] == self.iteration:
-                        log.write_picture("flight", self._draw_best(), self.frames)
                 if last:
                     self.gain = self.evaluator.measure_gain(self.iteration)
                     values |= self.gain.values()
@@ -110,6 +108,8 @@ class Trainer:
                 self.seconds += time.perf_counter() - start
                 if first or self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
                     self.save("last")
+                if values.get("eval/best_iteration") == self.iteration:
+                    log.write_picture("flight", self._draw_best(), self.frames)
                 bar.set_postfix(shown)
                 bar.update(not first)
         finally:
