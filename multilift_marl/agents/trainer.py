@@ -131,15 +131,13 @@ class Trainer:
             if "return" in values:
                 shown["return"] = f"{values['return']:.0f}"
             last = self.iteration >= self.iterations
-            if self.iteration % self.config.eval.every == 0 or last:
+            if first or self.iteration % self.config.eval.every == 0 or last:
                 _quietly(bar.set_description, f"{name}, evaluating")
                 values |= self.evaluate()
                 _quietly(bar.set_description, name)
                 shown["success"] = f"{values['eval/success_rate']:.0%}"
                 shown["error"] = f"{100 * values['eval/payload_position_error_m']:.2f} cm"
                 shown["best"] = f"{values['eval/best_iteration']:.0f}"
-                if values["eval/best_iteration"] == self.iteration:
-                    self._attempt(lambda: log.write_picture("flight", self._draw_best(), self.frames))
             if last:
                 self.gain = self.evaluator.measure_gain(self.iteration)
                 values |= self.gain.values()
@@ -149,6 +147,8 @@ class Trainer:
                 self._best_saved = self._attempt(self._restore_best)
             if unsaved or first or self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
                 unsaved = not self._attempt(partial(self.save, "last"))
+            if values.get("eval/best_iteration") == self.iteration:
+                self._attempt(lambda: log.write_picture("flight", self._draw_best(), self.frames))
             _quietly(bar.set_postfix, shown)
             _quietly(bar.update, not first)
         if unsaved:
@@ -259,7 +259,7 @@ class Trainer:
 
     def _load(self, content: dict[str, Any]) -> None:
         environments, optimizer = content["env"], self.learner.optimizer
-        own = self._training_state()
+        own = self._content() | self._training_state()
         for key in ("loss", "rng", "returns", "iteration", "seconds"):
             check_like(content[key], own[key], key)
         if content["best_policy"] is not None:
