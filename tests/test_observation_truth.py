@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from conftest import TASKS, make, zeros
 
+from multilift_marl.control.gains import make_gains
+from multilift_marl.control.redistribution import redistributed_slots
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.tasks.observations import list_components
 
@@ -171,10 +173,17 @@ def land(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
 
 
 def loss(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
-    """See docs/loss.md."""
-    lost = m.lost.any(axis=1)
-    between = m.azimuth[m.lost.argmax(axis=1)][:, None] - m.azimuth
+    """See docs/loss.md: drones give way for 0.9 s; from 1 s on, within 3 s, they move to where they hold the payload."""
+    lost, who = m.lost.any(axis=1), m.lost.argmax(axis=1)
+    between = m.azimuth[who][:, None] - m.azimuth
+    since = (m.seconds - m.vec.task.when)[:, None, None]
+    down = np.stack([0 * between + 0.2, 0 * between, -0.2 - 0.5 * np.cos(between)], axis=-1)
+    share = np.clip((since - 1) / 3, 0, 1)
+    config, system = m.vec.config.control, m.vec.world.system
+    held = redistributed_slots(system, make_gains(config, system), True, config.max_offset)[who]
+    plan = np.where(since < 0.9, down, 0.0) + held * (3 * share**2 - 2 * share**3)
     return {
+        "planned_offset": np.where(lost[:, None, None], plan, 0.0),
         "lost": m.lost[..., None],
         "team_lost": everyone(m, lost),
         "lost_direction": np.where(lost[:, None, None], pair(between), 0.0),
