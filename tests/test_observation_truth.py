@@ -173,7 +173,7 @@ def land(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
 
 
 def loss(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
-    """See docs/loss.md: drones give way for 0.9 s; from 1 s on, within 3 s, they move to where they hold the payload."""
+    """See docs/loss.md: drones give way for 0.9 s; from 1 s on they move to where they hold the payload."""
     lost, who = m.lost.any(axis=1), m.lost.argmax(axis=1)
     between = m.azimuth[who][:, None] - m.azimuth
     since = (m.seconds - m.vec.task.when)[:, None, None]
