@@ -33,7 +33,7 @@ def check_resolved(config: Config, system: System) -> None:
         ConfigError: what is too fast, and what to change.
     """
     ranges = config.randomization
-    _check_controller(config)
+    _check_controller(config, system)
     wind = _find_wind(config)
     for i, vehicle in enumerate(system.vehicles):
         try:
@@ -44,7 +44,7 @@ def check_resolved(config: Config, system: System) -> None:
     _check_cables(ranges, system)
 
 
-def _check_controller(config: Config) -> None:
+def _check_controller(config: Config, system: System) -> None:
     """Refuse filters and gains that are unstable at the rate of control."""
     control, rate = config.control, config.sim.control_hz
     if control.reference_frequency > rate / 4:
@@ -52,8 +52,10 @@ def _check_controller(config: Config) -> None:
             f"control.reference_frequency={control.reference_frequency:g} rad/s is more than a quarter of "
             f"sim.control_hz={rate:g}, at which its filter is no longer smooth; lower it or raise sim.control_hz"
         )
-    for loop in ("attitude", "position"):
-        frequency, damping = getattr(control, f"{loop}_frequency"), getattr(control, f"{loop}_damping")
+    attitude = control.attitude_frequency or max(0.7 / vehicle.rotor_time_constant for vehicle in system.vehicles)
+    position = control.position_frequency or attitude / 5  # null: as fast as motors allow, see control/gains.py
+    for loop, frequency in (("attitude", attitude), ("position", position)):
+        damping = getattr(control, f"{loop}_damping")
         if 2 * damping * frequency > rate:
             raise ConfigError(
                 f"control.{loop}_frequency={frequency:g} rad/s with control.{loop}_damping={damping:g} damps within "
