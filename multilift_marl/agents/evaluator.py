@@ -81,8 +81,7 @@ class Evaluator:
         """Fly the best policy and the script that training of so many iterations began with."""
         learned = self._fly(self.best_policy().bind, iterations + 1)
         script = self._fly(LINEAR[self.config.train.residual], iterations + 1)
-        means = [{name: float(flown[name].mean()) for name in _METRICS} for flown in (script, learned)]
-        return Gain(*means, is_better(learned, script))
+        return Gain(_means(script), _means(learned), is_better(learned, script))
 
     def best_policy(self) -> LearnedPolicy:
         """Return the best policy so far."""
@@ -98,3 +97,8 @@ class Evaluator:
         config = self.config
         episodes, first = config.eval.episodes, block * _BLOCK
         return fly_episodes(config, make_policy, episodes, config.seed, TRAINING_EVALUATION, first=first)
+
+
+def _means(flown: dict[str, np.ndarray]) -> dict[str, float]:
+    """Return the mean of each of the metrics."""
+    return {name: float(flown[name].mean()) for name in _METRICS}

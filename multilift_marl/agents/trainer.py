@@ -93,7 +93,7 @@ class Trainer:
                 values = {} if first else self.step()
                 if "return" in values:
                     shown["return"] = f"{values['return']:.0f}"
-                last = self.finished
+                last = self.iteration >= self.iterations
                 if first or self.iteration % self.config.eval.every == 0 or last:
                     bar.set_description(f"{name}, evaluating")
                     values |= self.evaluate()
