@@ -114,7 +114,7 @@ def observed(vec, spread=1.0, **values) -> np.ndarray:
 
 @pytest.mark.parametrize("name", LINEAR)
 def test_scripts_act_on_any_batch_within_the_limits(name):
-    vec = make("gate" if name == "formation_narrow" else "track", num_envs=1)
+    vec = make({"formation_narrow": "gate", "formation_redistributed": "loss"}.get(name, "track"), num_envs=1)
     policy, observation = make_scripted(name, vec), 10 * observed(vec)
     assert policy.act(observation).shape == (5, 4, 4)
     assert policy.act(observation[0]).shape == (4, 4)

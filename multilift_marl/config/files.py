@@ -49,7 +49,7 @@ def parse_mapping(content: bytes, source: Path, expected: str) -> dict[str, Any]
     try:
         values = parse_yaml(content.decode())
     except ValueError as error:
-        raise ConfigError(f"cannot read {shorten(source)} as YAML: {reason(error)}") from None
+        raise ConfigError(f"cannot read {shorten(source, 300)} as YAML: {reason(error)}") from None
     return as_mapping(values, source, expected)
 
 

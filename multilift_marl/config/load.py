@@ -240,7 +240,7 @@ def _read(name: str | Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise ConfigError(f"no configuration file {path}: give the path of a YAML file or a shipped name") from None
     except (OSError, ValueError) as error:  # ValueError: what is no YAML, and names with a NUL
-        raise ConfigError(f"cannot read {shorten(path)} as YAML: {reason(error)}") from None
+        raise ConfigError(f"cannot read {shorten(path, 300)} as YAML: {reason(error)}") from None
     return _locate(as_mapping(values, path, "sections such as 'env:'"), path.absolute().parent)
 
 
