@@ -1,4 +1,4 @@
-"""Tasks, vehicles, rigs and policies of one's own: found by name, stored with a run, refused in one sentence."""
+"""Tasks, vehicles and policies of one's own: found by name, stored with a run, refused in one sentence."""
 
 import json
 import re
@@ -51,7 +51,6 @@ class Lean:
         self.count[mask] = 0
 """
 SHORT = ["episodes=2", "env.episode_seconds=0.2", "env.num_threads=1"]
-RECIPES = [("rigs/falcon3", "pose", "pose_falcon3"), ("rigs/crazyflie2", "recover", "recover_crazymarl")]
 
 
 @pytest.fixture
@@ -390,33 +389,3 @@ def test_exported_policies_need_no_torch(exported):
     code += f"print(m.ExportedPolicy(Path({str(exported)!r})).action_names[0])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "outward\n", done.stderr
-
-
-# A rig in another task
-
-
-@pytest.mark.parametrize(("rig", "task", "recipe"), RECIPES)
-def test_a_rig_in_another_task_is_as_in_the_recipe_for_both(rig, task, recipe):
-    both, shipped = load_config(rig, {"task": task}), load_config(recipe)
-    for section in ("env", "sim", "vehicle", "payload", "cable", "control", "wind", "randomization"):
-        assert getattr(both, section) == getattr(shipped, section), section
-
-
-def test_a_rig_in_another_task_is_the_tasks_configuration_under_the_rigs_system(write):
-    both, task, rig = load_config("rigs/auto6", {"task": "track"}), load_config("track"), load_config("rigs/auto6")
-    for section in ("train", "eval", "task_options", "reward", "randomization"):
-        assert getattr(both, section) == getattr(task, section), section
-    for section in ("vehicle", "payload", "cable"):
-        assert getattr(both, section) == getattr(rig, section), section
-    assert (both.env.num_drones, both.env.episode_seconds) == (6, task.env.episode_seconds)
-    assert (both.control.max_offset, both.control.position_frequency) == (0.6, 3.0)
-    assert load_config("rigs/auto6", {"task": "track", "control.max_offset": 0.9}).control.max_offset == 0.9
-    assert load_config("rigs/auto6", {"task": "hover"}) == rig
-    mine = write("env: {num_drones: 3}\npayload: {mass: 1.0}")
-    assert load_config(mine, {"task": "hover"}) == load_config("hover", {"env.num_drones": 3, "payload.mass": 1.0})
-
-
-def test_a_task_alone_is_its_configuration(folder, capsys):
-    assert evaluate(["policy=formation", "task=track", "baseline=none", *SHORT]) == 0
-    report = json.loads(next(folder.glob("runs/formation-track/eval/*/metrics.json")).read_text())
-    assert report["config"]["train"] == load_config("track").model_dump(mode="json")["train"]

@@ -1,0 +1,38 @@
+"""A rig in a task that is not its own: the task's configuration under the rig's system."""
+
+import json
+
+import pytest
+
+from multilift_marl.cli.evaluate import main as evaluate
+from multilift_marl.config import load_config
+
+RECIPES = [("rigs/falcon3", "pose", "pose_falcon3"), ("rigs/crazyflie2", "recover", "recover_crazymarl")]
+
+
+@pytest.mark.parametrize(("rig", "task", "recipe"), RECIPES)
+def test_a_rig_in_another_task_is_as_in_the_recipe_for_both(rig, task, recipe):
+    both, shipped = load_config(rig, {"task": task}), load_config(recipe)
+    for section in ("env", "sim", "vehicle", "payload", "cable", "control", "wind", "randomization"):
+        assert getattr(both, section) == getattr(shipped, section), section
+
+
+def test_a_rig_in_another_task_is_the_tasks_configuration_under_the_rigs_system(write):
+    both, task, rig = load_config("rigs/auto6", {"task": "track"}), load_config("track"), load_config("rigs/auto6")
+    for section in ("train", "eval", "task_options", "reward", "randomization"):
+        assert getattr(both, section) == getattr(task, section), section
+    for section in ("vehicle", "payload", "cable"):
+        assert getattr(both, section) == getattr(rig, section), section
+    assert (both.env.num_drones, both.env.episode_seconds) == (6, task.env.episode_seconds)
+    assert (both.control.max_offset, both.control.position_frequency) == (0.6, 3.0)
+    assert load_config("rigs/auto6", {"task": "track", "control.max_offset": 0.9}).control.max_offset == 0.9
+    assert load_config("rigs/auto6", {"task": "hover"}) == rig
+    mine = write("env: {num_drones: 3}\npayload: {mass: 1.0}")
+    assert load_config(mine, {"task": "hover"}) == load_config("hover", {"env.num_drones": 3, "payload.mass": 1.0})
+
+
+def test_a_task_alone_is_its_configuration(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert evaluate(["policy=formation", "task=track", "baseline=none", "episodes=2", "env.episode_seconds=0.2"]) == 0
+    report = json.loads(next(tmp_path.glob("runs/formation-track/eval/*/metrics.json")).read_text())
+    assert report["config"]["train"] == load_config("track").model_dump(mode="json")["train"]
