@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import make, same, zeros
 
+from multilift_marl.sim.saved import fingerprint
 from multilift_marl.sim.world import World
 
 
@@ -67,3 +70,13 @@ def test_an_environment_that_diverged_may_hold_anything(vec):
     other = make(num_envs=2)
     other.load_state_dict(saved)
     assert np.isnan(other.state_dict()["world.rows"][1, -1])
+
+
+@pytest.mark.parametrize("varied", [(0, 8), (8, 0)], ids=str)
+def test_a_state_fits_in_every_process(varied):
+    """The order of a set follows hashes, which differ between processes, and the order of what was added."""
+    assert str(frozenset((0, 8))) != str(frozenset((8, 0)))
+    system = make().config.system
+    expected, found = (fingerprint(replace(system, varied=frozenset(order)), 1) for order in ((0, 8), varied))
+    assert same(found, expected)
+    assert not same(fingerprint(replace(system, varied=frozenset((0,))), 1), expected)

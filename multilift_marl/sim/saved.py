@@ -24,6 +24,8 @@ def _parts(value: Any) -> Iterator[str]:
         for field in fields(value):
             yield field.name
             yield from _parts(getattr(value, field.name))
+    elif isinstance(value, set | frozenset):
+        yield from _parts(sorted(value))  # a set's own order differs from process to process
     elif isinstance(value, list | tuple) or np.ndim(value):
         yield f"{len(value)}:"
         for part in value:
