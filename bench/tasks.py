@@ -1,6 +1,6 @@
 """The core against bare MuJoCo stepping of the same model, for every task and for teams of 2 to 16 drones.
 
-    python bench/tasks.py [repeats=5] [seconds=1.0]
+    python bench/tasks.py [repeats=5] [seconds=1.0] [key=value ...]
 
 Bare stepping starts, again and again, from the states in which the core has its teams: with their contacts.
 """
@@ -17,7 +17,7 @@ from multilift_marl.config import load_config, parse_overrides
 TEAMS = (2, 4, 8, 16)
 
 
-def ratio(config: str, repeats: int, seconds: float, **overrides) -> tuple[float, float, float]:
+def ratio(config: str, repeats: int, seconds: float, overrides: dict) -> tuple[float, float, float]:
     """Return the core's ratio to bare stepping, and both times of an environment step [µs]."""
     vec = ml.make_vec(load_config(config, {"env.num_envs": 256} | overrides))
     rates = measure({"bare": bare(vec, len(vec.world.shards)), "core": core(vec)}, repeats, seconds)
@@ -31,11 +31,11 @@ def main(arguments: list[str]) -> None:
     repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
     print("| task | ratio to bare | bare [µs] | core [µs] |\n|---|---|---|---|")
     for task in ml.list_tasks():
-        found, plain, whole = ratio(task, repeats, seconds)
+        found, plain, whole = ratio(task, repeats, seconds, values)
         print(f"| {task} | {found:.2f} | {plain:.1f} | {whole:.1f} |", flush=True)
     print("\n| drones | ratio to bare | bare [µs] | core [µs] |\n|---|---|---|---|")
     for count in TEAMS:
-        found, plain, whole = ratio("hover", repeats, seconds, **{"env.num_drones": count})
+        found, plain, whole = ratio("hover", repeats, seconds, values | {"env.num_drones": count})
         print(f"| {count} | {found:.2f} | {plain:.1f} | {whole:.1f} |", flush=True)
 
 

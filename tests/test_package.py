@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 import zipfile
@@ -11,6 +12,9 @@ import pytest
 import yaml
 
 import multilift_marl as ml
+from multilift_marl.cli.evaluate import main as evaluate
+from multilift_marl.cli.export import main as export
+from multilift_marl.cli.train import main as train
 from multilift_marl.config.schema import RandomizationConfig
 from multilift_marl.errors import pip_install
 from multilift_marl.tasks import find_task
@@ -151,39 +155,66 @@ def commands():
                         yield part
 
 
-def test_commands_of_documents_run_in_order(tmp_path):
-    """Every `python …` of the documents runs, made short: trainings to one iteration, evaluations to two episodes."""
-    seen = sorted(set(commands()), key=lambda command: ("train.py" not in command, "resume" in command, command))
-    assert any("train.py config=hover" in command for command in seen)
-    short = "env.num_envs=4 train.horizon=8 train.frames=32 eval.episodes=2"
+SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 eval.episodes=2"  # a training of one iteration
+SHORTER = {  # of each script: keys that go, and what is added
+    "train.py": (re.findall(r"(\S+)=", SHORT), SHORT),
+    "evaluate.py": (["episodes"], "episodes=1 env.episode_seconds=0.4"),
+    "bench/air.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
+    "bench/bench.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
+    "bench/disturbance.py": (["rigs", "seconds"], "rigs=report4 seconds=0.05"),
+    "bench/randomization.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
+    "bench/tasks.py": (["repeats", "seconds"], "repeats=1 seconds=0.02 env.num_envs=4"),
+    "bench/training.py": (["repeats"], f"repeats=1 {SHORT} train.minibatches=2"),
+    "results/search_gains.py": (["minutes"], "minutes=0.001 env.num_envs=2 env.episode_seconds=2.0"),
+    "examples/cleanrl_ppo.py": ([], "1"),  # iteration
+    "examples/fly_exported.py": ([], "1"),
+}
+MAINS = {"train.py": train, "evaluate.py": evaluate, "multilift_marl.export": export}
+
+
+def shorter(command):
+    """Return the script of a documented command and its arguments, made short."""
+    _, script, *arguments = shlex.split(command.replace("python -m", "python"))
+    dropped, more = SHORTER.get(script, ([], ""))
+    kept = [part for part in arguments if part.split("=")[0] not in dropped or "resume" in command]
+    kept = [part.replace("=examples/", f"={ROOT}/examples/") for part in kept]
+    return script, kept + ("" if "resume" in command else more).split()
+
+
+def run(command, folder, monkeypatch):
+    """Run a documented command, in this process where it has a function: starting Python takes the longest."""
+    script, arguments = shorter(command)
+    if script in MAINS and not any(part.startswith("import=") for part in arguments):
+        monkeypatch.chdir(folder)
+        assert MAINS[script](arguments) == 0, command
+        return
+    line = [sys.executable, *([str(ROOT / script)] if script.endswith(".py") else ["-m", script]), *arguments]
+    done = subprocess.run(line, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+
+
+def of_documents():
+    """Commands that follow one another in a folder, trainings first, and those that stand alone."""
+    first, alone = [], []
+    for command in sorted(set(commands())):
+        script = shorter(command)[0]
+        if (script.endswith(".py") or script in MAINS) and script != "results/reproduce.py":  # which tests compare
+            follows = script in ("train.py", "multilift_marl.export") or "=latest" in command or "runs/" in command
+            (first if follows else alone).append(command)
+    return sorted(first, key=lambda command: ("train.py" not in command, "resume" in command, command)), alone
+
+
+def test_commands_that_train_and_what_follows_them_run(tmp_path, monkeypatch):
+    seen = of_documents()[0]
+    assert sum("train.py" in command for command in seen) > 4
+    assert any("run=latest" in command for command in seen)
     for command in seen:
-        script = command.split()[1]
-        if (script.startswith("-") and "multilift_marl.export" not in command) or script == "results/reproduce.py":
-            continue  # other module commands, such as pytest itself; what would rewrite what tests compare
-        if not script.startswith("-"):
-            command = command.replace(script, str(ROOT / script), 1)
-        command = command.replace("python", sys.executable, 1).replace("=examples/", f"={ROOT}/examples/")
-        if script == "train.py" and "resume" not in command:
-            for key in [part.split("=")[0] for part in short.split()]:  # each key is given once
-                command = re.sub(rf" {re.escape(key)}=\S+", "", command)
-            command += f" {short}"
-        if script == "evaluate.py":
-            command = re.sub(r"episodes=\d+", "episodes=2", command) + " env.episode_seconds=0.4"
-        if script.startswith("examples/"):
-            command += " 1"  # iteration
-        if script in ("bench/air.py", "bench/bench.py", "bench/randomization.py"):
-            command = re.sub(r" (repeats|seconds|env\.num_envs)=\S+", "", command)
-            command += " repeats=1 seconds=0.05 env.num_envs=4"
-        if script == "bench/training.py":
-            command = command.split(" repeats=")[0] + f" repeats=1 {short} train.minibatches=2"
-        if script == "results/search_gains.py":
-            command = re.sub(r"minutes=\d+", "minutes=0.001", command) + " env.num_envs=2 env.episode_seconds=2.0"
-        if script == "bench/tasks.py":
-            command = command.split(" repeats=")[0] + " repeats=1 seconds=0.02"
-        if script == "bench/disturbance.py":
-            command = command.split(" rigs=")[0].replace("seconds=30", "") + " rigs=report4 seconds=0.05"
-        done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+        run(command, tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("command", of_documents()[1])
+def test_commands_of_documents_run(command, tmp_path, monkeypatch):
+    run(command, tmp_path, monkeypatch)
 
 
 def test_configs_only_override_what_exists():
