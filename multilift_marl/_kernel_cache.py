@@ -27,6 +27,7 @@ from numba.core.caching import CompileResultCacheImpl, NullCache, _CacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
+from multilift_marl._files import write_whole
 from multilift_marl.errors import warn_once
 
 PACKAGE = Path(__file__).parent
@@ -140,6 +141,8 @@ class KernelCache(NumbaCache):
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return what was compiled for these types; None, and a line that says so, if it must be compiled now."""
+        if not self._enabled:
+            return None
         found = self._read(self._index_key(sig, target_context.codegen()), target_context)
         if found is None:
             warn_once("kernels", "compiling kernels of the simulation for the first time, which takes up to a minute")
@@ -163,7 +166,8 @@ class KernelCache(NumbaCache):
         key = self._index_key(sig, data.codegen)
         content = dumps((key, self._impl.reduce(data)))
         try:
-            write_whole(self._path(key), hashlib.sha256(content).digest() + content)
+            self._folder.mkdir(parents=True, exist_ok=True)  # others may have deleted it
+            write_whole(self._path(key), hashlib.sha256(content).digest() + content, flush=False)
         except OSError as error:
             reason = f"{error.strerror}; compiled anew next time"
             warn_once("kernels", f"compiled kernels cannot be kept in {self._folder}: {reason}")
@@ -181,20 +185,6 @@ def make_cache(function: Callable[..., Any]) -> KernelCache | NullCache:
 def _split(content: bytes) -> tuple[bytes, bytes]:
     size = hashlib.sha256().digest_size
     return content[:size], content[size:]
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that is there whole or not at all; other processes may write the same one."""
-    path.parent.mkdir(parents=True, exist_ok=True)  # others may have deleted it
-    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(unfinished, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(unfinished)
-        raise
 
 
 @cache

@@ -31,7 +31,7 @@ import numpy as np
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.control.scripted import SCRIPTED, fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.evaluation.metrics import bootstrap, summarize
+from multilift_marl.evaluation.metrics import bootstrap, is_gain, summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
@@ -238,24 +238,21 @@ def best_script(flight: str) -> str:
 def gain(flight: str) -> str:
     """Return what learned teams do better than the best script: success and error, paired by episode.
 
-    Of several training seeds each episode counts by its mean. Learning gains if it succeeds more often, or errs less
-    and succeeds no less often, both beyond the 95 % intervals.
+    Of several training seeds each episode counts by its mean. `is_gain` says whether learning gains.
     """
     learned = [np.load(path) for path in sorted((HERE / flight).glob("seed*.npz")) if "." not in path.stem]
     best = best_script(flight)
     if not learned or not best:
         return "-"
     script = np.load(HERE / flight / f"{best}.npz")
-    parts, intervals = [], []
+    parts, differences = [], []
     for key, unit, digits in (("success", "points", 1), ("error", "cm", 2)):
         mean = np.mean([each[key].astype(float) for each in learned], axis=0)
         difference = 100 * (mean - script[key].astype(float))
-        intervals.append(bootstrap(difference))
-        low, high = (f"{bound:+.{digits}f}" for bound in intervals[-1])
+        differences.append(difference)
+        low, high = (f"{bound:+.{digits}f}" for bound in bootstrap(difference))
         parts.append(f"{difference.mean():+.{digits}f} ({low} to {high}) {unit}")
-    (worse, better), (_, most) = intervals
-    gains = worse > 0 or (better >= 0 and most < 0)
-    return f"{', '.join(parts)}, {best}" + ("" if gains else "; **learning gains nothing**")
+    return f"{', '.join(parts)}, {best}" + ("" if is_gain(*differences) else "; **learning gains nothing**")
 
 
 def _cell(paths: list[Path], error: str) -> str:

@@ -7,6 +7,7 @@ configuration of a cable model, for both models.
 from __future__ import annotations
 
 import importlib.util
+import sys
 from dataclasses import replace
 from math import sqrt
 from pathlib import Path
@@ -16,7 +17,9 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
-from multilift_marl.config import System
+from multilift_marl import plugins, tasks
+from multilift_marl.config import System, vehicles
+from multilift_marl.config.load import CONFIGS
 from multilift_marl.control.formation import place_formation
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
@@ -25,9 +28,10 @@ from multilift_marl.tasks import find_task
 from multilift_marl.validation.cables import hover_thrust  # noqa: F401 (for the tests)
 
 TASKS = ml.list_tasks()
-NUM_DRONES = (1, 2, 3, 6)
+NUM_DRONES = (1, 2, 6)
 CABLES = {"massless": {"cable.model": "massless"}, "chain": {"cable.model": "chain", "cable.segments": 3}}  # few: fast
 GRAVITY = 9.81
+EXAMPLES = Path(__file__).parents[1] / "examples"
 TIMESTEPS = (5e-4, 1e-3, 2e-3, 4e-3)
 OFF_CENTRE = [[0.25, 0.2, 0.08], [-0.3, 0.2, 0.08], [-0.3, -0.2, 0.08], [0.25, -0.2, 0.08]]
 INFO = {"success", "failure", "diverged", "failure_cause", "reward_terms", "randomization"}
@@ -48,6 +52,22 @@ def pytest_generate_tests(metafunc):
     ):
         if name in metafunc.fixturenames and name not in own:
             metafunc.parametrize(name, values, ids=ids)
+
+
+@pytest.fixture
+def registries(tmp_path):
+    """Forget what a test registers, and imports from its folder or from the examples."""
+    known = [tasks.TASKS, vehicles.PRESETS, CONFIGS, plugins._imported]
+    before, modules, path = [dict(registry) for registry in known], set(sys.modules), list(sys.path)
+    yield
+    for registry, content in zip(known, before, strict=True):
+        registry.clear()
+        registry.update(content)
+    for name in set(sys.modules) - modules:
+        file = str(getattr(sys.modules[name], "__file__", ""))
+        if file.startswith((str(tmp_path), str(EXAMPLES))):
+            del sys.modules[name]
+    sys.path[:] = path
 
 
 @pytest.fixture(autouse=True)

@@ -16,10 +16,10 @@ MASSLESS = pytest.mark.parametrize("starts", STARTS[: len(TASKS)], indirect=True
 
 @pytest.fixture(scope="module", params=STARTS, ids="-".join)
 def starts(request):
-    """Return a batch that collects, over four resets, what ten thousand starts are like, of chains two thousand."""
+    """Return a batch that collects, over four resets, what four thousand starts are like, of chains eight hundred."""
     model, task = request.param
     hidden = {"randomization.payload_mass": 0.2, "randomization.payload_force": 1.5}
-    vec = make(task, num_envs=2500 if model == "massless" else 500, num_drones=4, **hidden, **CABLES[model])
+    vec = make(task, num_envs=1000 if model == "massless" else 200, num_drones=4, **hidden, **CABLES[model])
     kept = {name: [] for name in ("cause", "stretch", "mass", "force", "position")}
     for _ in range(4):
         observation, _ = vec.reset()

@@ -163,7 +163,7 @@ def test_a_full_disk_costs_time_alone(package, tmp_path):
     assert value == pytest.approx(1) and not kernels(package)
     first, second = warnings.splitlines(keepends=True)
     assert first == COMPILING and second.startswith("compiled kernels cannot be kept in ")
-    assert not list(package.rglob("*.part"))
+    assert not list(package.rglob("*.tmp"))
 
 
 def test_folders_of_other_sources_go_but_for_those_used_last(tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ from multilift_marl.agents.trainer import new_run
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.cli.export import main as export
 from multilift_marl.cli.train import main as train
-from multilift_marl.config import load, vehicles
+from multilift_marl.config import load
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.envs.core import MultiliftVec
@@ -54,23 +54,11 @@ SHORT = ["episodes=2", "env.episode_seconds=0.2", "env.num_threads=1"]
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Enter a folder with a user's module `mine`; afterwards, what was registered and imported is forgotten."""
-    for registry in (TASKS, vehicles.PRESETS, load.CONFIGS, plugins._imported):
-        for name in registry:  # what is there is put back, what comes is deleted
-            monkeypatch.setitem(registry, name, registry[name])
-    registries = [(registry, set(registry)) for registry in (TASKS, vehicles.PRESETS, load.CONFIGS, plugins._imported)]
-    modules = set(sys.modules)
-    monkeypatch.setattr(sys, "path", list(sys.path))
+def folder(tmp_path, monkeypatch, registries):
+    """Enter a folder with a user's module `mine`."""
     (tmp_path / "mine.py").write_text(PLUGIN)
     monkeypatch.chdir(tmp_path)
-    yield tmp_path
-    for registry, names in registries:
-        for name in set(registry) - names:
-            del registry[name]
-    for name in set(sys.modules) - modules:
-        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
-            del sys.modules[name]
+    return tmp_path
 
 
 def arguments(values):

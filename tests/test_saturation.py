@@ -31,7 +31,7 @@ def best_by_search(vehicle, thrust, torque, low, high):
 def test_roll_and_pitch_come_first_then_thrust(name):
     vehicle, rng = PRESETS[name], np.random.default_rng(3)
     inverse, high = np.ascontiguousarray(np.linalg.inv(vehicle.allocation)), vehicle.rotor_thrust_max
-    for _ in range(40):
+    for _ in range(12):
         thrust, torque = rng.uniform(0, 6) * high, rng.normal(0, 2 * high * vehicle.arm, 3)
         torque[2] *= 0.1
         share, total = best_by_search(vehicle, thrust, torque, 0.05 * high, high)

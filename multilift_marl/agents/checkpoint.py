@@ -6,14 +6,13 @@ import fcntl
 import io
 import os
 import re
-import threading
 import zipfile
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from multilift_marl._files import write_whole
 from multilift_marl.errors import CheckpointError, reason
 
 FORMAT = "multilift_marl checkpoint 1"
@@ -27,18 +26,11 @@ def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
     Raises:
         CheckpointError: it cannot be written; what was there before is still there.
     """
-    aside = path.with_name(f"{path.stem}-{os.getpid()}-{threading.get_ident()}.tmp")  # no other writer's
     data = io.BytesIO()
     torch.save({"format": FORMAT, **content}, data)
     try:
-        with open(aside, "wb") as file:
-            file.write(data.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
+        write_whole(path, data.getbuffer())
     except OSError as error:
-        with suppress(OSError):
-            aside.unlink(missing_ok=True)
         raise CheckpointError(f"cannot write {path} ({reason(error)}); make room there, or use another disk") from error
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import platform
 import subprocess
@@ -13,6 +14,7 @@ from typing import Any
 import imageio.v3 as iio
 from torch.utils.tensorboard import SummaryWriter
 
+from multilift_marl._files import write_whole
 from multilift_marl.agents.versions import package_versions
 
 _GROUPS = {  # of TensorBoard's tags; names that have none and are not here belong to the update
@@ -78,12 +80,11 @@ class RunLog:
 
     def _rewrite(self) -> None:
         self._behind = True
-        aside = self._path.with_suffix(".tmp")  # so that a full disk costs no row that is there
-        with open(aside, "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self._columns, restval="")
-            writer.writeheader()
-            writer.writerows(self._rows)
-        aside.replace(self._path)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self._columns, restval="")
+        writer.writeheader()
+        writer.writerows(self._rows)
+        write_whole(self._path, text.getvalue().encode(), flush=False)
         self._behind = False
 
 

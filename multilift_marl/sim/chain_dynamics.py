@@ -337,9 +337,8 @@ def _move(e, i, h, state, chain, nodes, motion):
         torque = add(mul(matrow(motion.rotation[i], b), row(motion.torque, b)), row(motion.bend_moment, b))
         put(motion.momentum[b], add(row(motion.momentum, b), scale(h, torque)))
         if chain.bends:
-            _note_impulse(
-                b, i, scale(h, row(motion.bend_force, b)), scale(h, row(motion.bend_moment, b)), e, chain, motion
-            )
+            force, moment = scale(h, row(motion.bend_force, b)), scale(h, row(motion.bend_moment, b))
+            _note_impulse(b, i, force, moment, e, chain, motion)
 
     for n in range(chain.segments.shape[0]):
         links, top = chain.segments[n], chain.segments[n] - 1
@@ -358,8 +357,7 @@ def _move(e, i, h, state, chain, nodes, motion):
         last = scale(-h * motion.pull[n, top], row(motion.direction[n], top))
         _push(e, i, 0, first, row(motion.ends[n], 0), chain, motion)
         _push(e, i, 1 + n, last, row(motion.ends[n], 1), chain, motion)
-        tension = max(0.0, motion.pull[n, top])
-        motion.tension[i, n] = tension
+        motion.tension[i, n] = tension = max(0.0, motion.pull[n, top])
         motion.peak[i, n] = max(motion.peak[i, n], tension)
         if tension > chain.breaking_load[n]:
             state.cable_broken[e, n] = True

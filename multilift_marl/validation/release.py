@@ -23,7 +23,7 @@ def release(fast: bool) -> Result:
     """Drones of every preset are let go at rest at their references, rotors at hover speed, in random attitudes."""
     result = Result()
     for name in PRESETS:
-        fall, lost = release_drones(name, attitudes(100 if fast else 1000))
+        fall, lost = release_drones(name, attitudes(30 if fast else 1000))
         quantity = f"drones not back within {100 * _BACK:g} cm after {_SECONDS:g} s, of {len(lost)}"
         result.rows.append(Row(f"release, {name}", quantity, 0, lost.sum(), lost.sum(), 0))
         for angle, depth in zip(_KNOWN, fall, strict=False):

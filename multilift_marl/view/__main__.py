@@ -36,7 +36,9 @@ _DEFAULTS = {"task": None, "config": None, "run": None, "policy": None, "seed": 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until interrupted; return the exit status."""
-    return run_command(_view, _USAGE, _DEFAULTS, arguments, configuration="task", names=("task", "run", "policy"))
+    return run_command(
+        _view, _USAGE, _DEFAULTS, arguments, configuration="task", names=("task", "config", "run", "policy")
+    )
 
 
 def _view(values: dict[str, Any]) -> int:
