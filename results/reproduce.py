@@ -6,7 +6,7 @@
                                                         -> results/<flight>/<team>.json, .npz; also <flight>/<team>
                                                         for one team, workers=<processes> (as many as there are CPUs)
   python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
-  python results/reproduce.py table                     the tables of README.md and docs/tasks.md
+  python results/reproduce.py table                     the tables of README.md and docs/
 
 Every number in those tables comes from these files. `judge` skips teams whose files are there already, so it can be
 stopped and started again; delete the files of what has changed.
@@ -18,7 +18,6 @@ import csv
 import json
 import multiprocessing
 import os
-import re
 import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -27,61 +26,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from flights import EPISODES, FLIGHTS, HERE, ROOT, SEED, error_metric
+from tables import write_tables
 
 from multilift_marl.config.load import build_config, load_config
-from multilift_marl.control.scripted import SCRIPTED, fitting_scripts, make_scripted
+from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.evaluation.metrics import bootstrap, is_gain, summarize
+from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
-
-HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
-EPISODES, SEED = 1000, 1000
-FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
-AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
-FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
-
-ESTIMATED = "load without sensor"  # what differs with the published figures, briefly; docs/track.md, docs/recover.md
-AUTO = "41 cm: path of 2.8 m/s², start included; MPC, no motor lag, no drag"
-CRAZYMARL = "79.7 %: motor commands, noise, pushes"
-
-
-class Flight(NamedTuple):
-    """A row of the table."""
-
-    config: str
-    overrides: dict[str, Any]
-    recipe: str
-    """Whose policies fly it."""
-    title: str
-    published: str = ""
-
-
-FLIGHTS: dict[str, Flight] = {
-    "hover": Flight("hover", {}, "hover", "hover"),
-    "hover_wind": Flight("hover_wind", {}, "hover_wind", "hover in wind of 5 m/s, noise, delay"),
-    "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
-    "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
-    "pose_falcon3": Flight("pose_falcon3", {}, "pose_falcon3", "pose, three drones, tilts to 45°"),
-    "pose_wind": Flight("pose_wind", {}, "pose_wind", "pose, tilts to 45°, in wind of 5 m/s, noise, delay"),
-    "circle_slow": Flight("track_circle", {}, "track_circle", "circle, 0.2 rad/s"),
-    "circle_fast": Flight("track_circle", {"task_options.rate": 0.4}, "track_circle", "circle, 0.4 rad/s"),
-    "track": Flight("track", {}, "track", "figure-eight, 1 m/s, 0.5 m/s²", f"3.2 cm: geometric control, {ESTIMATED}"),
-    "track_2_2": Flight("track", FASTER, "track", "figure-eight, 2 m/s, 2 m/s²", f"9.3 cm: 10 Hz planner, {ESTIMATED}"),
-    "track_2_4": Flight("track", AGILE, "track", "figure-eight, 2 m/s, 4 m/s²", f"11.7 cm: 10 Hz planner, {ESTIMATED}"),
-    "track_5_8": Flight(
-        "track", FASTEST, "track", "figure-eight, 5 m/s, 8 m/s²", f"19.7 cm: 10 Hz planner, {ESTIMATED}"
-    ),
-    "track_auto6": Flight("track_auto6", {}, "track_auto6", "figure-eight, 4.5 m/s, 4 m/s², six drones, 7 kg", AUTO),
-    "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),
-    "land": Flight("land", {}, "land", "land"),
-    "gate": Flight("gate", {}, "gate", "gate"),
-    "gate_two": Flight("gate_two", {}, "gate", "two gates"),
-    "recover": Flight("recover", {}, "recover", "recover"),
-    "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),
-    "loss": Flight("loss", {}, "loss", "loss, 4 drones"),
-    "loss_6": Flight("loss_6", {}, "loss_6", "loss, 6 drones"),
-    "loss_snap": Flight("loss_snap", {}, "loss", "loss with its cable"),
-}
 
 
 def train(recipe: str, seeds: list[int]) -> None:
@@ -184,102 +136,11 @@ def fly(job: Job) -> str:
     return f"{job.flight}, {job.team}: success {metrics['success_rate']['mean']:.1%}, {100 * error.mean():.2f} cm"
 
 
-def error_metric(flight: Flight) -> str:
-    """Return the metric by which the teams of a flight are compared."""
-    return "payload_rmse_m" if flight.config.startswith("track") else "payload_position_error_m"
-
-
 def ship(recipes: list[str]) -> None:
     """Copy the weights of seed 0 to where `ml.load_policy` finds them."""
     for recipe in recipes:
         shipped = ROOT / "multilift_marl" / "policies" / f"{recipe}.pt"
         shipped.write_bytes((HERE / recipe / "seed0" / "policy.pt").read_bytes())
-
-
-def table() -> str:
-    """Return all flights and all teams as a Markdown table: success and error, of learned ones the mean of seeds."""
-    rows = []
-    for name, flight in FLIGHTS.items():
-        scripts = [_cell([HERE / name / f"{script}.json"], error_metric(flight)) for script in SCRIPTED]
-        rows.append([flight.title, *_learned(name), gain(name), *scripts, flight.published])
-    return _markdown(["learned", "training seeds", "learned - best script", *SCRIPTED, "published"], rows)
-
-
-def summary() -> str:
-    """Return the same of the learned teams and the best script of each flight alone."""
-    rows = []
-    for name, flight in FLIGHTS.items():
-        best = best_script(name)
-        script = f"{best}: {_cell([HERE / name / f'{best}.json'], error_metric(flight))}" if best else "-"
-        difference = gain(name).replace(f", {best}", "")
-        rows.append([flight.title, *_learned(name), script, difference, flight.published])
-    return _markdown(["learned", "training seeds", "best script", "learned - best script", "published"], rows)
-
-
-def _learned(flight: str) -> tuple[str, str]:
-    """Return what learned teams did, and how many."""
-    seeds = sorted((HERE / flight).glob("seed*.json"))
-    fresh = [path for path in seeds if path.with_suffix(".npz").is_file()]
-    return _cell(seeds, error_metric(FLIGHTS[flight])), str(len(fresh or seeds))
-
-
-def _markdown(columns: list[str], rows: list[list[str]]) -> str:
-    """Return a table of which the first column has no name."""
-    head = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
-    return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
-
-
-def best_script(flight: str) -> str:
-    """Return the script with the most successes, of several the one with the least error; "" if none was flown."""
-    scripts = {name: np.load(path) for name in SCRIPTED if (path := HERE / flight / f"{name}.npz").is_file()}
-    return min(scripts, default="", key=lambda name: (-scripts[name]["success"].mean(), scripts[name]["error"].mean()))
-
-
-def gain(flight: str) -> str:
-    """Return what learned teams do better than the best script: success and error, paired by episode.
-
-    Of several training seeds each episode counts by its mean. `is_gain` says whether learning gains.
-    """
-    learned = [np.load(path) for path in sorted((HERE / flight).glob("seed*.npz")) if "." not in path.stem]
-    best = best_script(flight)
-    if not learned or not best:
-        return "-"
-    script = np.load(HERE / flight / f"{best}.npz")
-    parts, differences = [], []
-    for key, unit, digits in (("success", "points", 1), ("error", "cm", 2)):
-        mean = np.mean([each[key].astype(float) for each in learned], axis=0)
-        difference = 100 * (mean - script[key].astype(float))
-        differences.append(difference)
-        low, high = (f"{bound:+.{digits}f}" for bound in bootstrap(difference))
-        parts.append(f"{difference.mean():+.{digits}f} ({low} to {high}) {unit}")
-    return f"{', '.join(parts)}, {best}" + ("" if is_gain(*differences) else "; **learning gains nothing**")
-
-
-def _cell(paths: list[Path], error: str) -> str:
-    """Return "success %, error cm", means of these results, with the smallest and the largest where they differ.
-
-    Results without their episodes are older than today's physics, and marked by a dagger where there are no others.
-    """
-    fresh = [path for path in paths if path.with_suffix(".npz").is_file()]
-    told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in fresh or paths if path.is_file()]
-    if not told:
-        return "-"
-    parts = []
-    for metric, unit, digits in (("success_rate", "%", 1), (error, "cm", 2)):
-        values = [100 * one[metric]["mean"] for one in told]
-        least, most = (f"{value:.{digits}f}" for value in (min(values), max(values)))
-        spread = f" ({least} - {most})" if least != most else ""
-        parts.append(f"{sum(values) / len(values):.{digits}f}{spread} {unit}")
-    return ", ".join(parts) + ("" if fresh else " †")
-
-
-def write_tables() -> None:
-    """Replace what stands between the markers in the documents."""
-    for path, content in ((ROOT / "README.md", summary()), (ROOT / "docs" / "tasks.md", table())):
-        text = path.read_text(encoding="utf-8")
-        marked = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.DOTALL)
-        replaced = marked.sub(lambda found, content=content: f"{found[1]}{content}\n{found[2]}", text)
-        path.write_text(replaced, encoding="utf-8")
 
 
 def main(arguments: list[str]) -> None:

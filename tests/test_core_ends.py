@@ -39,7 +39,7 @@ def test_ends_have_one_cause(task, num_drones, cables):
     )
     vec.reset(seed=0)
     terminations = truncations = 0
-    for step in range(300):
+    for step in range(160):
         observation, reward, terminated, truncated, info = vec.step(mixed_actions(vec, step))
         assert not (terminated & truncated).any()
         assert same(info["failure"], terminated)

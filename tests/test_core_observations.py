@@ -22,7 +22,7 @@ def ensemble(request):
     """Return observations (K, D) and states (K, S) of many moments of many episodes of four drones, and the names."""
     task, model = request.param
     varied = {"task_options.path": "random"} if task == "track" else {}  # others stay at one height
-    vec = make(task, num_envs=24 if model == "massless" else 8, num_drones=4, **varied, **CABLES[model])
+    vec = make(task, num_envs=16 if model == "massless" else 5, num_drones=4, **varied, **CABLES[model])
     observation, _ = vec.reset(seed=0)
     seen, states = [observation], [vec.state()]
     for step in range(max(150, vec.max_steps)):  # all phases of an episode

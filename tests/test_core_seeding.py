@@ -50,10 +50,9 @@ def test_different_seeds_environments_episodes_and_purposes_differ(task, cables)
     assert not any(same(a, b) for a, b in zip(start, evaluation, strict=True))
 
 
-@pytest.mark.parametrize("num_threads", [1, 2])
-def test_an_environment_of_a_batch_is_replayed_alone(task, num_drones, cables, num_threads):
+def test_an_environment_of_a_batch_is_replayed_alone(task, num_drones, cables):
     short = {"env.episode_seconds": 4.0}
-    batch = make(task, num_envs=6, num_drones=num_drones, num_threads=num_threads, seed=5, **short, **cables)
+    batch = make(task, num_envs=6, num_drones=num_drones, num_threads=2, seed=5, **short, **cables)
     alone = make(task, num_envs=1, num_drones=num_drones, first_env=5, seed=5, **short, **cables)
     assert same(batch.reset()[0][5], alone.reset()[0][0])
     crowded, ends = play(batch, 300, row=5)
@@ -98,7 +97,7 @@ def test_rows_outside_the_mask_are_unchanged(task, cables):
     assert not any(same(after[e], observation[e]) for e in (1, 2))
 
 
-@pytest.mark.parametrize("threads", [(1, 1), (1, 2), (2, 1)], ids=str)
+@pytest.mark.parametrize("threads", [(1, 2), (2, 1)], ids=str)
 def test_a_saved_batch_continues_bit_for_bit(task, cables, threads):
     first, second = (make(task, num_envs=5, num_threads=count, seed=5, **wide(task), **cables) for count in threads)
     first.reset()

@@ -18,6 +18,7 @@ from multilift_marl.cli.export import main as export
 from multilift_marl.cli.train import main as train
 from multilift_marl.config.schema import RandomizationConfig
 from multilift_marl.errors import pip_install
+from multilift_marl.evaluation import plots
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.failures import CAUSES
 from multilift_marl.tasks.observations import OBSERVATION
@@ -215,6 +216,7 @@ def test_commands_that_train_and_what_follows_them_run(tmp_path, monkeypatch, re
 
 @pytest.mark.parametrize("command", of_documents()[1])
 def test_commands_of_documents_run(command, tmp_path, monkeypatch, registries):
+    monkeypatch.setattr(plots, "_save", lambda figure, path: None)  # most of the time; see test_evaluation.py
     run(command, tmp_path, monkeypatch)
 
 

@@ -1,6 +1,7 @@
 """What the documents say of teams is what the recorded results hold."""
 
 import json
+import re
 import sys
 from itertools import count
 from pathlib import Path
@@ -20,22 +21,31 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "results"))
 import reproduce  # noqa: E402
 import search_gains  # noqa: E402
+import tables  # noqa: E402
 
 
 def test_tables_are_those_of_the_results():
-    assert reproduce.summary() in (ROOT / "README.md").read_text(encoding="utf-8")
-    assert reproduce.table() in (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
+    assert tables.summary() in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert tables.table() in (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
+    told = 0
+    for document in sorted((ROOT / "docs").glob("*.md")):
+        text = document.read_text(encoding="utf-8")
+        for flights in re.findall(r"<!-- results of ([\w ]+) -->", text):
+            assert tables.details(flights.split()) in text, (document.name, flights)
+            told += 1
+    assert told > 3
 
 
 def test_tables_are_written_between_their_marks(tmp_path, monkeypatch):
     (tmp_path / "docs").mkdir()
     whole = {}
-    for document in ("README.md", "docs/tasks.md"):
+    for document in ("README.md", "docs/tasks.md", "docs/hover.md"):
         whole[document] = (ROOT / document).read_text(encoding="utf-8")
-        shorter = whole[document].replace(reproduce.table(), "old").replace(reproduce.summary(), "old")
+        shorter = whole[document].replace(tables.table(), "old").replace(tables.summary(), "old")
+        shorter = shorter.replace(tables.details(["hover"]), "old")
         assert shorter != whole[document]
         (tmp_path / document).write_text(shorter, encoding="utf-8")
-    monkeypatch.setattr(reproduce, "ROOT", tmp_path)
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
     reproduce.main(["table"])
     for document, text in whole.items():
         assert (tmp_path / document).read_text(encoding="utf-8") == text
@@ -57,10 +67,10 @@ def test_flights_are_flown_a_thousand_times_by_shipped_teams_and_scripts():
 def test_older_results_are_marked(tmp_path):
     path = tmp_path / "seed0.json"
     path.write_text('{"metrics": {"success_rate": {"mean": 0.5}, "payload_rmse_m": {"mean": 0.01}}}')
-    assert reproduce._cell([path], "payload_rmse_m") == "50.0 %, 1.00 cm †"
+    assert tables._cell([path], "payload_rmse_m") == "50.0 %, 1.00 cm †"
     path.with_suffix(".npz").touch()
-    assert reproduce._cell([path], "payload_rmse_m") == "50.0 %, 1.00 cm"
-    assert reproduce._cell([tmp_path / "seed1.json"], "payload_rmse_m") == "-"
+    assert tables._cell([path], "payload_rmse_m") == "50.0 %, 1.00 cm"
+    assert tables._cell([tmp_path / "seed1.json"], "payload_rmse_m") == "-"
 
 
 def test_episodes_are_kept_beside_their_mean():
@@ -83,21 +93,21 @@ def write_episodes(folder, team, success, error):
 
 
 def test_the_gain_of_learning_is_paired_with_the_best_script(tmp_path, monkeypatch):
-    monkeypatch.setattr(reproduce, "HERE", tmp_path)
+    monkeypatch.setattr(tables, "HERE", tmp_path)
     folder, error = tmp_path / "gate", np.linspace(0.01, 0.5, 100)
-    assert reproduce.gain("gate") == "-"
+    assert tables.gain("gate") == "-"
     write_episodes(folder, "formation", [True] * 50 + [False] * 50, np.zeros(100))
     write_episodes(folder, "formation_lead", [True] * 100, error)
     write_episodes(folder, "seed0", [True] * 100, error - 0.01)
     write_episodes(folder, "seed1", [True] * 100, error - 0.003)
-    better = reproduce.gain("gate")
+    better = tables.gain("gate")
     assert better == "+0.0 (+0.0 to +0.0) points, -0.65 (-0.65 to -0.65) cm, formation_lead"
     write_episodes(folder, "seed0", [True] * 90 + [False] * 10, error - 0.01)
-    assert reproduce.gain("gate").startswith("-5.0 (")
-    assert reproduce.gain("gate").endswith("formation_lead; **learning gains nothing**")
+    assert tables.gain("gate").startswith("-5.0 (")
+    assert tables.gain("gate").endswith("formation_lead; **learning gains nothing**")
     write_episodes(folder, "formation_lead", [False] * 100, error)
     write_episodes(folder, "seed0", [True] * 100, error + 1)
-    assert "gains nothing" not in reproduce.gain("gate") and reproduce.gain("gate").startswith("+50.0 (")
+    assert "gains nothing" not in tables.gain("gate") and tables.gain("gate").startswith("+50.0 (")
 
 
 def test_judging_can_be_stopped_and_started_again(tmp_path, monkeypatch):

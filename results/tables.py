@@ -1,0 +1,139 @@
+"""The tables of the documents, from what `reproduce.py judge` has written beside each flight."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flights import FLIGHTS, HERE, ROOT, error_metric
+
+from multilift_marl.control.scripted import SCRIPTED
+from multilift_marl.evaluation.metrics import bootstrap, is_gain
+
+
+def table() -> str:
+    """Return all flights and all teams as a Markdown table: success and error, of learned ones the mean of seeds."""
+    rows = []
+    for name, flight in FLIGHTS.items():
+        scripts = [_cell([HERE / name / f"{script}.json"], error_metric(flight)) for script in SCRIPTED]
+        rows.append([flight.title, *_learned(name), gain(name), *scripts, flight.published])
+    return _markdown(["learned", "training seeds", "learned - best script", *SCRIPTED, "published"], rows)
+
+
+def summary() -> str:
+    """Return the same of the learned teams and the best script of each flight alone."""
+    rows = []
+    for name, flight in FLIGHTS.items():
+        best = best_script(name)
+        script = f"{best}: {_cell([HERE / name / f'{best}.json'], error_metric(flight))}" if best else "-"
+        difference = gain(name).replace(f", {best}", "")
+        rows.append([flight.title, *_learned(name), script, difference, flight.published])
+    return _markdown(["learned", "training seeds", "best script", "learned - best script", "published"], rows)
+
+
+def _learned(flight: str) -> tuple[str, str]:
+    """Return what learned teams did, and how many."""
+    seeds = sorted((HERE / flight).glob("seed*.json"))
+    fresh = [path for path in seeds if path.with_suffix(".npz").is_file()]
+    return _cell(seeds, error_metric(FLIGHTS[flight])), str(len(fresh or seeds))
+
+
+def _markdown(columns: list[str], rows: list[list[str]]) -> str:
+    """Return a table of which the first column has no name."""
+    head = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
+    return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
+
+
+def best_script(flight: str) -> str:
+    """Return the script with the most successes, of several the one with the least error; "" if none was flown."""
+    scripts = {name: np.load(path) for name in SCRIPTED if (path := HERE / flight / f"{name}.npz").is_file()}
+    return min(scripts, default="", key=lambda name: (-scripts[name]["success"].mean(), scripts[name]["error"].mean()))
+
+
+def gain(flight: str) -> str:
+    """Return what learned teams do better than the best script: success and error, paired by episode.
+
+    Of several training seeds each episode counts by its mean. `is_gain` says whether learning gains.
+    """
+    learned = [np.load(path) for path in sorted((HERE / flight).glob("seed*.npz")) if "." not in path.stem]
+    best = best_script(flight)
+    if not learned or not best:
+        return "-"
+    script = np.load(HERE / flight / f"{best}.npz")
+    parts, differences = [], []
+    for key, unit, digits in (("success", "points", 1), ("error", "cm", 2)):
+        mean = np.mean([each[key].astype(float) for each in learned], axis=0)
+        difference = 100 * (mean - script[key].astype(float))
+        differences.append(difference)
+        low, high = (f"{bound:+.{digits}f}" for bound in bootstrap(difference))
+        parts.append(f"{difference.mean():+.{digits}f} ({low} to {high}) {unit}")
+    return f"{', '.join(parts)}, {best}" + ("" if is_gain(*differences) else "; **learning gains nothing**")
+
+
+def _cell(paths: list[Path], error: str) -> str:
+    """Return "success %, error cm", means of these results, with the smallest and the largest where they differ.
+
+    Results without their episodes are older than today's physics, and marked by a dagger where there are no others.
+    """
+    fresh = [path for path in paths if path.with_suffix(".npz").is_file()]
+    told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in fresh or paths if path.is_file()]
+    if not told:
+        return "-"
+    parts = []
+    for metric, unit, digits in (("success_rate", "%", 1), (error, "cm", 2)):
+        values = [100 * one[metric]["mean"] for one in told]
+        least, most = (f"{value:.{digits}f}" for value in (min(values), max(values)))
+        spread = f" ({least} - {most})" if least != most else ""
+        parts.append(f"{sum(values) / len(values):.{digits}f}{spread} {unit}")
+    return ", ".join(parts) + ("" if fresh else " †")
+
+
+_DETAILS = (  # of each team: metric, title, factor, digits
+    ("success_rate", "success [%]", 100, 1),
+    ("payload_position_error_m", "position error [cm]", 100, 2),
+    ("payload_position_error_m_successful", "... successful [cm]", 100, 2),
+    ("payload_attitude_error_deg", "attitude error [deg]", 1, 2),
+    ("payload_attitude_error_deg_successful", "... successful [deg]", 1, 2),
+    ("settling_time_s", "settling time [s]", 1, 2),
+    ("return", "return", 1, 1),
+)
+
+
+def details(flights: Sequence[str]) -> str:
+    """Return what every team of some flights did, as a Markdown table: means and 95 % intervals over its episodes."""
+    rows = []
+    for flight in flights:
+        seeds = sorted(path.stem for path in (HERE / flight).glob("seed*.npz"))
+        for team in (*SCRIPTED, *seeds):
+            if not (HERE / flight / f"{team}.npz").is_file():
+                continue
+            metrics = json.loads((HERE / flight / f"{team}.json").read_text(encoding="utf-8"))["metrics"]
+            named = team.replace("seed", "learned, seed ")
+            rows.append([f"{FLIGHTS[flight].title}: {named}" if len(flights) > 1 else named])
+            rows[-1] += [_interval(metrics.get(name), factor, digits) for name, _, factor, digits in _DETAILS]
+    return _markdown([title for _, title, _, _ in _DETAILS], rows)
+
+
+def _interval(metric: dict[str, Any] | None, factor: float, digits: int) -> str:
+    if metric is None:
+        return "-"
+    mean, low, high = (f"{factor * value:.{digits}f}" for value in (metric["mean"], *metric["ci95"]))
+    return f"{mean} ({low} - {high})"
+
+
+def write_tables() -> None:
+    """Replace what stands between the markers in the documents."""
+    marked = re.compile(r"(<!-- results(?: of ([\w ]+))? -->\n).*?(<!-- end of results -->)", re.DOTALL)
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        whole = summary if path.name == "README.md" else table
+
+        def fill(found: re.Match[str], whole: Callable[[], str] = whole) -> str:
+            content = details(found[2].split()) if found[2] else whole()
+            return f"{found[1]}{content}\n{found[3]}"
+
+        text = path.read_text(encoding="utf-8")
+        path.write_text(marked.sub(fill, text), encoding="utf-8")
