@@ -30,7 +30,7 @@ VALUES = [
     "1:30", "[]", "[1", "[1,2,3]", "[nan,1,2]", "{}", "{a: 1}", "{", "'", '"', "&a", "*a", "!!python/object:os.system",
     "\0", "\x1b[2J", "é", "\ud800", "x" * 3000, "9" * 400, "../..", "/", "/dev/null", ".", "hover", "hover.yaml",
     "pose_easy", "formation", "formation_led", "module:Class", "os:getcwd", ":", "a.py:B", "policy.onnx", "weights.pt",
-    "latest", "best", "top", "none", "crazyflie", "point", "chain", "<<", "%s", "{}%n", "a b", "=", "==1", "- 1", "2020",
+    "latest", "best", "top", "none", "crazyflie", "point", "chain", "<<", "%s", "{}%n", "a b", "=", "==1", "- 1",
 ]  # fmt: skip
 WHOLE = [
     "", "=", "==", "=1", "x", "-", "--", "--help=1", "--config=hover", "config hover", "\0", "é=1", "env", "env.=1",
