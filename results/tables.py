@@ -38,8 +38,7 @@ def summary() -> str:
 def _learned(flight: str) -> tuple[str, str]:
     """Return what learned teams did, and how many."""
     seeds = sorted((HERE / flight).glob("seed*.json"))
-    fresh = [path for path in seeds if path.with_suffix(".npz").is_file()]
-    return _cell(seeds, error_metric(FLIGHTS[flight])), str(len(fresh or seeds))
+    return _cell(seeds, error_metric(FLIGHTS[flight])), str(len(seeds))
 
 
 def _markdown(columns: list[str], rows: list[list[str]]) -> str:
@@ -75,12 +74,8 @@ def gain(flight: str) -> str:
 
 
 def _cell(paths: list[Path], error: str) -> str:
-    """Return "success %, error cm", means of these results, with the smallest and the largest where they differ.
-
-    Results without their episodes are older than today's physics, and marked by a dagger where there are no others.
-    """
-    fresh = [path for path in paths if path.with_suffix(".npz").is_file()]
-    told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in fresh or paths if path.is_file()]
+    """Return "success %, error cm", means of these results, with the smallest and the largest where they differ."""
+    told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in paths if path.is_file()]
     if not told:
         return "-"
     parts = []
@@ -89,7 +84,7 @@ def _cell(paths: list[Path], error: str) -> str:
         least, most = (f"{value:.{digits}f}" for value in (min(values), max(values)))
         spread = f" ({least} - {most})" if least != most else ""
         parts.append(f"{sum(values) / len(values):.{digits}f}{spread} {unit}")
-    return ", ".join(parts) + ("" if fresh else " †")
+    return ", ".join(parts)
 
 
 _DETAILS = (  # of each team: metric, title, factor, digits

@@ -56,7 +56,8 @@ def test_flights_are_flown_a_thousand_times_by_shipped_teams_and_scripts():
     compared = 0
     for name, flight in reproduce.FLIGHTS.items():
         fitting = fitting_scripts(ml.make_vec(flight.config, num_envs=1, num_threads=1))
-        flown = {path.stem for path in (ROOT / "results" / name).glob("*.npz")}
+        flown, told = ({path.stem for path in (ROOT / "results" / name).glob(kind)} for kind in ("*.npz", "*.json"))
+        assert flown == told >= set(fitting)
         compared += "seed0" in flown and bool(flown & set(fitting))
         for team in flown:
             told = json.loads((ROOT / "results" / name / f"{team}.json").read_text(encoding="utf-8"))
@@ -64,13 +65,13 @@ def test_flights_are_flown_a_thousand_times_by_shipped_teams_and_scripts():
     assert compared == len(reproduce.FLIGHTS)
 
 
-def test_older_results_are_marked(tmp_path):
-    path = tmp_path / "seed0.json"
-    path.write_text('{"metrics": {"success_rate": {"mean": 0.5}, "payload_rmse_m": {"mean": 0.01}}}')
-    assert tables._cell([path], "payload_rmse_m") == "50.0 %, 1.00 cm †"
-    path.with_suffix(".npz").touch()
-    assert tables._cell([path], "payload_rmse_m") == "50.0 %, 1.00 cm"
-    assert tables._cell([tmp_path / "seed1.json"], "payload_rmse_m") == "-"
+def test_a_cell_holds_mean_and_range_of_what_is_there(tmp_path):
+    paths = [tmp_path / f"seed{seed}.json" for seed in range(3)]
+    assert tables._cell(paths, "payload_rmse_m") == "-"
+    paths[0].write_text('{"metrics": {"success_rate": {"mean": 0.5}, "payload_rmse_m": {"mean": 0.01}}}')
+    assert tables._cell(paths, "payload_rmse_m") == "50.0 %, 1.00 cm"
+    paths[2].write_text('{"metrics": {"success_rate": {"mean": 0.6}, "payload_rmse_m": {"mean": 0.01}}}')
+    assert tables._cell(paths, "payload_rmse_m") == "55.0 (50.0 - 60.0) %, 1.00 cm"
 
 
 def test_episodes_are_kept_beside_their_mean():
