@@ -60,6 +60,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         self.action_spaces = {name: Box(-1.0, 1.0, (vec.action_size,), np.float32) for name in names}
         self.state_space = Box(*unbounded, (vec.state_size,), np.float32)
         self._joint = np.zeros((1, vec.num_drones, vec.action_size))
+        self._term_names = [f"reward_terms.{name}" for name in vec.reward_terms]
         self._pictures = Pictures(vec, render_mode)
 
     def reset(
@@ -158,9 +159,11 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         """Return a dict for each agent; nothing in it is shared, so that wrappers may write into theirs."""
         told: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
         told["failure_cause"] = int(info["failure_cause"][0])
-        told |= {f"reward_terms.{name}": float(array[0]) for name, array in info["reward_terms"].items()}
-        drawn = {f"randomization.{name}": array[0] for name, array in info["randomization"].items()}
-        return {name: told | {key: row.copy() for key, row in drawn.items()} for name in self.possible_agents}
+        terms = info["reward_terms"].values()
+        told |= {name: float(array[0]) for name, array in zip(self._term_names, terms, strict=True)}
+        told |= {f"randomization.{name}": array[0] for name, array in info["randomization"].items()}
+        rows = {key: row for key, row in told.items() if isinstance(row, np.ndarray)}  # numbers cannot be written into
+        return {name: told | {key: row.copy() for key, row in rows.items()} for name in self.possible_agents}
 
     def _mismatch(self, actions: dict[str, Any]) -> ValueError:
         for name in self.possible_agents:
