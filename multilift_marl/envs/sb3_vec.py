@@ -65,7 +65,8 @@ class MultiliftSB3VecEnv(VecEnv):
         self._rows = vec.num_drones if shared else 1  # of an environment
         self._pictures = Pictures(vec, render_mode, BATCH_RENDER_MODES)
         super().__init__(vec.num_envs * self._rows, *row_spaces(vec, vec.num_drones // self._rows))
-        self._actions = np.zeros((self.num_envs, *self.action_space.shape), np.float32)
+        self._actions = np.zeros((self.num_envs, vec.num_drones // self._rows * vec.action_size), np.float32)
+        self._shape = self._actions.shape
 
     def reset(self) -> np.ndarray:
         """Start new episodes: at episode 0 of the seed that `seed` was given, else each environment's next.
@@ -99,9 +100,9 @@ class MultiliftSB3VecEnv(VecEnv):
             ValueError: actions of wrong shape or type, or not finite.
             RuntimeError: the environments were never reset.
         """
-        vec, shape = self.vec, (self.num_envs, *self.action_space.shape)
-        if self._actions.shape != shape:
-            raise ValueError(f"actions have shape {self._actions.shape}, expected {shape} (rows, numbers)")
+        vec = self.vec
+        if self._actions.shape != self._shape:
+            raise ValueError(f"actions have shape {self._actions.shape}, expected {self._shape} (rows, numbers)")
         joint = self._actions.reshape(vec.num_envs, vec.num_drones, vec.action_size)
         observation, reward, terminated, truncated, info = vec.step(joint)
         reward = reward.reshape(-1) if self.shared else mean_reward(reward).astype(np.float32)
