@@ -1,9 +1,10 @@
 """Compiled kernels on disk: one file for each kernel and its types, in a folder named by the sources they come from.
 
 Numba's own cache looks at the file of the kernel alone, not at those of the functions and constants that it uses; it
-keeps an index that two processes must not write at once; and it takes what it reads for sound. Here the folder's name
-is a digest of the package's sources, a kernel from elsewhere (a task of one's own) is also named by a digest of its own
-source, files are written whole and renamed, and one whose checksum is wrong counts as missing.
+keeps an index that two processes must not write at once; and it trusts what it reads. Here each module's kernels have a
+folder, named by a digest of the module and all modules of the package that it imports; a kernel from elsewhere (a task
+of one's own) is named by a digest of its own source; files are written whole and renamed, and one whose checksum is
+wrong counts as missing.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ import contextlib
 import hashlib
 import os
 import pickle
+import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -26,44 +28,68 @@ from numba.core.caching import Cache as NumbaCache
 from numba.core.caching import CompileResultCacheImpl, NullCache, _CacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
+from numba.core.types import BaseNamedTuple
 
 from multilift_marl._files import write_whole
 from multilift_marl.errors import warn_once
 
 PACKAGE = Path(__file__).parent
-KEPT = 20  # folders of other sources, those used last
-_WITHOUT_KERNELS = ("agents", "cli", "envs", "evaluation", "rendering", "view", "plugins.py", "__init__.py")
+KEPT = 20  # folders of a module's former sources
+_IMPORT = re.compile(
+    r"^\s*(?:from (multilift_marl[\w.]*) import ([\w, ]+|\([^)]+\))|import (multilift_marl[\w.]*))", re.M
+)
 
 
 @cache
-def sources_digest() -> str:
-    """Return a digest of all sources of the package that kernels may depend on."""
+def _imports(module: str) -> tuple[Path, frozenset[str]] | None:
+    """Return the file of a module of the package, and the names of those it imports; None if there is no such file."""
+    path = PACKAGE.parent.joinpath(*module.split("."))
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    if not path.is_file():
+        return None
+    names = set[str]()
+    for source, members, whole in _IMPORT.findall(path.read_text(encoding="utf-8")):
+        names |= {source or whole, *(f"{source}.{member}" for member in re.findall(r"\w+", members))}
+    return path, frozenset(names)
+
+
+@cache
+def sources_digest(module: str) -> str:
+    """Return a digest of the sources of a module of the package and of all modules of the package that it imports.
+
+    A module from elsewhere may use any of them.
+    """
+    if not module.startswith(f"{PACKAGE.name}."):
+        sources = sorted(PACKAGE.rglob("*.py"))
+        return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    found, waiting = dict[str, Path](), [module]
+    while waiting:
+        name = waiting.pop()
+        entry = None if name in found else _imports(name)
+        if entry is not None:
+            found[name] = entry[0]
+            waiting.extend(entry[1])
     digest = hashlib.sha256()
-    for source in sorted(PACKAGE.rglob("*.py")):
-        name = source.relative_to(PACKAGE)
-        if name.parts[0] not in _WITHOUT_KERNELS:
-            digest.update(name.as_posix().encode() + source.read_bytes())
+    for name in sorted(found):
+        digest.update(name.encode() + found[name].read_bytes())
     return digest.hexdigest()[:16]
 
 
 @cache
-def cache_folder() -> Path | None:
-    """Return the folder of today's kernels; None, and a warning, if it can be neither read nor made.
+def _home() -> Path | None:
+    """Return where folders of kernels can be made; None, and a warning, if nowhere.
 
     It is `NUMBA_CACHE_DIR` where that is set, else the package's own `__pycache__`, else the user's cache.
     """
-    name = f"multilift_marl-{sources_digest()}"
     asked = os.environ.get("NUMBA_CACHE_DIR")
     homes = [Path(asked)] if asked else [PACKAGE / "__pycache__", _user_cache()]
     for home in homes:
-        folder = home / name
+        folder = home / "multilift_marl-kernels"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
-            os.utime(folder)
         except (OSError, RuntimeError):  # read-only, full, no home
             continue
-        _forget_others(home, folder)
         return folder
     warn_once(
         "kernels",
@@ -71,6 +97,25 @@ def cache_folder() -> Path | None:
         "compiles anew, up to a minute. Set NUMBA_CACHE_DIR to a folder that can be",
     )
     return None
+
+
+@cache
+def cache_folder(module: str) -> Path | None:
+    """Return the folder of a module's kernels, those of today's sources; None if they cannot be kept."""
+    home = _home()
+    if home is None:
+        return None
+    own = f"{PACKAGE.name}."
+    name = module.removeprefix(own) if module.startswith(own) else "other"
+    folder = home / f"{name}-{sources_digest(module)}"
+    try:
+        made = not folder.is_dir()
+        folder.mkdir(exist_ok=True)
+        if made:
+            _forget_others(home, name, folder)
+    except OSError:  # written when there is something to write
+        pass
+    return folder
 
 
 def _user_cache() -> Path:
@@ -82,10 +127,10 @@ def _user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
-def _forget_others(home: Path, current: Path) -> None:
-    """Delete the folders of other sources but those used last."""
+def _forget_others(home: Path, name: str, current: Path) -> None:
+    """Delete the folders of a module's former sources but the newest."""
     with contextlib.suppress(OSError):
-        others = sorted((f for f in home.glob("multilift_marl-*") if f != current), key=lambda f: f.stat().st_mtime)
+        others = sorted((f for f in home.glob(f"{name}-*") if f != current), key=lambda f: f.stat().st_mtime)
         for folder in others[:-KEPT]:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -134,8 +179,8 @@ class KernelCache(NumbaCache):
     def _path(self, key: Any) -> Path:
         """Return the file of a signature: kernel, types, processor and Python in its name."""
         code = self._function.__code__
-        told = (repr(key), self._function.__module__, sys.version, foreign_digest(self._function))
-        digest = hashlib.sha256("\0".join(told).encode()).hexdigest()[:32]
+        parts = (repr(key), repr(_fields(key[0])), sys.version, foreign_digest(self._function))
+        digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
         name = "".join(c if c.isalnum() else "_" for c in self._function.__qualname__)[-40:]
         return self._folder / f"{name}-{code.co_firstlineno}-{digest}.kernel"
 
@@ -178,8 +223,14 @@ class KernelCache(NumbaCache):
 
 def make_cache(function: Callable[..., Any]) -> KernelCache | NullCache:
     """Return where a kernel's compiled versions are kept."""
-    folder = cache_folder()
+    folder = cache_folder(function.__module__)
     return NullCache() if folder is None else KernelCache(function, folder)
+
+
+def _fields(types: Iterable[Any]) -> list[Any]:
+    """Return the names of the fields of named tuples among Numba's types, which neither their names nor keys state."""
+    records: list[Any] = [each for each in types if isinstance(each, BaseNamedTuple)]
+    return [(record.fields, _fields(record.types)) for record in records]
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:

@@ -15,6 +15,7 @@ stopped and started again; delete the files of what has changed.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import multiprocessing
 import os
@@ -29,6 +30,7 @@ import numpy as np
 from flights import EPISODES, FLIGHTS, HERE, ROOT, SEED, error_metric
 from tables import write_tables
 
+from multilift_marl._files import write_whole
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
@@ -129,10 +131,10 @@ def fly(job: Job) -> str:
     content = {"episodes": EPISODES, "seed": SEED, "config": flight.config, "overrides": flight.overrides}
     told, episodes = job.files
     told.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = episodes.with_suffix(".part.npz")  # a stopped process leaves no file that looks whole
-    np.savez_compressed(unfinished, success=flown["success_rate"], error=error.astype(np.float32))
-    told.write_text(json.dumps(content | {"metrics": metrics}, indent=1) + "\n", encoding="utf-8")
-    unfinished.replace(episodes)
+    arrays = io.BytesIO()
+    np.savez_compressed(arrays, success=flown["success_rate"], error=error.astype(np.float32))
+    write_whole(told, f"{json.dumps(content | {'metrics': metrics}, indent=1)}\n".encode())
+    write_whole(episodes, arrays.getbuffer())
     return f"{job.flight}, {job.team}: success {metrics['success_rate']['mean']:.1%}, {100 * error.mean():.2f} cm"
 
 

@@ -14,6 +14,16 @@ from flights import FLIGHTS, HERE, ROOT, error_metric
 from multilift_marl.control.scripted import SCRIPTED
 from multilift_marl.evaluation.metrics import bootstrap, is_gain
 
+_DETAILS = (  # of each team: metric, title, factor, digits
+    ("success_rate", "success [%]", 100, 1),
+    ("payload_position_error_m", "position error [cm]", 100, 2),
+    ("payload_position_error_m_successful", "... successful [cm]", 100, 2),
+    ("payload_attitude_error_deg", "attitude error [deg]", 1, 2),
+    ("payload_attitude_error_deg_successful", "... successful [deg]", 1, 2),
+    ("settling_time_s", "settling time [s]", 1, 2),
+    ("return", "return", 1, 1),
+)
+
 
 def table() -> str:
     """Return all flights and all teams as a Markdown table: success and error, of learned ones the mean of seeds."""
@@ -37,8 +47,13 @@ def summary() -> str:
 
 def _learned(flight: str) -> tuple[str, str]:
     """Return what learned teams did, and how many."""
-    seeds = sorted((HERE / flight).glob("seed*.json"))
-    return _cell(seeds, error_metric(FLIGHTS[flight])), str(len(seeds))
+    teams = learned_teams(flight)
+    return _cell([HERE / flight / f"{team}.json" for team in teams], error_metric(FLIGHTS[flight])), str(len(teams))
+
+
+def learned_teams(flight: str) -> list[str]:
+    """Return the names of the learned teams that have flown, one for each training seed."""
+    return sorted(path.stem for path in (HERE / flight).glob("seed*.npz"))
 
 
 def _markdown(columns: list[str], rows: list[list[str]]) -> str:
@@ -58,7 +73,7 @@ def gain(flight: str) -> str:
 
     Of several training seeds each episode counts by its mean. `is_gain` says whether learning gains.
     """
-    learned = [np.load(path) for path in sorted((HERE / flight).glob("seed*.npz")) if "." not in path.stem]
+    learned = [np.load(HERE / flight / f"{team}.npz") for team in learned_teams(flight)]
     best = best_script(flight)
     if not learned or not best:
         return "-"
@@ -87,23 +102,11 @@ def _cell(paths: list[Path], error: str) -> str:
     return ", ".join(parts)
 
 
-_DETAILS = (  # of each team: metric, title, factor, digits
-    ("success_rate", "success [%]", 100, 1),
-    ("payload_position_error_m", "position error [cm]", 100, 2),
-    ("payload_position_error_m_successful", "... successful [cm]", 100, 2),
-    ("payload_attitude_error_deg", "attitude error [deg]", 1, 2),
-    ("payload_attitude_error_deg_successful", "... successful [deg]", 1, 2),
-    ("settling_time_s", "settling time [s]", 1, 2),
-    ("return", "return", 1, 1),
-)
-
-
 def details(flights: Sequence[str]) -> str:
     """Return what every team of some flights did, as a Markdown table: means and 95 % intervals over its episodes."""
     rows = []
     for flight in flights:
-        seeds = sorted(path.stem for path in (HERE / flight).glob("seed*.npz"))
-        for team in (*SCRIPTED, *seeds):
+        for team in (*SCRIPTED, *learned_teams(flight)):
             if not (HERE / flight / f"{team}.npz").is_file():
                 continue
             metrics = json.loads((HERE / flight / f"{team}.json").read_text(encoding="utf-8"))["metrics"]

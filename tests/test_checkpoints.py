@@ -214,7 +214,8 @@ def test_two_savers_of_one_file_lose_nothing(tmp_path):
 def test_a_run_that_another_process_trains_is_not_resumed(tmp_path, capsys):
     trainer = make_trainer(tmp_path)
     trainer.save("last")
-    (trainer.folder / "checkpoints" / "last-1-2.tmp").touch()  # of a process that was killed
+    for leftover in ("checkpoints/last-1-2.tmp", "metrics-1-2.tmp"):  # of a process that was killed
+        (trainer.folder / leftover).touch()
     before = (trainer.folder / "config.yaml").stat().st_mtime_ns
     with open(trainer.folder / "lock", "w+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -224,7 +225,7 @@ def test_a_run_that_another_process_trains_is_not_resumed(tmp_path, capsys):
     assert capsys.readouterr().err.count("is being trained by another process") == 1
     assert (trainer.folder / "config.yaml").stat().st_mtime_ns == before
     trainer.iteration = trainer.iterations
-    assert trainer.run() and not list(trainer.folder.glob("checkpoints/*.tmp"))
+    assert trainer.run() and not list(trainer.folder.rglob("*.tmp"))
     with open(trainer.folder / "lock") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # free again
 

@@ -111,7 +111,7 @@ def test_kernels_of_others_are_compiled_anew_when_what_they_use_has_changed(pack
 def test_kernels_are_read_back_not_compiled_again_and_the_first_time_says_so(package, tmp_path):
     assert run(NORM, tmp_path)[1] == COMPILING
     written = {path: path.stat().st_mtime_ns for path in kernels(package)}
-    assert written and all(path.parent.name.startswith("multilift_marl-") for path in written)
+    assert {path.parent.name.split("-")[0] for path in written} == {"math3d"}
     assert run(NORM, tmp_path)[1] == ""
     assert written == {path: path.stat().st_mtime_ns for path in kernels(package)}
 
@@ -147,8 +147,8 @@ def test_a_package_that_is_read_only_keeps_kernels_in_the_users_cache(package, t
     (package / "__pycache__").write_text("a file in the folder's place")
     assert run(NORM, tmp_path, XDG_CACHE_HOME=str(tmp_path / "caches")) == (pytest.approx(1), COMPILING)
     first = kernels(tmp_path / "caches")
-    constants = package / "config" / "vehicles.py"
-    constants.write_text(constants.read_text(encoding="utf-8").replace("GRAVITY = 9.81", "GRAVITY = 3.71"))
+    with open(package / "math3d.py", "a", encoding="utf-8") as file:
+        file.write("CHANGED = True\n")
     assert run(NORM, tmp_path, XDG_CACHE_HOME=str(tmp_path / "caches")) == (pytest.approx(1), COMPILING)
     assert len(kernels(tmp_path / "caches")) == 2 * len(first) > 0
 
@@ -166,16 +166,40 @@ def test_a_full_disk_costs_time_alone(package, tmp_path):
     assert not list(package.rglob("*.tmp"))
 
 
-def test_folders_of_other_sources_go_but_for_those_used_last(tmp_path, monkeypatch):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+def test_only_the_newest_folders_of_a_modules_former_sources_stay(tmp_path, monkeypatch):
     monkeypatch.setattr(_kernel_cache, "KEPT", 3)
+    monkeypatch.setattr(_kernel_cache, "_home", lambda: tmp_path)
     for age in range(6):
-        folder = tmp_path / f"multilift_marl-{age}"
-        folder.mkdir()
-        os.utime(folder, (1000 - age, 1000 - age))
-    current = _kernel_cache.cache_folder.__wrapped__()
-    left = {folder.name for folder in tmp_path.iterdir()}
-    assert left == {current.name, "multilift_marl-0", "multilift_marl-1", "multilift_marl-2"}
+        for module in ("sim.world", "math3d"):
+            folder = tmp_path / f"{module}-{age}"
+            folder.mkdir()
+            os.utime(folder, (1000 - age, 1000 - age))
+    current = _kernel_cache.cache_folder.__wrapped__("multilift_marl.sim.world")
+    left = {folder.name for folder in tmp_path.glob("sim.world-*")}
+    assert left == {current.name, "sim.world-0", "sim.world-1", "sim.world-2"}
+    assert len(list(tmp_path.glob("math3d-*"))) == 6
+
+
+RECORD = """
+from typing import NamedTuple
+import numpy as np
+from multilift_marl._jit import kernel
+from multilift_marl.tasks.hover import record
+
+class Pair(NamedTuple):
+    FIELDS
+
+print(record(Pair(1.0, 2.0)))
+"""
+
+
+def test_a_kernel_is_compiled_for_the_order_of_a_records_fields(package, tmp_path):
+    """The type of a named tuple states the types of its fields, not their names."""
+    with open(package / "tasks" / "hover.py", "a", encoding="utf-8") as file:
+        file.write("\n\n@kernel\ndef record(pair):\n    return pair.left - pair.right\n")
+    for fields, expected in (("left: float; right: float", -1.0), ("right: float; left: float", 1.0)):
+        (tmp_path / "pair.py").write_text(RECORD.replace("FIELDS", fields))
+        assert run(tmp_path / "pair.py", tmp_path)[0] == expected
 
 
 def test_it_flies_without_the_compiler(package, tmp_path):

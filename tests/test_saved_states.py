@@ -72,11 +72,10 @@ def test_an_environment_that_diverged_may_hold_anything(vec):
     assert np.isnan(other.state_dict()["world.rows"][1, -1])
 
 
-@pytest.mark.parametrize("varied", [(0, 8), (8, 0)], ids=str)
-def test_a_state_fits_in_every_process(varied):
+def test_a_state_fits_in_every_process():
     """The order of a set follows hashes, which differ between processes, and the order of what was added."""
     assert str(frozenset((0, 8))) != str(frozenset((8, 0)))
     system = make().config.system
-    expected, found = (fingerprint(replace(system, varied=frozenset(order)), 1) for order in ((0, 8), varied))
+    expected, found = (fingerprint(replace(system, varied=frozenset(order)), 1) for order in ((0, 8), (8, 0)))
     assert same(found, expected)
     assert not same(fingerprint(replace(system, varied=frozenset((0,))), 1), expected)

@@ -162,5 +162,5 @@ def unlock_run(folder: Path) -> None:
 
 def clear_leftovers(folder: Path) -> None:
     """Delete what writers that were killed have left in `folder`, which must be locked."""
-    for path in (folder / "checkpoints").glob("*.tmp"):
+    for path in (*folder.glob("*.tmp"), *(folder / "checkpoints").glob("*.tmp")):
         path.unlink(missing_ok=True)
