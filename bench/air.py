@@ -13,7 +13,7 @@ import sys
 
 import multilift_marl as ml
 from bench import core, measure
-from multilift_marl.config import load_config, parse_overrides
+from multilift_marl.config.load import load_config, parse_overrides
 
 WIND = {"wind.velocity": [3.0, 0.0, 0.0]}
 PARTS = {

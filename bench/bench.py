@@ -19,7 +19,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 import multilift_marl as ml
-from multilift_marl.config import load_config, parse_overrides
+from multilift_marl.config.load import load_config, parse_overrides
 from multilift_marl.envs.core import MultiliftVec
 
 Runner = Callable[[], int]

@@ -14,8 +14,9 @@ import sys
 
 import numpy as np
 
-from multilift_marl.config import Config, load_config, parse_overrides
-from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import load_config, parse_overrides
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import fly
@@ -48,7 +49,7 @@ class Flight:
         self.world, self.reference = World(self.system, e, 1), Reference.zeros(e, n)
         self.world.set_parameters(np.ones(e, bool), payload_mass=mass * self.system.payload_mass)
         self.gains = make_gains(config.control, self.system)
-        self.pull = np.broadcast_to(self.system.drone_pull, (e, n, 3)).copy()
+        self.cable_force = np.broadcast_to(self.system.hook_force, (e, n, 3)).copy()
         self.slots = self.system.slots + [0, 0, REST_HEIGHT]
         self.reference.position[:] = self.slots
         self.disturbance = Disturbance.zeros(e, n)
@@ -60,20 +61,23 @@ class Flight:
         """Start from what stands in `world.state`."""
         self.world.load(np.ones(self.world.num_envs, bool))
         for e in range(self.world.num_envs):
-            forget(e, self.world.state, self.disturbance)
+            reset_estimate(e, self.world.state, self.disturbance)
 
     def reject(self) -> None:
         """Bring the estimates up to date."""
-        known, own = (self.world.state, self.reference, self.pull), (self.disturbance, self.gains, self.rejection)
+        known, own = (
+            (self.world.state, self.reference, self.cable_force),
+            (self.disturbance, self.gains, self.rejection),
+        )
         REJECTIONS[self.kind](0, self.world.num_envs, *known, *own)
 
     def step(self) -> None:
         """Fly one control step."""
-        pull, thrust = self.pull, self.world.thrust
+        cable_force, thrust = self.cable_force, self.world.thrust
         if self.kind != "none":
             self.reject()
-            pull = self.disturbance.pull
-        fly(0, self.world.num_envs, self.world.state, self.reference, pull, thrust, self.gains)
+            cable_force = self.disturbance.cable_force
+        fly(0, self.world.num_envs, self.world.state, self.reference, cable_force, thrust, self.gains)
         self.world.step(thrust, self.system.control_interval)
 
 
@@ -104,7 +108,7 @@ def fly_cases(config: Config, rate: float, seconds: float) -> tuple[np.ndarray, 
     drones, payload, counted = np.zeros(len(cases)), np.zeros(len(cases)), 0
     for tick in range(round((START + seconds) / flight.dt)):
         t = tick * flight.dt
-        flight.world.plant.wind[:, 0] = cases[:, 1] + cases[:, 2] * np.sin(cases[:, 3] * t)
+        flight.world.hidden_loads.wind[:, 0] = cases[:, 1] + cases[:, 2] * np.sin(cases[:, 3] * t)
         position, velocity, acceleration, jerk, yaw, yaw_rate = circle(t, rate)
         reference.position[:], reference.velocity[:] = flight.slots + position, velocity
         reference.acceleration[:], reference.jerk[:] = acceleration, jerk

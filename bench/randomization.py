@@ -13,7 +13,7 @@ import sys
 
 import multilift_marl as ml
 from bench import bare, core, measure
-from multilift_marl.config import load_config, parse_overrides
+from multilift_marl.config.load import load_config, parse_overrides
 
 CASES = {  # name: what it switches on beside the shipped configuration
     "inertia": {"payload_inertia": 0.2},

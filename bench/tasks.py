@@ -12,7 +12,7 @@ import sys
 
 import multilift_marl as ml
 from bench import bare, core, measure
-from multilift_marl.config import load_config, parse_overrides
+from multilift_marl.config.load import load_config, parse_overrides
 
 TEAMS = (2, 4, 8, 16)
 

@@ -25,7 +25,7 @@ from torchrl.modules import IndependentNormal
 
 from multilift_marl.agents.mappo import update
 from multilift_marl.agents.trainer import Trainer
-from multilift_marl.config import load_config, parse_overrides
+from multilift_marl.config.load import load_config, parse_overrides
 from multilift_marl.errors import ConfigError
 
 PARTS = {

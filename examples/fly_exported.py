@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
-from multilift_marl.config import build_config
+from multilift_marl.config.load import build_config
 from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 

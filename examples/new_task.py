@@ -15,8 +15,8 @@ from multilift_marl._jit import bind, kernel
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.rewards import action_rate, tolerance
 from multilift_marl.tasks.starts import StartRanges, start_near_target
-from multilift_marl.tasks.terms import mean_change, tolerance
 
 
 class LiftOptions(Section):
@@ -42,7 +42,7 @@ class Lift(Task):
         goal.position[env, 2] += rise
         goal.slots[env, :, 2] += rise
 
-    def scorer(self, lo, hi, action, previous):
+    def reward(self, lo, hi, action, previous):
         """Return the call that pays environments lo to hi after every step."""
         state, near = self.world.state, self.options.near
         return bind(
@@ -61,7 +61,7 @@ def score(lo, hi, state, errors, action, previous, weights, near, dt, terms, goo
         speed = np.sqrt((state.payload_velocity[e] ** 2).sum())
         terms[e, 0] = weights[0] * tolerance(errors.distance[e], 0.1)
         terms[e, 1] = weights[1] * tolerance(speed, 0.2)
-        terms[e, 2] = weights[2] * mean_change(e, action, previous)
+        terms[e, 2] = weights[2] * action_rate(e, action, previous)
         good_time[e] = good_time[e] + dt if errors.distance[e] <= near else 0.0
 
 

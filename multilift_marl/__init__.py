@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from multilift_marl import _interrupt, sim  # noqa: F401 (_interrupt first: Ctrl-C may come while the rest is imported)
 from multilift_marl.config.load import load_config, register_config
-from multilift_marl.config.teams import register_vehicle
 from multilift_marl.envs.core import make_vec
 from multilift_marl.envs.gymnasium_env import register as _register_with_gymnasium
 from multilift_marl.envs.multilift_v0 import parallel_env
 from multilift_marl.envs.multilift_v0 import register as _register_with_pettingzoo
 from multilift_marl.errors import pip_install
+from multilift_marl.rig.vehicles import register_vehicle
 from multilift_marl.tasks import list_tasks, register_task
 
 if TYPE_CHECKING:

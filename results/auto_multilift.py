@@ -24,8 +24,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from multilift_marl.agents.policy import load_policy
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
-from multilift_marl.config.schema import Config
 from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.evaluation.plots import POLICY_COLOURS

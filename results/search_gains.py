@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from multilift_marl.cli.common import run_command
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
-from multilift_marl.config.schema import Config
 from multilift_marl.control.scripted import LINEAR, Formation, check_interface
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest

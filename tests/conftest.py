@@ -18,11 +18,12 @@ import pytest
 
 import multilift_marl as ml
 from multilift_marl import plugins, tasks
-from multilift_marl.config import System, vehicles
 from multilift_marl.config.load import CONFIGS
 from multilift_marl.control.formation import place_formation
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
+from multilift_marl.rig import vehicles
+from multilift_marl.rig.system import System
 from multilift_marl.sim import World
 from multilift_marl.tasks import find_task
 from multilift_marl.validation.cables import hover_thrust  # noqa: F401 (for the tests)
@@ -75,7 +76,7 @@ def _enough_drones(request):
     """Skip a task's tests with fewer drones than it makes sense with."""
     asked = getattr(request.node, "callspec", None)
     if asked is not None and {"task", "num_drones"} <= asked.params.keys():
-        least = find_task(asked.params["task"]).LEAST_DRONES
+        least = find_task(asked.params["task"]).MIN_DRONES
         if asked.params["num_drones"] < least:
             pytest.skip(f"{asked.params['task']} needs {least} drones")
 

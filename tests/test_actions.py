@@ -141,7 +141,7 @@ def test_thrust_goes_from_limit_to_limit_by_the_hover_thrust(action):
     vec = flying(action)
     vehicle = vec.world.system.vehicle
     low, high = vehicle.thrust_coefficient * vehicle.rotor_speed_min**2, vehicle.rotor_thrust_max
-    hover = np.linalg.norm(vec.task.goal.pull + [0, 0, vehicle.mass * GRAVITY], axis=-1, keepdims=True) / 4
+    hover = np.linalg.norm(vec.task.goal.cable_force + [0, 0, vehicle.mass * GRAVITY], axis=-1, keepdims=True) / 4
     for share, expected in [(-1, low), (0, hover), (1, high), (0.5, (hover + high) / 2), (-0.5, (hover + low) / 2)]:
         vec.reset(seed=0)
         step(vec, *([share] * 4 if action == "rotor" else [share, 0, 0, 0]))
@@ -178,7 +178,7 @@ def test_an_environment_replays_alone_and_continues_from_its_saved_state(action)
             assert not (terminated | truncated).any()
         return seen
 
-    disturbance = {"control.disturbance": "indi"} if "indi" in ACTIONS[action].rejects else {}
+    disturbance = {"control.disturbance": "indi"} if "indi" in ACTIONS[action].supports else {}
     options = {"control.action": action} | disturbance
     many, alone = make(num_envs=5, num_threads=2, **options), make(num_envs=1, first_env=3, **options)
     many.reset(seed=1), alone.reset(seed=1)

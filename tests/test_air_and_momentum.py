@@ -14,7 +14,7 @@ from multilift_marl.sim import World
 
 def momenta(world: World) -> tuple[np.ndarray, np.ndarray]:
     """Return the momentum (E, 3) and the angular momentum about the origin (E, 3) of payload, drones and rotors."""
-    system, state, mass = world.system, world.state, world.plant.payload_mass[:, None]
+    system, state, mass = world.system, world.state, world.hidden_loads.payload_mass[:, None]
     inertia = system.payload_inertia * mass / system.payload_mass
     spin = np.einsum("eij,ej->ei", state.payload_rotation, inertia * state.payload_body_rates)
     own = np.asarray(system.vehicle.inertia) * state.drone_body_rates
@@ -44,7 +44,7 @@ def test_drag_slows_a_drone_exponentially_along_its_body_axes(yaw, timestep):
 
 def test_wind_carries_a_drone_with_it_exponentially():
     world = free_world(drag=True)
-    world.plant.wind[:] = [3.0, -1.0, 0.0]
+    world.hidden_loads.wind[:] = [3.0, -1.0, 0.0]
     world.step(weightless(world), 250)
     share = 1 - np.exp(-np.array(world.system.vehicle.drag) / world.system.vehicle.mass)
     np.testing.assert_allclose(world.state.drone_velocity[0, 0], share * [3.0, -1.0, 0.0], rtol=2e-3, atol=1e-9)
@@ -52,7 +52,7 @@ def test_wind_carries_a_drone_with_it_exponentially():
 
 def test_configured_wind_is_the_wind():
     world = World(make_system(1, **{"wind.velocity": [1, 2, 3]}), 2, 1)
-    assert world.plant.wind.tolist() == [[1, 2, 3]] * 2
+    assert world.hidden_loads.wind.tolist() == [[1, 2, 3]] * 2
 
 
 def test_a_falling_payload_approaches_its_terminal_speed():
@@ -71,7 +71,7 @@ def test_a_falling_payload_approaches_its_terminal_speed():
 def test_force_on_a_free_payload_accelerates_it(force):
     world = free_world(num_envs=2)
     world.set_parameters(mask(2, 1), payload_mass=np.array([0, 0.7]))
-    world.plant.payload_force[:] = force
+    world.hidden_loads.payload_force[:] = force
     world.step(weightless(world), 25)
     expected = 0.1 * (np.array(force) / np.array([[0.35], [0.7]]) - [0, 0, GRAVITY])
     np.testing.assert_allclose(world.state.payload_velocity, expected, rtol=1e-9, atol=1e-12)
@@ -80,7 +80,7 @@ def test_force_on_a_free_payload_accelerates_it(force):
 @pytest.mark.parametrize("force", [[1.5, 0, 0], [0, 0, -2.0], [1e-4, 0, 0]])
 def test_force_on_a_carried_payload_accelerates_the_whole_team(num_drones, force):
     world = World(without_drag(make_system(num_drones)), 1, 1)
-    world.plant.payload_force[:] = force
+    world.hidden_loads.payload_force[:] = force
     world.step(hover_thrust(world), 25)
     np.testing.assert_allclose(momenta(world)[0][0], 0.1 * np.array(force), rtol=1e-3, atol=1e-12)
 
@@ -90,7 +90,7 @@ def test_momentum_changes_by_the_impulse_of_thrust_and_weight(num_drones, shape)
     world = World(without_drag(make_system(num_drones, **{"payload.shape": shape})), 2, 1)
     world.set_parameters(mask(2, 1), payload_mass=np.full(2, 1.2 * world.system.payload_mass))
     system, vehicle, rng = world.system, world.system.vehicle, np.random.default_rng(0)
-    weight = (world.plant.payload_mass + num_drones * vehicle.mass)[:, None] * [0, 0, -GRAVITY]
+    weight = (world.hidden_loads.payload_mass + num_drones * vehicle.mass)[:, None] * [0, 0, -GRAVITY]
     linear, angular = (momentum.copy() for momentum in momenta(world))
     lag = system.timestep / vehicle.rotor_time_constant
     for step in range(100):
@@ -107,7 +107,7 @@ def test_momentum_changes_by_the_impulse_of_thrust_and_weight(num_drones, shape)
         linear += system.timestep * (force.sum(axis=1) + weight)
         turning = np.cross(position, force - [0, 0, vehicle.mass * GRAVITY]).sum(axis=1)
         turning += np.einsum("enij,enj->ei", rotation, torque)
-        turning += np.cross(load_position, world.plant.payload_mass[:, None] * [0, 0, -GRAVITY])
+        turning += np.cross(load_position, world.hidden_loads.payload_mass[:, None] * [0, 0, -GRAVITY])
         angular += system.timestep * turning
         world.step(thrust)
     np.testing.assert_allclose(momenta(world)[0], linear, atol=1e-12)

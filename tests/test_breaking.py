@@ -21,14 +21,14 @@ def make_world(model: str, num_envs: int = 1, num_drones: int = 1, load_factor: 
 def test_a_cable_breaks_when_its_tension_exceeds_the_breaking_load_and_not_before(model):
     world = make_world(model)
     thrust = hover_thrust(world)
-    world.plant.payload_force[:] = [0, 0, -0.9 * 0.4 * GRAVITY]
+    world.hidden_loads.payload_force[:] = [0, 0, -0.9 * 0.4 * GRAVITY]
     world.step(thrust, 25)
-    assert not world.state.cable_broken.any() and world.record.tension_max[0] > 1.2 * 0.4 * GRAVITY
-    world.plant.payload_force[:] = [0, 0, -6 * 0.4 * GRAVITY]  # shared by drone and load, as accelerations go
+    assert not world.state.cable_broken.any() and world.stats.tension_max[0] > 1.2 * 0.4 * GRAVITY
+    world.hidden_loads.payload_force[:] = [0, 0, -6 * 0.4 * GRAVITY]  # shared by drone and load, as accelerations go
     largest = [0.0]
     for _ in range(25):
         world.step(thrust)
-        largest.append(world.record.tension_peak[0])
+        largest.append(world.stats.tension_peak[0])
         if world.state.cable_broken[0, 0]:
             break
     assert largest[-1] > 2.0 * 0.4 * GRAVITY >= largest[-2]

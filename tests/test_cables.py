@@ -107,8 +107,8 @@ def test_a_slack_cable_pulls_with_exactly_nothing():
     load(world)
     world.step(hover_thrust(world), 25)
     assert (world.state.cable_tension == 0).all()
-    assert world.record.tension_max[0] == 0
-    assert world.record.slack_time[0] == pytest.approx(0.1)
+    assert world.stats.tension_max[0] == 0
+    assert world.stats.slack_time[0] == pytest.approx(0.1)
     assert world.state.payload_velocity[0, 2] == pytest.approx(-0.98, rel=0.01)
 
 

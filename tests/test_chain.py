@@ -7,7 +7,7 @@ import pytest
 from conftest import GRAVITY, hover_thrust, load, make_system, same, steady, without_drag
 
 from multilift_marl.sim import World
-from multilift_marl.sim.hanging import SLACK, hang
+from multilift_marl.sim.catenary import SLACK, hang
 from multilift_marl.validation.chains import exponential
 from multilift_marl.validation.conservation import totals
 
@@ -48,9 +48,9 @@ def test_the_formation_hangs_as_statics_says(num_drones, shape, timestep):
     node = 0.01 * system.cable_length / 9 * GRAVITY
     offset, tension = np.zeros((num_drones, 3)), 0.0
     for j in range(10):  # each segment carries the nodes below it
-        pull = force + j * node[:, None] * [0, 0, 1]
-        tension = np.linalg.norm(pull, axis=1)
-        offset += pull / tension[:, None] * (system.cable_length / 10 + tension / 1e6)[:, None]
+        cable_force = force + j * node[:, None] * [0, 0, 1]
+        tension = np.linalg.norm(cable_force, axis=1)
+        offset += cable_force / tension[:, None] * (system.cable_length / 10 + tension / 1e6)[:, None]
     world.step(hover_thrust(world), round(0.4 / timestep))
     for name in FORMATION:
         np.testing.assert_allclose(getattr(world.state, name), before[f"state.{name}"], rtol=1e-8, atol=1e-9)
@@ -70,7 +70,7 @@ def test_a_changed_payload_stretches_the_cable_by_its_weight_and_the_ropes(times
     expected = (mass * GRAVITY + 2 * 0.0125 * GRAVITY) / 1e5  # on average a segment carries two of the four nodes
     np.testing.assert_allclose(chords(world)[:, 0] - 1, expected, rtol=1e-4)
     np.testing.assert_allclose(world.state.cable_tension[:, 0], (mass + 0.05) * GRAVITY, rtol=1e-4)
-    assert world.record.stretch_max[0] == pytest.approx(world.record.tension_max[0] / 1e5)
+    assert world.stats.stretch_max[0] == pytest.approx(world.stats.tension_max[0] / 1e5)
 
 
 @pytest.mark.parametrize("chord", [(0.3, 0.1, 0.9495), (0.9, 0, 0.4364), (0, 0, 1.00004), (1, 0, 0.001), (1, 0, -0.1)])
@@ -79,8 +79,8 @@ def test_a_hanging_chain_spans_its_chord_in_balance(chord):
     hang(tuple(chord), OPENING, 0.1, 1e6, 0.01, links)
     directions, stretch = links[:, :3], links[:, 3]
     np.testing.assert_allclose(directions.T @ (0.1 + stretch), chord, atol=1e-9)
-    pulls = 1e6 * stretch[:, None] * directions
-    np.testing.assert_allclose(np.diff(pulls, axis=0), np.tile([0, 0, 0.01], (9, 1)), atol=1e-6)
+    cable_forces = 1e6 * stretch[:, None] * directions
+    np.testing.assert_allclose(np.diff(cable_forces, axis=0), np.tile([0, 0, 0.01], (9, 1)), atol=1e-6)
     np.testing.assert_allclose(links[:, 4:], np.tile(np.divide(OPENING, 10), (10, 1)))
 
 
@@ -162,7 +162,7 @@ def test_a_slack_chain_holds_nothing():
     world.step(hover_thrust(world), 25)
     assert world.state.payload_velocity[0, 2] == pytest.approx(-0.981, rel=2e-3)
     assert world.state.cable_tension.max() < 0.2
-    assert world.record.slack_time[0] > 0.05
+    assert world.stats.slack_time[0] > 0.05
     assert calm(world)
 
 
@@ -250,7 +250,7 @@ def test_a_light_chain_of_stiff_segments_moves_as_a_massless_cable():
     paths = []
     for overrides in ({}, {**CHAIN, "cable.density": 1e-4, "cable.segments": 20}):
         world = World(make_system(3, **{"sim.timestep": 1e-3, **overrides}), 1, 1)
-        world.plant.payload_force[:] = [0.3, 0.1, 0]
+        world.hidden_loads.payload_force[:] = [0.3, 0.1, 0]
         thrust, path = hover_thrust(world), []
         for _ in range(100):
             path.append(world.step(thrust, 10).payload_position[0].copy())

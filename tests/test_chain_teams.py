@@ -109,7 +109,7 @@ def test_a_masked_reset_is_a_fresh_start_and_leaves_the_others_alone():
 def test_a_diverged_team_spares_the_others_and_is_healed_by_a_reset(force):
     world, calm_one = make_world(3, 3), make_world(3, 3)
     thrust = hover_thrust(world) * np.linspace(0.98, 1.02, 3)[:, None, None]
-    world.plant.payload_force[1] = force
+    world.hidden_loads.payload_force[1] = force
     for each in (world, calm_one):
         each.step(thrust, 20)
     assert world.diverged.tolist() == [False, True, False]
@@ -126,7 +126,7 @@ def test_a_diverged_team_spares_the_others_and_is_healed_by_a_reset(force):
 def test_teams_start_with_their_cables_at_the_tension_of_rest():
     vec = make(num_envs=16, **CHAIN, **{"randomization.payload_mass": 0.3})
     vec.reset(seed=0)
-    load = vec.world.plant.payload_mass / vec.world.system.payload_mass
+    load = vec.world.hidden_loads.payload_mass / vec.world.system.payload_mass
     expected = vec.world.system.resting_tension * load[:, None]
     np.testing.assert_allclose(vec.world.state.cable_tension, expected, rtol=0.01)
     assert (vec.world.state.cable_tension == vec.world.state.cable_tension.clip(1)).all()

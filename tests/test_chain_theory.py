@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from multilift_marl.config.system import GRAVITY
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.validation.cables import second_order
 from multilift_marl.validation.chains import exponential, inclined_chains, straight_chain
 

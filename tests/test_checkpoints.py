@@ -21,7 +21,7 @@ from multilift_marl.agents.checkpoint import find_run, load_checkpoint, save_che
 from multilift_marl.agents.policy import load_policy, strip_checkpoint
 from multilift_marl.agents.trainer import resume_run
 from multilift_marl.cli.train import main as train
-from multilift_marl.config import build_config
+from multilift_marl.config.load import build_config
 from multilift_marl.errors import CheckpointError
 
 SHIPPED = Path(policy.__file__).parents[1] / "policies"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import load, make_system, without_drag
 
-from multilift_marl.config.vehicles import PRESETS
+from multilift_marl.rig.vehicles import PRESETS
 from multilift_marl.sim import World
 from multilift_marl.sim.contact import drone_half_size
 
@@ -32,7 +32,7 @@ def collide(preset: str, axis: int, speed: float, phase: float, model: str = "ma
     state.drone_velocity[0, :, axis] = [speed / 2, -speed / 2]
     load(world)
     world.break_cables(np.ones((1, 2), bool))
-    world.plant.motors_off[:] = True
+    world.hidden_loads.motors_off[:] = True
     before, nearest = state.drone_velocity[0].sum(axis=0), np.inf
     steps = round((0.05 / speed + 0.1) / system.timestep)
     for _ in range(steps):
@@ -82,7 +82,7 @@ def strike(preset: str, pair: str, speed: float, phase: float) -> tuple[float, f
     state.rotor_speed[:] = 0.0
     load(world)
     world.break_cables(np.ones((1, 1), bool))
-    world.plant.motors_off[:] = True
+    world.hidden_loads.motors_off[:] = True
     nearest, back = np.inf, 0.0
     for _ in range(round((0.05 / speed + 0.1) / system.timestep)):
         world.step(np.zeros((1, 1, 4)))
@@ -114,7 +114,7 @@ def test_nothing_bounces():
     world.state.rotor_speed[:] = 0
     load(world)
     world.break_cables(np.ones((1, 1), bool))
-    world.plant.motors_off[:] = True
+    world.hidden_loads.motors_off[:] = True
     highest, landed = 0.0, False
     for _ in range(500):
         world.step(np.zeros((1, 1, 4)))

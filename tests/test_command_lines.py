@@ -13,7 +13,7 @@ import pytest
 from multilift_marl.agents import export as exporting
 from multilift_marl.agents import trainer
 from multilift_marl.cli import evaluate, export, train
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.errors import ConfigError
 from multilift_marl.view import __main__ as view
 

@@ -11,8 +11,7 @@ import pytest
 from conftest import refusal, refuse_system, refuse_task
 
 import multilift_marl as ml
-from multilift_marl.config import load_config, parse_overrides
-from multilift_marl.config.load import config_dir, dump_config
+from multilift_marl.config.load import config_dir, dump_config, load_config, parse_overrides
 from multilift_marl.errors import ConfigError
 
 

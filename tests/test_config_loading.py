@@ -8,7 +8,8 @@ import pytest
 import yaml
 from conftest import TASKS
 
-from multilift_marl.config import Config, build_config, dump_config, explain, list_configs, load_config, parse_overrides
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import build_config, dump_config, explain, list_configs, load_config, parse_overrides
 from multilift_marl.config.values import Section
 
 

@@ -85,7 +85,7 @@ def test_a_diverged_environment_ends_alone_and_soundly(task, cables, num_threads
     others = [0, 1, 3, 4, 5]
     for step in range(40):
         if step == 5:
-            broken.world.plant.payload_force[2] = 1e9
+            broken.world.hidden_loads.payload_force[2] = 1e9
         action = 0.2 * bold_actions(sound, step)
         expected, (observation, reward, terminated, truncated, info) = sound.step(action), broken.step(action)
         assert np.isfinite(observation).all() and np.isfinite(reward).all() and np.isfinite(broken.state()).all()
@@ -162,7 +162,7 @@ def test_each_failure_has_its_cause(happen, cause):
 def test_a_failure_ends_the_episode():
     vec = make("hover", num_envs=3)
     vec.reset(seed=0)
-    vec.world.plant.payload_force[1] = [0, 0, -60]
+    vec.world.hidden_loads.payload_force[1] = [0, 0, -60]
     for _ in range(100):
         _, _, terminated, _, info = vec.step(zeros(vec))
         if terminated.any():

@@ -51,9 +51,9 @@ def test_no_number_of_an_observation_repeats_another(ensemble):
 def test_the_state_tells_what_is_hidden_from_the_drones(task, cables):
     vec = make(task, num_envs=64, **{"randomization.payload_mass": 0.2, "randomization.payload_force": 1.5}, **cables)
     observation, _ = vec.reset(seed=0)
-    state, plant = vec.state(), vec.world.plant
-    excess = (plant.payload_mass / vec.world.system.payload_mass - 1)[:, None]
-    strength = np.linalg.norm(plant.payload_force, axis=1)[:, None]
+    state, hidden_loads = vec.state(), vec.world.hidden_loads
+    excess = (hidden_loads.payload_mass / vec.world.system.payload_mass - 1)[:, None]
+    strength = np.linalg.norm(hidden_loads.payload_force, axis=1)[:, None]
     assert np.abs(state - excess).max(axis=0).min() < 1e-6
     assert np.abs(np.hypot(state[:, :-1], state[:, 1:]) - strength).max(axis=0).min() < 1e-6
     assert np.abs(observation - excess[..., None]).max(axis=(0, 1)).min() > 0.1

@@ -25,9 +25,9 @@ def starts(request):
         observation, _ = vec.reset()
         vec.task.check(0, vec.num_envs, 0.0)
         kept["cause"].append(vec.task.cause.copy())
-        kept["stretch"].append(vec.world.record.stretch_max.copy())
-        kept["mass"].append(vec.world.plant.payload_mass / vec.world.system.payload_mass - 1)
-        kept["force"].append(vec.world.plant.payload_force.copy())
+        kept["stretch"].append(vec.world.stats.stretch_max.copy())
+        kept["mass"].append(vec.world.hidden_loads.payload_mass / vec.world.system.payload_mass - 1)
+        kept["force"].append(vec.world.hidden_loads.payload_force.copy())
         kept["position"].append(vec.task.errors.distance.copy())
         assert np.isfinite(observation).all() and np.isfinite(vec.state()).all()
     return vec, {name: np.array(arrays) for name, arrays in kept.items()}
@@ -72,7 +72,7 @@ def test_inertia_and_cables_follow_the_payload_mass(starts):
     vec, _ = starts
     world, body = vec.world, vec.world.layout.payload_body
     for shard in world.shards:
-        mass = world.plant.payload_mass[shard.lo : shard.hi]
+        mass = world.hidden_loads.payload_mass[shard.lo : shard.hi]
         np.testing.assert_array_equal(shard.batch.expanded("body_mass")[:, body], mass)
         inertia = shard.batch.expanded("body_inertia")[:, body]
         np.testing.assert_allclose(
@@ -91,5 +91,5 @@ def test_inertia_and_cables_follow_the_payload_mass(starts):
 def test_hidden_parameters_can_be_switched_off(task, cables):
     vec = make(task, **{"randomization.payload_mass": 0, "randomization.payload_force": 0}, **cables)
     vec.reset()
-    assert (vec.world.plant.payload_mass == vec.world.system.payload_mass).all()
-    assert (vec.world.plant.payload_force == 0).all()
+    assert (vec.world.hidden_loads.payload_mass == vec.world.system.payload_mass).all()
+    assert (vec.world.hidden_loads.payload_force == 0).all()

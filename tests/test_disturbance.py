@@ -22,7 +22,7 @@ def windy(kind: str, wind: float = 3.0, **overrides) -> bench.Flight:
     light = {"env.num_drones": 1, "payload.shape": "point", "payload.mass": 1e-3, "payload.drag_area": 0.0}
     config = ml.load_config("hover", light | {"control.disturbance": kind} | overrides)
     flight = bench.Flight(config, np.ones(1))
-    flight.world.plant.wind[:] = [wind, 0, 0]
+    flight.world.hidden_loads.wind[:] = [wind, 0, 0]
     return flight
 
 
@@ -161,7 +161,7 @@ def test_estimates_are_forgotten_at_a_reset_and_saved_with_the_rest(kind):
     vec.reset(seed=4)
     for _ in range(20):
         vec.step(zeros(vec))
-    assert np.abs(vec.pilot.disturbance.force).max() > 0.01
+    assert np.abs(vec.controller.disturbance.force).max() > 0.01
     saved = vec.state_dict()
     assert {f"disturbance.{field}" for field in Disturbance._fields} <= saved.keys()
     fresh.load_state_dict(saved)
@@ -174,7 +174,7 @@ def test_estimates_are_forgotten_at_a_reset_and_saved_with_the_rest(kind):
 
 def test_without_rejection_nothing_is_kept():
     vec = make(num_envs=1)
-    assert vec.pilot.disturbance is None
+    assert vec.controller.disturbance is None
     assert not [key for key in vec.state_dict() if key.startswith("disturbance")]
 
 

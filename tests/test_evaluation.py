@@ -11,8 +11,7 @@ from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.trainer import new_run
 from multilift_marl.cli.evaluate import main as evaluate
-from multilift_marl.config import load_config
-from multilift_marl.config.load import build_config
+from multilift_marl.config.load import build_config, load_config
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.evaluation import rollout
@@ -167,7 +166,7 @@ def test_evaluation_seeds_are_the_contracts():
     vec.reset(seed=1000)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(1000, spawn_key=(2, 7, 0))))
     factor = rng.uniform(-1, 1)
-    assert vec.world.plant.payload_mass[0] == pytest.approx(1.4 * (1 + 0.2 * factor), rel=1e-12)
+    assert vec.world.hidden_loads.payload_mass[0] == pytest.approx(1.4 * (1 + 0.2 * factor), rel=1e-12)
 
 
 @pytest.fixture(scope="module")

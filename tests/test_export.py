@@ -18,7 +18,7 @@ from multilift_marl.agents.export import export_policy
 from multilift_marl.agents.networks import Actor
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.cli.export import main as export
-from multilift_marl.config import load_config
+from multilift_marl.config.load import load_config
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.errors import CheckpointError, pip_install
 from multilift_marl.tasks import find_task
@@ -109,13 +109,13 @@ def test_the_document_explains_every_field(tmp_path):
 READ = {
     ("reference", "up"): lambda vec: vec.reference.command[0, 0, 2] - vec.task.goal.slots[0, 0, 2],
     ("reference", "yaw"): lambda vec: vec.reference.command_yaw[0, 0] - vec.task.goal.yaw[0],
-    ("velocity", "up"): lambda vec: vec.pilot._setpoint.velocity[0, 0, 2],
+    ("velocity", "up"): lambda vec: vec.controller._setpoint.velocity[0, 0, 2],
     ("velocity", "yaw_rate"): lambda vec: vec.reference.yaw_rate[0, 0],
     ("acceleration", "up"): lambda vec: vec.reference.acceleration[0, 0, 2],
-    ("acc_rates", "pitch_rate"): lambda vec: vec.pilot._setpoint.rates[0, 0, 1],
-    ("ctbr", "thrust"): lambda vec: vec.pilot._setpoint.thrust[0, 0],
-    ("ctbr", "roll_rate"): lambda vec: vec.pilot._setpoint.rates[0, 0, 0],
-    ("ctbr", "yaw_rate"): lambda vec: vec.pilot._setpoint.rates[0, 0, 2],
+    ("acc_rates", "pitch_rate"): lambda vec: vec.controller._setpoint.rates[0, 0, 1],
+    ("ctbr", "thrust"): lambda vec: vec.controller._setpoint.thrust[0, 0],
+    ("ctbr", "roll_rate"): lambda vec: vec.controller._setpoint.rates[0, 0, 0],
+    ("ctbr", "yaw_rate"): lambda vec: vec.controller._setpoint.rates[0, 0, 2],
     ("rotor", "rotor_2"): lambda vec: vec.world.thrust[0, 0, 2],
 }
 

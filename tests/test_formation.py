@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import GRAVITY, make, make_system, refusal
 
-from multilift_marl.config import load_config
+from multilift_marl.config.load import load_config
 from multilift_marl.control.formation import Goal, make_rig, place_formation
 from multilift_marl.control.scripted import INTEGRAL_GAIN, LEAD_GAIN, LINEAR, fitting_scripts, make_scripted
 from multilift_marl.errors import ConfigError
@@ -33,8 +33,8 @@ def test_pulls_balance_the_payloads_weight_and_moments(num_drones, yaw):
     system = make_system(num_drones)
     goal = placed(system, yaw)
     anchors = system.anchors @ goal.rotation[0].T
-    np.testing.assert_allclose(goal.pull[0].sum(axis=0), [0, 0, system.payload_mass * GRAVITY], atol=1e-12)
-    np.testing.assert_allclose(np.cross(anchors, goal.pull[0]).sum(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(goal.cable_force[0].sum(axis=0), [0, 0, system.payload_mass * GRAVITY], atol=1e-12)
+    np.testing.assert_allclose(np.cross(anchors, goal.cable_force[0]).sum(axis=0), 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
@@ -42,9 +42,9 @@ def test_slots_are_at_the_end_of_the_stretched_cables_along_the_pulls(num_drones
     system = make_system(num_drones)
     goal = placed(system, yaw)
     cables = goal.slots[0] - goal.position[0] - system.anchors @ goal.rotation[0].T
-    tension = np.linalg.norm(goal.pull[0], axis=-1, keepdims=True)
+    tension = np.linalg.norm(goal.cable_force[0], axis=-1, keepdims=True)
     length = system.cable_length[:, None] + tension / system.cable_stiffness[:, None]
-    np.testing.assert_allclose(cables, length * goal.pull[0] / tension, atol=1e-12)
+    np.testing.assert_allclose(cables, length * goal.cable_force[0] / tension, atol=1e-12)
 
 
 def test_cables_keep_their_directions_over_a_tilted_target():
@@ -55,7 +55,7 @@ def test_cables_keep_their_directions_over_a_tilted_target():
     anchors = system.anchors @ tilted.rotation[0].T
     cables = goal.slots[0] - goal.position[0] - system.anchors
     np.testing.assert_allclose(tilted.slots[0] - tilted.position[0] - anchors, cables @ turn.T, atol=1e-12)
-    np.testing.assert_allclose(tilted.pull[0], level.pull[0] @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(tilted.cable_force[0], level.cable_force[0] @ turn.T, atol=1e-12)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])

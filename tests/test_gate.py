@@ -91,7 +91,7 @@ def test_success_asks_for_rest_in_the_target_attitude(field, value, option):
         task.time[0], task.goal.position[0] = 14.0, state.payload_position[0]
         task.goal.rotation[0] = np.eye(3)
         task.check(0, 1, 0.0)
-        score = task.scorer(0, 1, vec._action, vec._action)
+        score = task.reward(0, 1, vec._action, vec._action)
         for _ in range(51):
             score()
         assert task.succeeded()[0] == (given is None or bool(options))

@@ -16,8 +16,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import multilift_marl as ml
-from multilift_marl.config import list_configs
-from multilift_marl.envs import faces, gymnasium_env
+from multilift_marl.config.load import list_configs
+from multilift_marl.envs import gymnasium_env, wrapper_utils
 from multilift_marl.envs.gymnasium_env import MultiliftGymnasiumEnv, MultiliftVectorEnv
 
 SHORT = {"env.episode_seconds": 0.2}  # 10 steps
@@ -51,7 +51,7 @@ def flat(vec, info):
 
 @pytest.mark.parametrize("drawn", [False, True], ids=["", "drawn"])
 def test_official_checker_finds_nothing(task, cables, drawn, monkeypatch):
-    monkeypatch.setattr(faces, "Window", MagicMock())  # the checker tries render_mode="human", too: see test_window.py
+    monkeypatch.setattr(wrapper_utils, "Window", MagicMock())  # it tries render_mode="human", too: see test_window.py
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*Box observation space (min|max)imum value is")  # as they are

@@ -10,12 +10,12 @@ from conftest import floats, level, load, make, make_system, mask, refuse_system
 
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.actions import ACTIONS
-from multilift_marl.control.formation import Goal, face, goal_hook, make_rig, place_formation
+from multilift_marl.control.formation import Goal, goal_hook, make_rig, place_formation, set_heading
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import hook_moment
 from multilift_marl.math3d import axis_angle, rot_z
 from multilift_marl.sim import World
-from multilift_marl.sim.standing import hook_place
+from multilift_marl.sim.hover import hook_position
 
 BELOW = [0.0, 0.0, -0.05]
 ASIDE = [[0.03, 0.02, -0.05], [0.0, 0.03, 0.02], [-0.02, 0.0, -0.04], [0.0, 0.0, 0.0]]
@@ -47,8 +47,8 @@ def test_a_team_rests_in_its_slots_under_rotor_thrusts_that_hold_the_moments(hoo
     b = np.array([vehicle.thrust_coefficient for vehicle in system.vehicles])
     thrust = b[None, :, None] * world.state.rotor_speed**2
     moments = np.einsum("nij,nj->ni", np.stack([v.allocation for v in system.vehicles]), thrust[0])[:, 1:]
-    pulls = np.einsum("nji,nj->ni", system.resting_rotation, system.drone_pull)
-    np.testing.assert_allclose(moments, np.cross(system.hooks, pulls), atol=1e-12)
+    cable_forces = np.einsum("nji,nj->ni", system.resting_rotation, system.hook_force)
+    np.testing.assert_allclose(moments, np.cross(system.hooks, cable_forces), atol=1e-12)
     assert np.abs(moments).max() > 0.02
     world.step(thrust, 250)
     assert np.abs(world.state.drone_position - start).max() < 1e-5
@@ -60,7 +60,7 @@ def test_the_controller_holds_a_resting_team(model):
     vec = make("hover", num_envs=1, **STILL, **{"cable.hook": ASIDE, "cable.model": model})
     vec.reset(seed=0)
     level(vec)
-    vec.pilot.start(0)
+    vec.controller.start(0)
     start = vec.world.state.drone_position.copy()
     np.testing.assert_allclose(start, vec.task.goal.slots, atol=1e-9)
     for _ in range(50):
@@ -73,7 +73,7 @@ def test_an_action_of_zero_hovers_with_every_interface(action):
     vec = make("hover", num_envs=1, **STILL, **{"cable.hook": ASIDE, "control.action": action})
     vec.reset(seed=0)
     level(vec)
-    vec.pilot.start(0)
+    vec.controller.start(0)
     start = vec.world.state.drone_position.copy()
     for _ in range(15):
         vec.step(zeros(vec))
@@ -118,9 +118,9 @@ def test_the_controller_feeds_the_moment_of_the_pull_forward():
     gains = make_gains(ControlConfig(), system)
     for n in range(4):
         rotation = np.reshape(axis_angle(floats([0.6, 0.0, 0.8]), 0.7), (3, 3))
-        pull, acceleration = rng.normal(size=(2, 3))
-        expected = np.cross(system.hooks[n], rotation.T @ (pull + gains.load_share[n] * acceleration))
-        found = hook_moment(n, floats(rotation), floats(pull), floats(acceleration), gains)
+        cable_force, acceleration = rng.normal(size=(2, 3))
+        expected = np.cross(system.hooks[n], rotation.T @ (cable_force + gains.load_share[n] * acceleration))
+        found = hook_moment(n, floats(rotation), floats(cable_force), floats(acceleration), gains)
         np.testing.assert_allclose(found, expected, atol=1e-15)
 
 
@@ -137,7 +137,7 @@ def test_starts_and_observations_are_of_the_hooks(model):
     np.testing.assert_allclose(told, span / world.system.cable_length, rtol=1e-6)
     stretch = 1 + world.state.cable_tension / world.system.cable_stiffness
     np.testing.assert_allclose(span, stretch, rtol=1e-9 if model == "massless" else 1e-4)
-    place = hook_place(3, 1, world.state, world.system.hooks)
+    place = hook_position(3, 1, world.state, world.system.hooks)
     np.testing.assert_allclose(place, hooks_of(world)[3, 1], atol=1e-12)
 
 
@@ -149,7 +149,7 @@ def test_drones_that_face_elsewhere_keep_their_hooks_where_they_were():
     turned = np.reshape(rot_z(0.4), (3, 3)) @ system.cable_ends.T
     hooks, slots = np.array([goal_hook(0, n, goal, rig) for n in range(4)]), goal.slots.copy()
     np.testing.assert_allclose(hooks, turned.T + [1, 2, 3], atol=1e-12)
-    face(0, 2.0, goal, rig)
+    set_heading(0, 2.0, goal, rig)
     assert goal.drone_yaw[0] == 2.0
     np.testing.assert_allclose([goal_hook(0, n, goal, rig) for n in range(4)], hooks, atol=1e-12)
     assert np.abs(goal.slots - slots)[0, 0].max() > 0.01 and np.abs(goal.slots - slots)[0, 3].max() < 1e-12

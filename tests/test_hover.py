@@ -25,7 +25,8 @@ def test_hover_starts_are_as_documented():
     assert 0.29 < speed.max() <= 0.3
     np.testing.assert_array_equal(state.drone_velocity, np.repeat(state.payload_velocity[:, None], 4, axis=1))
     expected = (
-        np.linalg.norm(system.formation_force, axis=1) * (vec.world.plant.payload_mass / system.payload_mass)[:, None]
+        np.linalg.norm(system.formation_force, axis=1)
+        * (vec.world.hidden_loads.payload_mass / system.payload_mass)[:, None]
     )
     np.testing.assert_allclose(state.cable_tension, expected, rtol=1e-6)
 
@@ -37,7 +38,7 @@ def hover_terms(displace) -> dict[str, float]:
     level(vec)
     displace(vec.world.state)
     vec.task.check(0, 1, 0.0)
-    vec.task.scorer(0, 1, still, still)()
+    vec.task.reward(0, 1, still, still)()
     return dict(zip(vec.reward_terms, vec.task.terms[0], strict=True))
 
 
@@ -116,7 +117,7 @@ def test_observations_do_not_depend_on_place_and_heading():
     for array in (task.goal.position, state.payload_position, state.drone_position, reference.position):
         array[:] = array @ turn.T + shift
     for array in (
-        state.payload_velocity, state.drone_velocity, reference.velocity, vec.world.plant.payload_force,
+        state.payload_velocity, state.drone_velocity, reference.velocity, vec.world.hidden_loads.payload_force,
         task.errors.position_integral, task.errors.rotation_integral,
     ):  # fmt: skip
         array[:] = array @ turn.T

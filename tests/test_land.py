@@ -52,7 +52,7 @@ def test_land_starts_are_as_documented():
     assert np.abs(task.course[:, :2]).max() <= 1 and np.ptp(task.course[:, :2]) > 1.99
     assert np.degrees(np.abs(task.goal.yaw).max()) <= 45 and np.degrees(np.ptp(task.goal.yaw)) > 89
     assert (state.payload_velocity == 0).all() and task.errors.angle.max() < 1e-7
-    expected = system.resting_tension * (vec.world.plant.payload_mass / system.payload_mass)[:, None]
+    expected = system.resting_tension * (vec.world.hidden_loads.payload_mass / system.payload_mass)[:, None]
     np.testing.assert_allclose(state.cable_tension, expected, rtol=1e-6)
 
 
@@ -148,7 +148,7 @@ def test_scripts_land(script):
 def test_in_return_motors_off_lose_to_staying_high_to_the_formation_to_its_integral():
     def score(script=None, **gains):
         vec = make("land", num_envs=32)
-        vec.pilot.gains = vec.pilot.gains._replace(**gains)
+        vec.controller.gains = vec.controller.gains._replace(**gains)
         vec._bind()
         vec.reset(seed=0)
         high = zeros(vec)

@@ -27,7 +27,7 @@ def test_the_drawn_drone_is_lost_at_the_drawn_time():
         vec.step(zeros(vec))
         gone = vec.task.watch.lost.any(axis=1)
         assert (gone == (vec.task.when <= 0.02 * step + 1e-9)).all()
-    assert (vec.task.watch.lost == vec.world.plant.motors_off).all()
+    assert (vec.task.watch.lost == vec.world.hidden_loads.motors_off).all()
     assert (vec.task.watch.lost.argmax(axis=1) == vec.task.who).all() and gone.all()
 
 
@@ -50,7 +50,9 @@ def test_with_a_snapped_cable_the_drone_is_gone():
         assert state.cable_broken[e].tolist() == [i == n for i in range(4)]
         assert state.cable_tension[e, n] == 0 and state.drone_position[e, n, 2] < 0.5
     vec.reset()
-    assert not state.cable_broken.any() and not vec.world.plant.motors_off.any() and not vec.task.watch.lost.any()
+    assert (
+        not state.cable_broken.any() and not vec.world.hidden_loads.motors_off.any() and not vec.task.watch.lost.any()
+    )
     vec.step(zeros(vec))
     assert (state.cable_tension > 0).all()
 
@@ -92,7 +94,7 @@ def judge_held(degrees=0.0, speed=0.0, body_rate=0.0, tension=1.0, **options):
     state.cable_tension[0] = tension * vec.world.system.resting_tension
     task.check(0, 1, 0.0)
     task.planner(0, 1)()
-    score = task.scorer(0, 1, vec._action, vec._action)
+    score = task.reward(0, 1, vec._action, vec._action)
     for _ in range(101):
         score()
     task.watch.lost[0, 0] = True

@@ -10,11 +10,11 @@ import pytest
 from conftest import floats, load, make, make_system, refuse_system, same, zeros
 
 import multilift_marl as ml
-from multilift_marl.config.rig import formation_forces
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.config.vehicles import PRESETS
 from multilift_marl.control.gains import drone_gains, make_gains
 from multilift_marl.control.scripted import make_scripted
+from multilift_marl.rig.payload import formation_forces
+from multilift_marl.rig.vehicles import PRESETS
 from multilift_marl.sim import World
 from multilift_marl.sim.air import make_air, wash_at
 from multilift_marl.sim.contact import drone_half_size

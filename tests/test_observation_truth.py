@@ -70,13 +70,13 @@ class Moment:
         self.vec, self.observation, self.action = vec, observation, action
         self.state = {name: array.copy() for name, array in world.state._asdict().items()}
         self.goal = {name: array.copy() for name, array in task.goal._asdict().items()}
-        self.way = {name: array.copy() for name, array in task.way._asdict().items()}
+        self.planned = {name: array.copy() for name, array in task.planned._asdict().items()}
         self.reference = {name: array.copy() for name, array in vec.reference._asdict().items()}
-        self.lost = world.plant.motors_off.copy()
+        self.lost = world.hidden_loads.motors_off.copy()
         self.seconds = 0.0 if before is None else before.seconds + task.dt
         apart = (
-            self.state["payload_position"] - self.way["position"],
-            rotation_vector(self.state["payload_rotation"], self.way["rotation"]),
+            self.state["payload_position"] - self.planned["position"],
+            rotation_vector(self.state["payload_rotation"], self.planned["rotation"]),
         )
         self.integrals = [np.zeros_like(error) for error in apart]
         if before is not None:
@@ -194,9 +194,9 @@ def pose(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
     """See docs/pose.md."""
     each = m.vec.task.options.target_seconds
     return {
-        "way_position": m.in_slot_frame(m.way["position"] - m.goal["position"]),
-        "way_velocity": m.in_slot_frame(m.way["velocity"]),
-        "way_rotation": m.in_slot_frame(rotation_vector(m.way["rotation"], m.goal["rotation"])),
+        "planned_position": m.in_slot_frame(m.planned["position"] - m.goal["position"]),
+        "planned_velocity": m.in_slot_frame(m.planned["velocity"]),
+        "planned_rotation": m.in_slot_frame(rotation_vector(m.planned["rotation"], m.goal["rotation"])),
         "time_left": everyone(m, 1 - ((m.seconds + 1e-9) % each) / each),
     }
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import GRAVITY, load, make, make_system, refuse_system
 
-from multilift_marl.config.vehicles import PRESETS
+from multilift_marl.rig.vehicles import PRESETS
 from multilift_marl.sim import World
 
 MIX = ["falcon", "hummingbird", "iris"]

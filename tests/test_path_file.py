@@ -271,9 +271,9 @@ def test_drones_see_where_the_path_goes_on(tmp_path):
 
 def test_what_is_drawn_is_the_path(tmp_path):
     rows = loop()
-    route = fly(save(tmp_path, rows), **{"env.episode_seconds": 20.0}).task.route(0)
-    np.testing.assert_allclose(route[[0, -1]], rows[[0, -1], 1:4], atol=1e-9)
-    assert np.abs(np.hypot(route[:, 0], route[:, 1] - 1) - 1).max() < 1e-3
+    target_path = fly(save(tmp_path, rows), **{"env.episode_seconds": 20.0}).task.target_path(0)
+    np.testing.assert_allclose(target_path[[0, -1]], rows[[0, -1], 1:4], atol=1e-9)
+    assert np.abs(np.hypot(target_path[:, 0], target_path[:, 1] - 1) - 1).max() < 1e-3
 
 
 def test_an_episode_goes_on_from_saved_state(tmp_path):

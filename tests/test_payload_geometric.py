@@ -139,7 +139,7 @@ def test_it_leaves_slack_cables_to_the_formation(task):
     held = 0
     for _ in range(vec.max_steps):
         action = script.act(observation)
-        slack = np.linalg.norm(vec.task.goal.pull, axis=-1).max(axis=1) < 1e-9
+        slack = np.linalg.norm(vec.task.goal.cable_force, axis=-1).max(axis=1) < 1e-9
         assert np.isfinite(action).all() and not action[slack].any()
         held += slack.sum()
         observation, _, terminated, truncated, _ = vec.step(action)

@@ -9,10 +9,10 @@ import pytest
 from conftest import make, refusal, same, zeros
 
 import multilift_marl as ml
+from multilift_marl.control.cable_forces import is_stable
 from multilift_marl.control.gains import make_gains
-from multilift_marl.control.pulls import settles
 from multilift_marl.control.scripted import make_scripted
-from multilift_marl.tasks.way import aim, attitude_of
+from multilift_marl.tasks.trajectory import attitude_of, set_goal_from_plan
 
 CALM = {"randomization.payload_mass": 0.0}
 
@@ -77,9 +77,9 @@ def test_the_payload_settles_at_every_target():
     np.testing.assert_allclose(task._bounds.stiffness, 0.5 * gains.mass * gains.k_p)
     for stage in (1, 2, 3):
         for e in range(300):
-            aim(e, stage, task.plan, task.goal, task.rig, task.nominal_hanging)
-            assert settles(e, task.goal, task.rig, task.nominal_hanging, task._bounds.stiffness)
-    assert not all(settles(e, task.goal, task.rig, task.nominal_hanging, np.full(3, 0.5)) for e in range(300))
+            set_goal_from_plan(e, stage, task.plan, task.goal, task.rig, task.nominal_hanging)
+            assert is_stable(e, task.goal, task.rig, task.nominal_hanging, task._bounds.stiffness)
+    assert not all(is_stable(e, task.goal, task.rig, task.nominal_hanging, np.full(3, 0.5)) for e in range(300))
 
 
 def test_drones_are_above_a_tilted_payload():
@@ -115,7 +115,7 @@ def test_pose_pays_every_positive_weight_in_full_at_rest_at_the_goal():
     state.payload_position[:], state.payload_rotation[:] = goal.position, goal.rotation
     state.payload_velocity[:], state.payload_body_rates[:] = 0, 0
     vec.task.check(0, 1, 0.0)
-    vec.task.scorer(0, 1, still, still)()
+    vec.task.reward(0, 1, still, still)()
     paid = dict(zip(vec.reward_terms, vec.task.terms[0], strict=True))
     assert paid == pytest.approx({name: max(weight, 0.0) for name, weight in vec.task.REWARD.items()})
 
@@ -124,7 +124,7 @@ def test_returns_rank_motors_off_holding_the_start_and_the_scripts():
     def score(script="formation", off=False, **options):
         vec = make("pose", num_envs=48, **{f"task_options.{key}": value for key, value in options.items()})
         if off:
-            vec.pilot.gains = vec.pilot.gains._replace(thrust_min=np.zeros(4), thrust_max=np.zeros(4))
+            vec.controller.gains = vec.controller.gains._replace(thrust_min=np.zeros(4), thrust_max=np.zeros(4))
             vec._bind()
         policy, total, over = make_scripted(script, vec), np.zeros(48), np.zeros(48, bool)
         observation, _ = vec.reset(seed=0)
@@ -149,7 +149,7 @@ def test_returns_rank_motors_off_holding_the_start_and_the_scripts():
 def test_integrals_count_the_distance_from_the_way():
     vec, total = make("pose", num_envs=4, **CALM), 0.0
     for _ in flown(vec, 60):
-        total = np.clip(total + vec.task.dt * (vec.world.state.payload_position - vec.task.way.position), -0.5, 0.5)
+        total = np.clip(total + vec.task.dt * (vec.world.state.payload_position - vec.task.planned.position), -0.5, 0.5)
     np.testing.assert_allclose(vec.task.errors.position_integral, total, atol=1e-12)
     assert vec.task.errors.distance.max() > 0.5 and np.abs(total).max() < 0.1
 
@@ -158,10 +158,10 @@ def test_observations_tell_where_the_way_is_and_how_much_time_is_left():
     vec = make("pose", num_envs=2)
     for _ in flown(vec, 230):
         pass
-    goal, way, names = vec.task.goal, vec.task.way, vec.observation_names
+    goal, planned, names = vec.task.goal, vec.task.planned, vec.observation_names
     c, s = goal.slot_frame[..., 0], goal.slot_frame[..., 1]
-    assert np.linalg.norm(way.velocity, axis=1).min() > 0.1
-    for name, (x, y, z) in (("position", (way.position - goal.position).T), ("velocity", way.velocity.T)):
+    assert np.linalg.norm(planned.velocity, axis=1).min() > 0.1
+    for name, (x, y, z) in (("position", (planned.position - goal.position).T), ("velocity", planned.velocity.T)):
         x, y, z = x[:, None], y[:, None], np.broadcast_to(z[:, None], c.shape)
         at, expected = names.index(f"way_{name}_0"), np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
         np.testing.assert_allclose(vec._observation[..., at : at + 3], expected, atol=1e-5)

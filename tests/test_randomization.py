@@ -92,7 +92,7 @@ def test_info_tells_the_draw_at_reset_and_at_every_step(task, cables):
     info = vec.step(zeros(vec))[4]
     assert same(told, info["randomization"])
     assert same(told["vehicle_mass"], vec.world.parameters.vehicle_mass)
-    assert same(told["payload_force"], vec.world.plant.payload_force)
+    assert same(told["payload_force"], vec.world.hidden_loads.payload_force)
     with pytest.raises(ValueError, match="read-only"):
         told["vehicle_mass"][0] = 1
     again = vec.reset(mask=mask(4, 1))[1]["randomization"]
@@ -159,9 +159,11 @@ def test_a_cable_stretches_by_its_own_stiffness_from_its_own_length(model):
     world.state.drone_position[:, 0] = world.state.payload_position + length * [0, 0, 1]
     world.load(EVERYONE)
     for _ in range(4000):
-        pull = GRAVITY * (load + rope + system.vehicle.mass)
+        cable_force = GRAVITY * (load + rope + system.vehicle.mass)
         height = world.state.drone_position[:, 0, 2] - 2.5
-        world.step((pull - 20 * height - 12 * world.state.drone_velocity[:, 0, 2])[:, None, None].repeat(4, 2) / 4)
+        world.step(
+            (cable_force - 20 * height - 12 * world.state.drone_velocity[:, 0, 2])[:, None, None].repeat(4, 2) / 4
+        )
     stretch = world.state.drone_position[:, 0, 2] - world.state.payload_position[:, 2] - length[:, 0]
     own = rope / 2 if model == "chain" else 0.0
     np.testing.assert_allclose(stretch, GRAVITY * (load + own) / stiffness[:, 0], rtol=1e-5)
@@ -276,9 +278,9 @@ def test_force_and_wind_act_at_the_true_centre_of_mass(model, load):
     world.load(one)
     force = np.array([0.0, 4.0, 1.0])
     if load == "force":
-        world.plant.payload_force[:] = force
+        world.hidden_loads.payload_force[:] = force
     else:
-        world.plant.wind[:] = np.sqrt(2 / (1.225 * system.payload_drag_area * np.linalg.norm(force))) * force
+        world.hidden_loads.wind[:] = np.sqrt(2 / (1.225 * system.payload_drag_area * np.linalg.norm(force))) * force
     world.step(np.zeros((1, 1, 4)), 20)
     state = world.state
     middle = state.payload_velocity[0] + state.payload_rotation[0] @ np.cross(state.payload_body_rates[0], shift)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import make, zeros
 
-from multilift_marl.tasks.failures import CABLE, TILT, forgive
+from multilift_marl.tasks.failures import CABLE, TILT, ignore
 
 
 def starts(config: str, count: int = 200):
@@ -49,11 +49,11 @@ def test_crazymarl_starts_are_its_samplers():
 def test_tilt_and_cable_angle_count_after_the_grace_alone():
     vec = make("recover", num_envs=2)
     vec.reset(seed=0)
-    assert (vec.task.watch.forgiven == forgive(TILT, CABLE)).all()
+    assert (vec.task.watch.ignored == ignore(TILT, CABLE)).all()
     for step in range(101):
-        assert (vec.task.watch.forgiven != 0).all() == (step <= 100 and vec.task.time[0] <= 2.0)
+        assert (vec.task.watch.ignored != 0).all() == (step <= 100 and vec.task.time[0] <= 2.0)
         vec.step(zeros(vec))
-    assert (vec.task.watch.forgiven == 0).all()
+    assert (vec.task.watch.ignored == 0).all()
 
 
 def test_success_is_within_a_centimetre_at_the_end():

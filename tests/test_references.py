@@ -18,7 +18,7 @@ from multilift_marl.sim import World
 # The smoothed reference
 
 
-def follow(command, seconds, yaw=0.0, frequency=6.0, speed=1.0, dt=0.004) -> Reference:
+def control_step(command, seconds, yaw=0.0, frequency=6.0, speed=1.0, dt=0.004) -> Reference:
     """Return a reference's history, one step for each environment, after it started at rest at the origin."""
     steps = round(seconds / dt)
     one, history = Reference.zeros(1, 1), Reference.zeros(steps, 1)
@@ -32,7 +32,7 @@ def follow(command, seconds, yaw=0.0, frequency=6.0, speed=1.0, dt=0.004) -> Ref
 
 def test_a_near_command_is_approached_like_a_critically_damped_third_order_step():
     dt, w = 1e-4, 6.0
-    history = follow([0.2, -0.1, 0.1], 1.5, dt=dt)
+    history = control_step([0.2, -0.1, 0.1], 1.5, dt=dt)
     t = dt * np.arange(1, len(history.position) + 1)[:, None]
     share = 1 - np.exp(-w * t) * (1 + w * t + (w * t) ** 2 / 2)
     np.testing.assert_allclose(history.position[:, 0], share * [0.2, -0.1, 0.1], atol=2e-4)
@@ -42,28 +42,28 @@ def test_a_near_command_is_approached_like_a_critically_damped_third_order_step(
 
 @pytest.mark.parametrize("distance", [0.1, 0.6, 4.0])
 def test_no_command_is_overshot(distance):
-    history = follow([0, distance, 0], 10.0)
+    history = control_step([0, distance, 0], 10.0)
     assert history.position[:, 0, 1].max() <= distance + 1e-6
     assert history.position[-1, 0, 1] == pytest.approx(distance, abs=1e-6)
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 2.0])
 def test_a_far_command_is_approached_at_the_speed_limit(speed):
-    history = follow([6.0, -6.0, 6.0], 5.0, speed=speed)
+    history = control_step([6.0, -6.0, 6.0], 5.0, speed=speed)
     norm = np.linalg.norm(history.velocity[:, 0], axis=-1)
     assert norm.max() <= 1.01 * speed
     assert norm[round(2 / 0.004)] == pytest.approx(speed, rel=0.01)
 
 
 def test_velocity_acceleration_and_jerk_are_derivatives():
-    history = follow([2.0, 0.5, -0.3], 2.0, dt=1e-3)
+    history = control_step([2.0, 0.5, -0.3], 2.0, dt=1e-3)
     for lower, higher in [("position", "velocity"), ("velocity", "acceleration"), ("acceleration", "jerk")]:
         slope = np.diff(getattr(history, lower), axis=0) / 1e-3
         np.testing.assert_allclose(slope, getattr(history, higher)[1:], atol=1e-9)
 
 
 def test_yaw_is_approached_like_a_critically_damped_second_order_step():
-    history = follow([0, 0, 0], 1.5, yaw=0.8, dt=1e-4)
+    history = control_step([0, 0, 0], 1.5, yaw=0.8, dt=1e-4)
     wt = 6.0 * 1e-4 * np.arange(1, len(history.yaw) + 1)
     np.testing.assert_allclose(history.yaw[:, 0], 0.8 * (1 - np.exp(-wt) * (1 + wt)), atol=1e-3)
 
@@ -72,7 +72,7 @@ def test_yaw_is_approached_like_a_critically_damped_second_order_step():
     "command, expected", [(2.5, 2.5), (4.0, 4.0 - 2 * pi), (-3.5, 2 * pi - 3.5), (7.0, 7.0 - 2 * pi)]
 )
 def test_yaw_takes_the_short_way(command, expected):
-    assert follow([0, 0, 0], 6.0, yaw=command).yaw[-1, 0] == pytest.approx(expected, abs=1e-6)
+    assert control_step([0, 0, 0], 6.0, yaw=command).yaw[-1, 0] == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_wrap_of_less_than_a_turn_too_much_is_exact():
 @pytest.mark.parametrize("frequency", [62.5, 1e-2])
 def test_the_fastest_and_the_slowest_filter_stay_smooth(frequency):
     """A quarter of the control rate is the fastest that the configuration takes; from 130 rad/s on it would diverge."""
-    history = follow([0.2, -0.1, 0.1], 2.0, yaw=0.8, frequency=frequency)
+    history = control_step([0.2, -0.1, 0.1], 2.0, yaw=0.8, frequency=frequency)
     assert np.abs(history.position[:, 0]).max() <= 0.2 * 1.02
     assert np.abs(history.yaw).max() <= 0.8 * 1.02
 

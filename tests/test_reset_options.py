@@ -57,7 +57,7 @@ def test_the_physics_has_the_fixed_values():
     masses = batch.expanded("body_mass")
     assert (masses[:, model.body("payload").id] == 1.0).all() and (masses[:, model.body("drone_1").id] == 0.7).all()
     assert (batch.expanded("tendon_range")[:, :, 1] == [1.0, 1.2]).all()
-    assert (vec.world.plant.wind == [1.0, 0.0, 0.0]).all()
+    assert (vec.world.hidden_loads.wind == [1.0, 0.0, 0.0]).all()
 
 
 def test_an_episode_with_its_own_draw_fixed_is_the_same_episode(task, cables):

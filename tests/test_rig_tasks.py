@@ -5,7 +5,7 @@ import json
 import pytest
 
 from multilift_marl.cli.evaluate import main as evaluate
-from multilift_marl.config import load_config
+from multilift_marl.config.load import load_config
 
 RECIPES = [("rigs/falcon3", "pose", "pose_falcon3"), ("rigs/crazyflie2", "recover", "recover_crazymarl")]
 

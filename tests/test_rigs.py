@@ -11,10 +11,10 @@ import pytest
 from conftest import hover_thrust, level, load, make, make_system, refuse_system, same
 
 import multilift_marl as ml
-from multilift_marl.config import list_configs
-from multilift_marl.config.mesh import read_mesh
+from multilift_marl.config.load import list_configs
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.math3d import axis_angle
+from multilift_marl.rig.mesh import read_mesh
 from multilift_marl.sim import World
 from multilift_marl.sim.scene import build_model
 from multilift_marl.tasks.failures import CAUSES
@@ -116,7 +116,7 @@ def test_a_payload_pulled_along_its_centre_of_mass_does_not_turn():
     world = World(system, 1, 1)
     world.state.payload_position[:], world.state.drone_position[:] = [0, 0, 100], [0, 0, 102]
     load(world)
-    world.plant.payload_force[:] = [5.0, 2.0, 0.0]
+    world.hidden_loads.payload_force[:] = [5.0, 2.0, 0.0]
     world.step(np.zeros((1, 1, 4)), 100)
     assert np.abs(world.state.payload_velocity).max() > 1
     assert np.abs(world.state.payload_body_rates).max() < 1e-9

@@ -100,7 +100,7 @@ def test_energy_is_the_integral_of_rotor_torque_times_speed():
     vehicle, speed = world.system.vehicle, world.state.rotor_speed.copy()
     world.step(hover_thrust(world), 100)
     power = (vehicle.torque_ratio * vehicle.thrust_coefficient * speed**3).sum()
-    assert world.record.energy[0] == pytest.approx(0.4 * power, rel=1e-9)
+    assert world.stats.energy[0] == pytest.approx(0.4 * power, rel=1e-9)
 
 
 # The rotors' own inertia

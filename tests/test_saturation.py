@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from conftest import floats, make, zeros
 
-from multilift_marl.config.vehicles import PRESETS
 from multilift_marl.control.allocation import allocate
+from multilift_marl.rig.vehicles import PRESETS
 from multilift_marl.validation.release import attitudes, release_drones
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.config.schema import Config
 from multilift_marl.config.values import Between, Section
 from multilift_marl.errors import ConfigError
 

@@ -31,7 +31,7 @@ def fly_once(vec: MultiliftVec, act, seed: int = 0) -> tuple[np.ndarray, np.ndar
 def test_in_return_motors_off_lose_to_holding_the_start_to_the_formation_to_its_integral():
     def score(script=None, **gains):
         vec = make("hover", num_envs=64)
-        vec.pilot.gains = vec.pilot.gains._replace(**gains)
+        vec.controller.gains = vec.controller.gains._replace(**gains)
         vec._bind()
         first, _ = vec.reset(seed=0)
         at = vec.observation_names.index("slot_error_0")

@@ -12,13 +12,13 @@ from multilift_marl.control.gains import Gains, drone_gains, make_gains
 from multilift_marl.control.geometric import rate_torque
 from multilift_marl.control.setpoints import (
     Setpoint,
-    drift,
     fly_acc_rates,
     fly_acceleration,
     fly_attitude,
     fly_rates,
     fly_velocity,
     smooth_velocity,
+    track_own_state,
 )
 from multilift_marl.math3d import axis_angle
 from multilift_marl.sim import World
@@ -230,7 +230,7 @@ def test_below_the_position_references_go_with_the_drone():
     world.state.drone_velocity[0, 0] = [1, 2, 3]
     reference = Reference.zeros(1, 1)
     reference.yaw_rate[0, 0] = 0.5
-    drift(0, 1, world.state, reference, 0.1)
+    track_own_state(0, 1, world.state, reference, 0.1)
     np.testing.assert_array_equal(reference.position, world.state.drone_position)
     np.testing.assert_array_equal(reference.velocity, world.state.drone_velocity)
     assert reference.yaw[0, 0] == pytest.approx(0.05)

@@ -55,7 +55,7 @@ def thrown_apart(speed: float, timestep: float, tilt: float = 0.0, phase: float 
     state.payload_velocity[:], state.drone_velocity[:] = -0.5 * speed * along, 0.5 * speed * along
     state.rotor_speed[:] = 0.0
     load(world)
-    world.plant.motors_off[:] = True
+    world.hidden_loads.motors_off[:] = True
     world.step(np.zeros((1, 1, 4)), round((0.03 / speed + 0.05) / timestep))
     return world
 
@@ -66,13 +66,13 @@ def thrown_apart(speed: float, timestep: float, tilt: float = 0.0, phase: float 
 def test_the_recorded_peak_does_not_depend_on_the_time_step(speed, timestep, tilt):
     for phase in (0.0, 0.5, 0.9):
         world = thrown_apart(speed, timestep, tilt, phase)
-        assert world.record.tension_peak[0] == pytest.approx(1e3 * speed, rel=0.01)  # c v: it falls from there
+        assert world.stats.tension_peak[0] == pytest.approx(1e3 * speed, rel=0.01)  # c v: it falls from there
 
 
 def test_fine_steps_show_the_same_peak():
     seen = 0.0
     world = thrown_apart(1.0, 1e-5)
-    assert world.record.tension_peak[0] == pytest.approx(1000, rel=0.01)
+    assert world.stats.tension_peak[0] == pytest.approx(1000, rel=0.01)
     world = thrown_apart(1.0, 4e-3)
     seen = float(world.state.cable_tension.max())
     assert seen < 100  # means over steps of 4 ms

@@ -9,9 +9,9 @@ import pytest
 from conftest import GRAVITY, make_system, refusal, refuse_system, refuse_task
 
 import multilift_marl as ml
-from multilift_marl.config.feasibility import MIN_THRUST_TO_WEIGHT
-from multilift_marl.config.rig import formation_forces
-from multilift_marl.config.vehicles import PRESETS
+from multilift_marl.rig.feasibility import MIN_THRUST_TO_WEIGHT
+from multilift_marl.rig.payload import formation_forces
+from multilift_marl.rig.vehicles import PRESETS
 
 # What is refused
 

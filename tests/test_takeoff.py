@@ -80,7 +80,7 @@ def test_the_velocities_of_the_plan_are_those_of_target_and_slots():
 
 
 def test_cables_are_slack_until_the_drones_close_them_and_taut_when_they_pull():
-    assert (after(TIGHTEN[0], 8).world.record.tension_max == 0).all()
+    assert (after(TIGHTEN[0], 8).world.stats.tension_max == 0).all()
     vec = after(PULL[0] + 0.6 * PULL[1], 8)
     assert (vec.world.state.cable_tension > 0.2 * vec.world.system.resting_tension).all()
     assert (vec.task.stage == FLYING).all()
@@ -90,7 +90,7 @@ def test_the_team_of_a_known_payload_lifts_it_with_no_jerk_at_its_cables():
     vec = after(ARRIVED + 1.0, 4, **CALM)
     assert (vec.task.stage == LIFTED).all()
     assert vec.task.errors.distance.max() < 0.01
-    assert (vec.world.record.tension_max < 1.3 * vec.world.system.resting_tension.max()).all()
+    assert (vec.world.stats.tension_max < 1.3 * vec.world.system.resting_tension.max()).all()
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
@@ -101,7 +101,7 @@ def test_the_pull_suits_lighter_and_heavier_payloads(factor):
     for _ in range(vec.max_steps):
         *_, info = vec.step(zeros(vec))
     assert info["success"].all()
-    assert (vec.world.record.tension_max < 1.5 * factor * vec.world.system.resting_tension.max()).all()
+    assert (vec.world.stats.tension_max < 1.5 * factor * vec.world.system.resting_tension.max()).all()
 
 
 # What is forgiven
@@ -150,8 +150,10 @@ def test_collisions_and_tumbling_are_never_forgiven(seconds):
 def test_success_is_at_the_final_target_with_never_more_than_twice_the_resting_tension():
     vec = after(9.9, 8, **{"task_options.success_distance": 0.1})
     assert vec.task.succeeded().all()
-    static = vec.world.system.resting_tension.max() * vec.world.plant.payload_mass / vec.world.system.payload_mass
-    vec.world.record.tension_max[:4] = 2.01 * static[:4]
+    static = (
+        vec.world.system.resting_tension.max() * vec.world.hidden_loads.payload_mass / vec.world.system.payload_mass
+    )
+    vec.world.stats.tension_max[:4] = 2.01 * static[:4]
     assert vec.task.succeeded().tolist() == [False] * 4 + [True] * 4
     vec.task.good_time[:] = 1.9
     assert not vec.task.succeeded().any()
@@ -171,7 +173,7 @@ def test_the_integral_formation_takes_off():
 def test_in_return_motors_off_lose_to_standing_by_to_the_formation_to_its_integral():
     def score(script=None, raised=0.0, **gains):
         vec = make("takeoff", num_envs=32, **{"control.max_offset": 0.5})
-        vec.pilot.gains = vec.pilot.gains._replace(**gains)
+        vec.controller.gains = vec.controller.gains._replace(**gains)
         vec._bind()
         vec.reset(seed=0)
         action = zeros(vec)

@@ -15,7 +15,7 @@ from conftest import SMALL, make_trainer
 from multilift_marl.agents.checkpoint import load_checkpoint
 from multilift_marl.agents.logging import RunLog, read_metrics
 from multilift_marl.cli.train import main as train
-from multilift_marl.config import load_config
+from multilift_marl.config.load import load_config
 from multilift_marl.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]

@@ -14,7 +14,7 @@ from multilift_marl.agents.logging import RunLog, read_metrics
 from multilift_marl.agents.mappo import update
 from multilift_marl.agents.networks import Normalizer
 from multilift_marl.agents.trainer import adapted_rate, resume_run
-from multilift_marl.config import load_config
+from multilift_marl.config.load import load_config
 from multilift_marl.errors import ConfigError
 
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from multilift_marl.config import load_config
+from multilift_marl.config.load import load_config
 from multilift_marl.sim.air import AIR_DENSITY
 from multilift_marl.validation import symmetry, teams, trajectory
+from multilift_marl.validation.asymmetric_team import make_team
 from multilift_marl.validation.bodies import make_config
 from multilift_marl.validation.cables import second_order
-from multilift_marl.validation.team import make_team
 
 PLAN = trajectory.make_plan((0.1, 0.1))
 
@@ -74,7 +74,7 @@ def test_cables_are_slack_until_they_are_to_tighten(system):
     time = np.linspace(0, PLAN.start[PLAN.names.index("tighten")], 500)[:-1]
     way = trajectory.make_trajectory(system, PLAN, time)
     distance = np.linalg.norm(way.position - way.payload[:, None] - system.anchors, axis=2)
-    assert np.all(distance < system.cable_length + 1e-12) and np.all(way.pull == 0)
+    assert np.all(distance < system.cable_length + 1e-12) and np.all(way.cable_force == 0)
     ground, places = trajectory.on_the_ground(system)
     assert ground == pytest.approx(system.payload_size[2] / 2) and np.all(places[:, 2] > 0)
     np.testing.assert_allclose(way.position[0], places)
@@ -86,10 +86,10 @@ def test_pulls_carry_the_load_against_its_drag(system):
     _, v, a = (part[0] for part in trajectory.load_path(system, PLAN, time))
     drag = 0.5 * AIR_DENSITY * system.payload_drag_area * np.linalg.norm(v) * v
     total = system.payload_mass * (a + [0, 0, 9.81]) + drag
-    np.testing.assert_allclose(way.pull[0].sum(axis=0), total, atol=1e-9)
-    np.testing.assert_allclose(np.cross(system.anchors, way.pull[0]).sum(axis=0), 0, atol=1e-9)
+    np.testing.assert_allclose(way.cable_force[0].sum(axis=0), total, atol=1e-9)
+    np.testing.assert_allclose(np.cross(system.anchors, way.cable_force[0]).sum(axis=0), 0, atol=1e-9)
     cable = way.position[0] - way.payload[0] - system.anchors
-    np.testing.assert_allclose(np.cross(cable, way.pull[0]), 0, atol=1e-9)
+    np.testing.assert_allclose(np.cross(cable, way.cable_force[0]), 0, atol=1e-9)
 
 
 def test_maps_of_teams_undo_themselves():

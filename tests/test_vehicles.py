@@ -11,12 +11,11 @@ import pytest
 from conftest import GRAVITY, floats, free_world, load, make_system, refuse_system
 
 from multilift_marl.config.schema import ControlConfig, VehicleConfig
-from multilift_marl.config.teams import resolve_vehicles
-from multilift_marl.config.vehicles import PRESETS
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.gains import DroneGains, drone_gains, make_gains
 from multilift_marl.control.geometric import attitude_torque
 from multilift_marl.math3d import axis_angle
+from multilift_marl.rig.vehicles import PRESETS, resolve_vehicles
 
 NAMES = sorted(PRESETS)
 LEVEL = floats(np.eye(3))
@@ -206,7 +205,7 @@ def test_position_is_limited_relative_to_attitude_and_the_configured_frequency_i
 def test_a_gain_that_is_limited_says_so_once(caplog, asked, warnings):
     for _ in range(2):
         gains_of("falcon", **asked)
-    assert [record.getMessage().partition(";")[0] for record in caplog.records] == warnings
+    assert [stats.getMessage().partition(";")[0] for stats in caplog.records] == warnings
 
 
 @pytest.mark.parametrize("axis", range(3))

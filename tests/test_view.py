@@ -93,27 +93,27 @@ def test_a_push_moves_the_payload_its_way_for_half_a_second(heading, elevation):
     direction = np.array([np.cos(v) * np.cos(h), np.cos(v) * np.sin(h), np.sin(v)])
     steps = round(PUSH_SECONDS / pushed.vec.task.dt)
     for step in range(steps):
-        assert np.allclose(pushed.vec.world.plant.payload_force[0], 3.0 * direction)
+        assert np.allclose(pushed.vec.world.hidden_loads.payload_force[0], 3.0 * direction)
         for flight in (pushed, calm):
             flight.step()
         if step == 2 and elevation == 0:  # while the cables still hang straight: a/2 t² of the hanging mass
             moved = pushed.vec.world.state.payload_velocity[0] - calm.vec.world.state.payload_velocity[0]
             assert moved @ direction > 0.7 * np.linalg.norm(moved) > 0.02
-    assert (pushed.vec.world.plant.payload_force[0] == calm.vec.world.plant.payload_force[0]).all()
+    assert (pushed.vec.world.hidden_loads.payload_force[0] == calm.vec.world.hidden_loads.payload_force[0]).all()
     gap = (positions(pushed) - positions(calm))[0]
     assert gap @ direction > 0.5 * np.linalg.norm(gap) > 0
 
 
 def test_a_push_adds_to_the_hidden_force_and_a_reset_ends_it():
     flight = session(**{"randomization.payload_force": 1.5})
-    hidden = flight.vec.world.plant.payload_force[0].copy()
+    hidden = flight.vec.world.hidden_loads.payload_force[0].copy()
     for _ in range(2):  # the second push takes the place of the first
         flight.push(0.0, 0.0, 2.0)
-        assert np.allclose(flight.vec.world.plant.payload_force[0], hidden + [2, 0, 0])
+        assert np.allclose(flight.vec.world.hidden_loads.payload_force[0], hidden + [2, 0, 0])
         flight.step()
     flight.reset()
     for _ in range(30):
-        assert (flight.vec.world.plant.payload_force[0] == hidden).all()
+        assert (flight.vec.world.hidden_loads.payload_force[0] == hidden).all()
         flight.step()
 
 
@@ -249,9 +249,9 @@ def test_controls_act_on_the_flight(page):
     assert flight.vec.steps[0] == 1
     controls["heading"].value, controls["force"].value = 90, 5.0
     page.press("push")
-    assert np.allclose(flight.vec.world.plant.payload_force[0], [0, 5, 0])
+    assert np.allclose(flight.vec.world.hidden_loads.payload_force[0], [0, 5, 0])
     page.press("reset")
-    assert flight.vec.steps[0] == 0 and not flight.vec.world.plant.payload_force.any()
+    assert flight.vec.steps[0] == 0 and not flight.vec.world.hidden_loads.payload_force.any()
     page.press("next")
     assert flight.vec.episodes[0] == 1
     controls["speed"].value = "4"

@@ -84,7 +84,7 @@ def test_there_is_no_wash_above_beside_and_from_oneself():
         assert not below(world, point).any(), point
     load(world)
     world.step(steady(world, 1.5))
-    assert below(world, (0, 0, 9)).any() and not world.air.wash[0, 0].any()
+    assert below(world, (0, 0, 9)).any() and not world.air.downwash[0, 0].any()
 
 
 def test_wash_follows_a_tilted_drone():
@@ -112,10 +112,10 @@ def test_wash_drags_the_drones_and_the_payload_below():
     load(world)
     system, vehicle = world.system, world.system.vehicle
     world.step(steady(world, vehicle.mass * GRAVITY / 4))
-    drone, payload = world.air.wash[0, 1], world.air.wash[0, 2]
+    drone, payload = world.air.downwash[0, 1], world.air.downwash[0, 2]
     world.state.drone_position[0, 1] = [1e3, 0, 0]
     np.testing.assert_allclose(drone, below(world, (0.1, 0, 10.5), vehicle.arm), atol=2e-2)
-    assert drone[2] < -2 and payload[2] < drone[2] and not world.air.wash[0, 0].any()
+    assert drone[2] < -2 and payload[2] < drone[2] and not world.air.downwash[0, 0].any()
     np.testing.assert_allclose(world.state.drone_velocity[0, 0], 0, atol=1e-12)
     expected = 0.004 * 0.2 * drone[2] / vehicle.mass
     assert world.state.drone_velocity[0, 1, 2] == pytest.approx(expected, rel=1e-6)
@@ -141,14 +141,14 @@ def test_permuting_the_drones_permutes_the_wash():
         world.state.payload_position[0] = [0, 0, 9]
         load(world)
         world.step(steady(world, 1.5))
-        found.append(world.air.wash[0, np.argsort([*order, 3])])
+        found.append(world.air.downwash[0, np.argsort([*order, 3])])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-12)
 
 
 def test_a_team_in_formation_hardly_blows_on_its_payload():
     world = World(make_system(4, **{"wind.wash": True}), 1, 1)
     world.step(hover_thrust(world), 5)
-    assert np.abs(world.air.wash[0, :4]).max() == 0 and -0.3 < world.air.wash[0, 4, 2] < 0
+    assert np.abs(world.air.downwash[0, :4]).max() == 0 and -0.3 < world.air.downwash[0, 4, 2] < 0
 
 
 # Ground effect

@@ -33,7 +33,7 @@ def fly(world: World, steps: int = 60, seed: int = 0, first: int = 0) -> dict[st
 def disturb(world: World) -> None:
     everyone = np.arange(world.num_envs)
     world.set_parameters(everyone > 0, payload_mass=world.system.payload_mass * (1 + 0.05 * everyone))
-    world.plant.payload_force[:, 0] = 0.3 * everyone
+    world.hidden_loads.payload_force[:, 0] = 0.3 * everyone
 
 
 def rows(saved: dict[str, np.ndarray], chosen) -> dict[str, np.ndarray]:
@@ -53,7 +53,7 @@ def test_an_environment_does_not_feel_its_neighbours():
     system = make_system(4)
     alone, crowd = World(system, 1, 1), World(system, 5, 2)
     crowd.set_parameters(mask(5, 2, 3), payload_mass=np.full(5, 1.6))
-    crowd.plant.payload_force[4] = [0, 1, 0]
+    crowd.hidden_loads.payload_force[4] = [0, 1, 0]
     assert same(rows(fly(crowd), [0]), fly(alone))
 
 
@@ -79,11 +79,11 @@ def test_a_masked_reset_is_a_fresh_start():
 def test_a_reset_restores_the_nominal_plant():
     world = World(make_system(2, **{"wind.velocity": [1, 0, 0]}), 3, 1)
     disturb(world)
-    world.plant.wind[:] = [0, 5, 0]
+    world.hidden_loads.wind[:] = [0, 5, 0]
     world.reset(mask(3, 2))
-    assert world.plant.payload_mass[2] == world.system.payload_mass != world.plant.payload_mass[1]
-    assert world.plant.payload_force[:, 0].tolist() == pytest.approx([0, 0.3, 0])
-    assert world.plant.wind.tolist() == [[0, 5, 0], [0, 5, 0], [1, 0, 0]]
+    assert world.hidden_loads.payload_mass[2] == world.system.payload_mass != world.hidden_loads.payload_mass[1]
+    assert world.hidden_loads.payload_force[:, 0].tolist() == pytest.approx([0, 0.3, 0])
+    assert world.hidden_loads.wind.tolist() == [[0, 5, 0], [0, 5, 0], [1, 0, 0]]
 
 
 @pytest.mark.parametrize("threads", [(1, 1), (1, 2), (2, 1)], ids=str)
@@ -100,12 +100,12 @@ def test_a_saved_world_continues_bit_for_bit(threads):
 def test_the_record_keeps_the_extremes_of_tension():
     world = World(make_system(4), 1, 1)
     rest = world.state.cable_tension[0, 0]
-    assert world.record.tension_min[0] == world.record.tension_max[0] == pytest.approx(rest)
+    assert world.stats.tension_min[0] == world.stats.tension_max[0] == pytest.approx(rest)
     seen = [rest]
     for _ in range(50):
         seen += world.step(1.2 * hover_thrust(world)).cable_tension[0].tolist()
-    assert (world.record.tension_min[0], world.record.tension_max[0]) == (min(seen), max(seen))
-    assert world.record.stretch_max[0] == pytest.approx(max(seen) / 1e5)
+    assert (world.stats.tension_min[0], world.stats.tension_max[0]) == (min(seen), max(seen))
+    assert world.stats.stretch_max[0] == pytest.approx(max(seen) / 1e5)
 
 
 # What is refused, and what goes wrong
@@ -137,7 +137,7 @@ def test_impossible_payload_mass_is_refused(mass):
 def test_a_diverged_simulation_keeps_sound_numbers_and_spares_the_others(force):
     system = make_system(4)
     world, calm = World(system, 5, 2), World(system, 5, 2)
-    world.plant.payload_force[2] = force
+    world.hidden_loads.payload_force[2] = force
     saved, expected = fly(world), fly(calm)
     others = [0, 1, 3, 4]
     assert world.diverged.tolist() == [False, False, True, False, False]
@@ -148,7 +148,7 @@ def test_a_diverged_simulation_keeps_sound_numbers_and_spares_the_others(force):
 def test_reset_heals_a_diverged_simulation():
     system = make_system(4)
     world, fresh = World(system, 3, 1), World(system, 3, 1)
-    world.plant.payload_force[1] = np.nan
+    world.hidden_loads.payload_force[1] = np.nan
     fly(world)
     world.reset(mask(3, 1))
     assert not world.diverged.any()
@@ -162,7 +162,7 @@ def test_divergence_writes_no_file_and_nothing_to_the_screen(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     caplog.set_level(logging.DEBUG, "multilift_marl.mujoco")
     world = World(make_system(4), 4, num_threads)
-    world.plant.payload_force[[0, 3]] = np.nan
+    world.hidden_loads.payload_force[[0, 3]] = np.nan
     world.step(hover_thrust(world), 5)
     assert world.diverged.tolist() == [True, False, False, True]
     assert "simulation is unstable" in caplog.text

@@ -17,8 +17,8 @@ from torchrl.envs import EnvBase, GymEnv, PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 
 import multilift_marl as ml
-from multilift_marl.envs.faces import RENDER_MODES
 from multilift_marl.envs.gymnasium_env import MultiliftGymnasiumEnv, MultiliftVectorEnv
+from multilift_marl.envs.wrapper_utils import RENDER_MODES
 
 SHORT = {"env.episode_seconds": 0.2}  # 10 steps
 BATCH = {"num_envs": 2, "num_threads": 1}

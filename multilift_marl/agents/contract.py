@@ -9,7 +9,7 @@ import numpy as np
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.trained import FORMAT
 from multilift_marl.agents.versions import package_versions
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.control.actions import ACTIONS, Team
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.gains import make_gains
@@ -105,9 +105,9 @@ def _measure_thrusts(config: Config) -> np.ndarray:
     action = np.broadcast_to(np.array([-1.0, 0.0, 1.0])[:, None, None], (e, n, len(interface.numbers))).copy()
     team = Team(
         SystemState.zeros(e, n), Goal.zeros(e, n), Reference.zeros(e, n), Setpoint.zeros(e, n),
-        np.tile(system.drone_pull, (e, 1, 1)), np.zeros((e, n, 4)), make_gains(config.control, system),
+        np.tile(system.hook_force, (e, 1, 1)), np.zeros((e, n, 4)), make_gains(config.control, system),
     )  # fmt: skip
-    interface.act(0, e, action, team)()
+    interface.set_action(0, e, action, team)()
     return interface.thrusts(team)
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from multilift_marl.agents.policy import LearnedPolicy
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.control.policy import Policy
 from multilift_marl.control.scripted import LINEAR
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec

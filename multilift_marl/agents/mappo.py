@@ -40,7 +40,7 @@ class KeyedNetwork(TensorDictModuleBase):
         return tensordict
 
 
-class Explorer(nn.Module):
+class StochasticPolicy(nn.Module):
     """What flies the rollouts: observations to actions drawn from the actor's Gaussian, and their log-probabilities."""
 
     def __init__(self, actor: Actor):
@@ -82,7 +82,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
     agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
     gaussian, log_prob = [agents["loc"], agents["scale"]], ("agents", "action_log_prob")
-    policy = KeyedNetwork(Explorer(actor), agents["observation"], [agents["action"], log_prob])
+    policy = KeyedNetwork(StochasticPolicy(actor), agents["observation"], [agents["action"], log_prob])
     mean = KeyedNetwork(actor, agents["observation"], gaussian)
     judged = ProbabilisticActor(
         mean, in_keys=gaussian, out_keys=[agents["action"]], distribution_class=IndependentNormal,

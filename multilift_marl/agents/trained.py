@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.config.schema import Config
 from multilift_marl.errors import CheckpointError, ConfigError, pip_install
 
 if TYPE_CHECKING:

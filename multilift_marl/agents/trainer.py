@@ -30,8 +30,8 @@ from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import RunLog, write_versions
 from multilift_marl.agents.mappo import adapted_rate, make_learner, update
 from multilift_marl.agents.policy import check_policy
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, dump_config
-from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason

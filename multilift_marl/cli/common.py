@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from multilift_marl._interrupt import end_quiet_import
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import check_names, explain, load_config, parse_overrides
-from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install, reason, shorten
 from multilift_marl.plugins import import_modules

@@ -14,8 +14,8 @@ import numpy as np
 
 from multilift_marl.cli.common import make_folder, run_command, title, whole_number
 from multilift_marl.cli.policies import find_policy
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
-from multilift_marl.config.schema import Config
 from multilift_marl.control.scripted import fitting_scripts
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError, nearest

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.control.policy import Policy
 from multilift_marl.control.scripted import SCRIPTED, make_scripted
 from multilift_marl.envs.core import MultiliftVec

@@ -8,8 +8,8 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.files import as_mapping, is_yaml
-from multilift_marl.config.schema import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Section
 from multilift_marl.config.yaml_text import parse_yaml, read_yaml, write_yaml

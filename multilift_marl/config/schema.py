@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from math import pi
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,9 +27,6 @@ from multilift_marl.config.values import (
     Vector,
     VectorPerDrone,
 )
-
-if TYPE_CHECKING:
-    from multilift_marl.config.system import System
 
 
 class EnvConfig(Section):
@@ -340,8 +336,8 @@ else:  # a class statement cannot have a field of this name, a word of Python
     _Imports = create_model("_Imports", __base__=Section, **{"import": (tuple[str, ...], _modules)})
 
 
-class Config(_Imports):
-    """The whole configuration."""
+class SystemConfig(_Imports):
+    """What is simulated; `rig.resolve.resolve_system` computes its numbers."""
 
     task: str = Field("hover", description="name of the task")
     seed: Int = Field(0, ge=0, lt=2**63, description="seed of everything random")
@@ -353,16 +349,3 @@ class Config(_Imports):
     control: ControlConfig = ControlConfig()
     randomization: RandomizationConfig = RandomizationConfig()
     wind: WindConfig = WindConfig()
-    reward: dict[str, Annotated[Float, Between(-1e6, 1e6)]] = Field(
-        {}, description="weights of the task's reward terms"
-    )
-    task_options: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field({}, description="options of the task")
-    train: TrainConfig = TrainConfig()
-    eval: EvalConfig = EvalConfig()
-
-    @cached_property
-    def system(self) -> System:
-        """The physical system that this configuration describes; a ConfigError if it cannot be or cannot fly."""
-        from multilift_marl.config.system import resolve_system
-
-        return resolve_system(self)

@@ -13,11 +13,11 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.gains import Gains, limited
 from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale, sub, tmul, vec
-from multilift_marl.sim.standing import make_drones
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.sim.hover import make_drones
 
 # Bandwidth over ω_p m/(m + m_L), at most: ω_p of the position loop, m and m_L the masses of a drone and of its load.
 # The share m_L/(m + m_L) of a thrust comes back as pull of the cable, which slows any loop around the drone. Faster,
@@ -32,7 +32,7 @@ class Disturbance(NamedTuple):
     """(E, N, 3) estimated force that the drone has to overcome beside the nominal ones, world frame [N]."""
     velocity: np.ndarray
     """(E, N, 3) of the drone one control step ago [m/s]."""
-    pull: np.ndarray
+    cable_force: np.ndarray
     """(E, N, 3) nominal pull and estimate: what the drone flies with [N]."""
 
     @classmethod
@@ -80,7 +80,7 @@ def rotor_force(e, n, state, thrust_coefficient):
 
 
 @kernel
-def forget(e, state, disturbance):
+def reset_estimate(e, state, disturbance):
     """Let the estimates of environment e start anew."""
     for n in range(disturbance.force.shape[1]):
         disturbance.force[e, n] = 0.0
@@ -88,7 +88,7 @@ def forget(e, state, disturbance):
 
 
 @kernel
-def integrate_error(lo, hi, state, reference, pull, disturbance, g, c):
+def integrate_error(lo, hi, state, reference, cable_force, disturbance, g, c):
     """Add the integral of the position error to the pulls of environments lo to hi: `integral`.
 
     F_i = -m k_p ω ∫ (p - p_d) dt, no longer than the limit. While a rotor is at its limit the integral may only shrink.
@@ -101,7 +101,7 @@ def integrate_error(lo, hi, state, reference, pull, disturbance, g, c):
         g, c: Gains, Rejection.
     """
     for e in range(lo, hi):
-        for n in range(pull.shape[1]):
+        for n in range(cable_force.shape[1]):
             saturated, low, high = False, g.thrust_min[n], g.thrust_max[n]
             for k in range(4):
                 thrust = c.thrust_coefficient[n] * state.rotor_speed[e, n, k] ** 2
@@ -112,11 +112,11 @@ def integrate_error(lo, hi, state, reference, pull, disturbance, g, c):
             if saturated and norm(force) > norm(before):
                 force = before
             put(disturbance.force[e, n], force)
-            put(disturbance.pull[e, n], add(vec(pull, e, n), force))
+            put(disturbance.cable_force[e, n], add(vec(cable_force, e, n), force))
 
 
 @kernel
-def estimate_force(lo, hi, state, reference, pull, disturbance, g, c):
+def estimate_force(lo, hi, state, reference, cable_force, disturbance, g, c):
     """Add the measured external force to the pulls of environments lo to hi: `indi`.
 
     What moved the drone over the last control step is m Δv/Δt = F_rotors - m g e3 - (pull, load and drag that are fed
@@ -125,9 +125,9 @@ def estimate_force(lo, hi, state, reference, pull, disturbance, g, c):
     Practice 73, 2018; Tal and Karaman, IEEE TCST 29(3), 2021). Arguments are those of `integrate_error`.
     """
     for e in range(lo, hi):
-        for n in range(pull.shape[1]):
+        for n in range(cable_force.shape[1]):
             velocity, rotors = vec(state.drone_velocity, e, n), rotor_force(e, n, state, c.thrust_coefficient[n])
-            nominal, attitude = vec(pull, e, n), mat(state.drone_rotation, e, n)
+            nominal, attitude = vec(cable_force, e, n), mat(state.drone_rotation, e, n)
             air = tmul(attitude, vec(reference.velocity, e, n))
             drag = mul(attitude, (g.drag[n, 0] * air[0], g.drag[n, 1] * air[1], g.drag[n, 2] * air[2]))
             told = add(add(nominal, drag), scale(g.load_share[n], vec(reference.acceleration, e, n)))
@@ -138,7 +138,7 @@ def estimate_force(lo, hi, state, reference, pull, disturbance, g, c):
             force = limit(add(before, scale(c.share[n], gap)), c.largest[n])
             put(disturbance.force[e, n], force)
             put(disturbance.velocity[e, n], velocity)
-            put(disturbance.pull[e, n], add(nominal, force))
+            put(disturbance.cable_force[e, n], add(nominal, force))
 
 
 REJECTIONS = {"integral": integrate_error, "indi": estimate_force}

@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.math3d import (
     add,
     clip,
@@ -26,7 +24,9 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
-from multilift_marl.sim.standing import Drones, make_drones
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.sim.hover import Drones, make_drones
 
 LEAP_SPEED = 20.0  # [m/s] of a slot from one control step to the next: what is faster was put elsewhere ...
 LEAP_RATE = 50.0  # [rad/s] ... or turned at once
@@ -45,7 +45,7 @@ class Goal(NamedTuple):
     """(E, N, 3) place of each drone with the payload at rest at the target, world frame [m]."""
     slot_frame: np.ndarray
     """(E, N, 2) cosine and sine of the slot frame's heading: x points outward from the payload, z up."""
-    pull: np.ndarray
+    cable_force: np.ndarray
     """(E, N, 3) nominal force of each drone on its cable there [N]."""
     drone_yaw: np.ndarray
     """(E,) heading that the drones are to have, the target's where a task does not say otherwise [rad]."""
@@ -91,7 +91,7 @@ class Rig(NamedTuple):
 
 def make_rig(system: System) -> Rig:
     """Return the formation of `system`."""
-    return Rig(system.anchors, system.slots, system.slot_azimuth, system.drone_pull, make_drones(system))
+    return Rig(system.anchors, system.slots, system.slot_azimuth, system.hook_force, make_drones(system))
 
 
 class Reference(NamedTuple):
@@ -133,7 +133,7 @@ def place_formation(e: int, goal: Goal, rig: Rig) -> None:
         anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
         cable = sub((rig.slots[n, 0], rig.slots[n, 1], rig.slots[n, 2]), anchor)
         put(goal.slots[e, n], add(add(position, mul(target, anchor)), turn(c, s, cable)))
-        put(goal.pull[e, n], turn(c, s, (rig.force[n, 0], rig.force[n, 1], rig.force[n, 2])))
+        put(goal.cable_force[e, n], turn(c, s, (rig.force[n, 0], rig.force[n, 1], rig.force[n, 2])))
         goal.slot_frame[e, n, 0] = cos(yaw + rig.azimuth[n])
         goal.slot_frame[e, n, 1] = sin(yaw + rig.azimuth[n])
 
@@ -141,15 +141,15 @@ def place_formation(e: int, goal: Goal, rig: Rig) -> None:
 @kernel
 def goal_arm(e, n, goal, rig, yaw):
     """Return where the hook of drone n is from its centre as it rests at the target with heading `yaw`, world frame."""
-    return hook_arm(n, vec(goal.pull, e, n), yaw, rig)
+    return hook_arm(n, vec(goal.cable_force, e, n), yaw, rig)
 
 
 @kernel
-def hook_arm(n, pull, yaw, rig):
+def hook_arm(n, cable_force, yaw, rig):
     """Return where the hook of drone n is from its centre as it pulls by `pull` [N] with heading `yaw`, world frame."""
     if not rig.drones.hooked:
         return (0.0, 0.0, 0.0)
-    force = add(pull, (0.0, 0.0, rig.drones.mass[n] * GRAVITY))
+    force = add(cable_force, (0.0, 0.0, rig.drones.mass[n] * GRAVITY))
     return mul(thrust_frame(force, yaw), row(rig.drones.hooks, n))
 
 
@@ -160,7 +160,7 @@ def goal_hook(e, n, goal, rig):
 
 
 @kernel
-def face(e, yaw, goal, rig):
+def set_heading(e, yaw, goal, rig):
     """Give the drones of environment e another heading than the target's; their hooks stay where they are."""
     if rig.drones.hooked:
         for n in range(rig.slots.shape[0]):
@@ -211,7 +211,7 @@ def smooth(lo, hi, reference, frequency, speed, dt):
 
 
 @kernel
-def leave_goal(lo, hi, reference, goal, left):
+def to_goal_frame(lo, hi, reference, goal, left):
     """Make the references of environments lo to hi relative to the slots and motion of their goals, which then move on.
 
     `smooth_moving` makes them absolute again. In between, references ride along: only commands are smoothed, so a

@@ -8,11 +8,11 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.errors import warn_once
 from multilift_marl.math3d import row
-from multilift_marl.sim.standing import make_drones
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.sim.hover import make_drones
 
 POSITION_RATIO = 5.0  # attitude's natural frequency over position's, at least
 
@@ -96,7 +96,7 @@ def make_gains(control: ControlConfig, system: System) -> Gains:
         allocation=drones.allocation,
         thrust_min=np.array([vehicle.thrust_coefficient * vehicle.rotor_speed_min**2 for vehicle in vehicles]),
         thrust_max=np.array([vehicle.rotor_thrust_max for vehicle in vehicles], float),
-        load_share=system.drone_pull[:, 2] / GRAVITY,
+        load_share=system.hook_force[:, 2] / GRAVITY,
         drag=np.array([vehicle.drag for vehicle in vehicles], float) * control.drag_feedforward,
         hooks=drones.hooks,
         hooked=drones.hooked,

@@ -10,7 +10,6 @@ from __future__ import annotations
 from math import cos, sin
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import smooth
 from multilift_marl.control.gains import drone_gains
@@ -32,6 +31,7 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
+from multilift_marl.rig.vehicles import GRAVITY
 
 
 @kernel
@@ -91,7 +91,7 @@ def rate_torque(rates, desired, g):
 
 
 @kernel
-def hook_moment(n, attitude, pull, acceleration, g):
+def hook_moment(n, attitude, cable_force, acceleration, g):
     """Return the moment of the cable about the drone's centre of mass that its rotors are to hold [N m].
 
     Args:
@@ -103,11 +103,11 @@ def hook_moment(n, attitude, pull, acceleration, g):
     """
     if not g.hooked:
         return (0.0, 0.0, 0.0)
-    return cross(row(g.hooks, n), tmul(attitude, add(pull, scale(g.load_share[n], acceleration))))
+    return cross(row(g.hooks, n), tmul(attitude, add(cable_force, scale(g.load_share[n], acceleration))))
 
 
 @kernel
-def wanted_force(feedback, acceleration, velocity, pull, attitude, g):
+def wanted_force(feedback, acceleration, velocity, cable_force, attitude, g):
     """Return the force [N] that a drone's rotors are to exert, world frame.
 
     The nominal pull of the cable, the inertia of the load that hangs on it and the drag are fed forward.
@@ -121,7 +121,7 @@ def wanted_force(feedback, acceleration, velocity, pull, attitude, g):
         g: DroneGains.
     """
     force = sub(scale(g.mass + g.load_share, acceleration), scale(g.mass, feedback))
-    force = add(force, pull)
+    force = add(force, cable_force)
     air = tmul(attitude, velocity)
     force = add(force, mul(attitude, (g.drag[0] * air[0], g.drag[1] * air[1], g.drag[2] * air[2])))
     return (force[0], force[1], max(force[2] + g.mass * GRAVITY, 0.1 * g.mass * GRAVITY))
@@ -152,14 +152,14 @@ def follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, g):
 
 
 @kernel
-def control(lo, hi, state, reference, pull, thrust, g, frequency, speed, dt):
+def control(lo, hi, state, reference, cable_force, thrust, g, frequency, speed, dt):
     """One control step: `smooth` the references, then `fly` after them."""
     smooth(lo, hi, reference, frequency, speed, dt)
-    fly(lo, hi, state, reference, pull, thrust, g)
+    fly(lo, hi, state, reference, cable_force, thrust, g)
 
 
 @kernel
-def fly(lo, hi, state, reference, pull, thrust, g):
+def fly(lo, hi, state, reference, cable_force, thrust, g):
     """Compute the rotor thrusts that make the drones of environments lo to hi follow their references: position.
 
     Args:
@@ -178,8 +178,8 @@ def fly(lo, hi, state, reference, pull, thrust, g):
             velocity_error = sub(vec(state.drone_velocity, e, n), velocity)
             feedback = add(scale(d.k_p, position_error), scale(d.k_v, velocity_error))
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
-            force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, d)
-            moment = hook_moment(n, attitude, vec(pull, e, n), acceleration, g)
+            force = wanted_force(feedback, acceleration, velocity, vec(cable_force, e, n), attitude, d)
+            moment = hook_moment(n, attitude, vec(cable_force, e, n), acceleration, g)
             force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
             rotors = follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, d)

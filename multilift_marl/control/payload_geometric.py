@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.control.cable_forces import MIN_TENSION_RATIO, drone_offset, solve_cable_forces
 from multilift_marl.control.gains import make_gains
-from multilift_marl.control.pulls import LEAST, reach, solve_pulls
 from multilift_marl.math3d import (
     add,
     clip,
@@ -33,6 +32,7 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
+from multilift_marl.rig.vehicles import GRAVITY
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -99,8 +99,8 @@ class PayloadGeometric:
                 f"the observation has shape {np.shape(observation)}; give the observations of all of them"
             )
         _steer(
-            0, vec.num_envs, vec.world.state, task.way, task.errors, task.rig, task.hanging, self._inertia, self._gains,
-            *self._numbers, self._pull, self._last, self._fresh, self._action,
+            0, vec.num_envs, vec.world.state, task.planned, task.errors, task.rig, task.hanging, self._inertia,
+            self._gains, *self._numbers, self._pull, self._last, self._fresh, self._action,
         )  # fmt: skip
         return self._action.copy()
 
@@ -117,7 +117,7 @@ def _times(a, b):
 
 @kernel
 def _steer(
-    lo, hi, state, way, errors, rig, hanging, inertia, g, stiffness, ahead, max_offset, pull, last, fresh, action
+    lo, hi, state, way, errors, rig, hanging, inertia, g, stiffness, ahead, max_offset, cable_force, last, fresh, action
 ):
     """Write the actions (E, N, 4) of environments lo to hi.
 
@@ -155,13 +155,16 @@ def _steer(
         body = matmul(matmul(attitude, inertia), transpose(attitude))
         moment = scale(-1.0, mul(body, turning))
         for n in range(rig.slots.shape[0]):
-            put(pull[e, n], _own(e, n, way, rig, hanging))
+            put(cable_force[e, n], _own(e, n, way, rig, hanging))
             arm = mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2]))
-            force, moment = add(force, vec(pull, e, n)), add(moment, cross(arm, vec(pull, e, n)))
-        solve_pulls(force, moment, attitude, rig.anchors, LEAST, pull[e])
+            force, moment = add(force, vec(cable_force, e, n)), add(moment, cross(arm, vec(cable_force, e, n)))
+        solve_cable_forces(force, moment, attitude, rig.anchors, MIN_TENSION_RATIO, cable_force[e])
         for n in range(rig.slots.shape[0]):
-            old, new = _own(e, n, way, rig, hanging), vec(pull, e, n)
-            offset = add(sub(reach(n, new, hanging), reach(n, old, hanging)), scale(1.0 / stiffness[n], sub(new, old)))
+            old, new = _own(e, n, way, rig, hanging), vec(cable_force, e, n)
+            offset = add(
+                sub(drone_offset(n, new, hanging), drone_offset(n, old, hanging)),
+                scale(1.0 / stiffness[n], sub(new, old)),
+            )
             change = (0.0, 0.0, 0.0) if fresh[e] else sub(offset, vec(last, e, n))
             put(last[e, n], offset)
             offset = add(offset, scale(ahead, change))
@@ -176,7 +179,7 @@ def _carried(e, way, rig):
     """Return whether the cables are meant to pull at least half of what they do at rest, in all."""
     wanted, rest = 0.0, 0.0
     for n in range(rig.slots.shape[0]):
-        wanted, rest = wanted + norm(vec(way.pull, e, n)), rest + norm(row(rig.force, n))
+        wanted, rest = wanted + norm(vec(way.cable_force, e, n)), rest + norm(row(rig.force, n))
     return wanted >= 0.5 * rest
 
 
@@ -185,4 +188,4 @@ def _own(e, n, way, rig, hanging):
     """Return the pull on the payload that the way needs of cable n: `way.pull` leaves the load's inertia out [N]."""
     share = rig.force[n, 2] / GRAVITY
     inertial = scale(share, add(row(way.acceleration, e), vec(way.slot_acceleration, e, n)))
-    return sub(add(vec(way.pull, e, n), inertial), (0.0, 0.0, hanging.weight[n]))
+    return sub(add(vec(way.cable_force, e, n), inertial), (0.0, 0.0, hanging.weight[n]))

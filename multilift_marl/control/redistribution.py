@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.gains import Gains
 from multilift_marl.math3d import clip
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 
 TILTS = np.radians(np.arange(0.0, 71.0))  # tried in this order
 AXES = np.radians(np.arange(0.0, 360.0, 5.0))  # horizontal axes of the tilt

@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.payload_geometric import PayloadGeometric
 from multilift_marl.control.policy import OwnPolicy, Policy
 from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.rig.vehicles import GRAVITY
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 INTEGRAL_GAIN = 0.5  # [1/s]
 WANTED = {  # what the payload is meant to do meanwhile, where a task tells
-    "payload_error": ("way_position",),
-    "payload_velocity": ("way_velocity", "target_velocity"),
-    "payload_rotation_error": ("way_rotation",),
+    "payload_error": ("planned_position",),
+    "payload_velocity": ("planned_velocity", "target_velocity"),
+    "payload_rotation_error": ("planned_rotation",),
 }
 LEAD_TIME = 0.4  # [s] that a payload's acceleration follows a moved slot: the lags of reference and drone
 LEAD_GAIN = 0.87  # [-] of what the acceleration asks for; RMSE is least at 0.81 for (2, 2), at 1 for (2, 4)

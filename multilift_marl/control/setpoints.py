@@ -64,7 +64,7 @@ def smooth_velocity(lo, hi, state, reference, setpoint, frequency, dt):
 
 
 @kernel
-def fly_velocity(lo, hi, state, reference, pull, thrust, g):
+def fly_velocity(lo, hi, state, reference, cable_force, thrust, g):
     """Compute the rotor thrusts with which drones follow reference velocity, acceleration, jerk and yaw; see `fly`.
 
     The velocity error falls as exp(-k_v t).
@@ -74,8 +74,8 @@ def fly_velocity(lo, hi, state, reference, pull, thrust, g):
             velocity, d = vec(reference.velocity, e, n), drone_gains(g, n)
             feedback = scale(d.k_v, sub(vec(state.drone_velocity, e, n), velocity))
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
-            force = wanted_force(feedback, acceleration, velocity, vec(pull, e, n), attitude, d)
-            moment = hook_moment(n, attitude, vec(pull, e, n), acceleration, g)
+            force = wanted_force(feedback, acceleration, velocity, vec(cable_force, e, n), attitude, d)
+            moment = hook_moment(n, attitude, vec(cable_force, e, n), acceleration, g)
             force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
             rotors = follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, d)
@@ -84,7 +84,7 @@ def fly_velocity(lo, hi, state, reference, pull, thrust, g):
 
 
 @kernel
-def drift(lo, hi, state, reference, dt):
+def track_own_state(lo, hi, state, reference, dt):
     """Let reference positions and velocities of environments lo to hi be the drones' own; the yaw moves at its rate."""
     for e in range(lo, hi):
         for n in range(reference.yaw.shape[1]):
@@ -94,14 +94,14 @@ def drift(lo, hi, state, reference, dt):
 
 
 @kernel
-def fly_acceleration(lo, hi, state, reference, pull, thrust, g):
+def fly_acceleration(lo, hi, state, reference, cable_force, thrust, g):
     """Compute the rotor thrusts with which drones accelerate as their references do; see `fly`."""
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
             velocity, d = vec(reference.velocity, e, n), drone_gains(g, n)
-            force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, d)
-            moment = hook_moment(n, attitude, vec(pull, e, n), acceleration, g)
+            force = wanted_force(STILL, acceleration, velocity, vec(cable_force, e, n), attitude, d)
+            moment = hook_moment(n, attitude, vec(cable_force, e, n), acceleration, g)
             rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
             rotors = follow_force(attitude, rates, force, STILL, yaw, yaw_rate, moment, d)
             for k in range(4):
@@ -109,16 +109,16 @@ def fly_acceleration(lo, hi, state, reference, pull, thrust, g):
 
 
 @kernel
-def drift_to_yaw(lo, hi, state, reference, frequency, dt):
+def track_own_state_to_yaw(lo, hi, state, reference, frequency, dt):
     """Do as `drift`, but move the yaw towards the commanded one."""
-    drift(lo, hi, state, reference, 0.0)
+    track_own_state(lo, hi, state, reference, 0.0)
     for e in range(lo, hi):
         for n in range(reference.yaw.shape[1]):
             smooth_yaw(e, n, reference, frequency, dt)
 
 
 @kernel
-def fly_acc_rates(lo, hi, state, reference, rates, pull, thrust, g):
+def fly_acc_rates(lo, hi, state, reference, rates, cable_force, thrust, g):
     """Do as `fly_acceleration`, with the roll and pitch rates of the desired attitude given, (E, N, 3) [rad/s].
 
     An acceleration alone says nothing of how it will change: these rates feed forward what the jerk would.
@@ -127,8 +127,8 @@ def fly_acc_rates(lo, hi, state, reference, rates, pull, thrust, g):
         for n in range(thrust.shape[1]):
             attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
             velocity, d = vec(reference.velocity, e, n), drone_gains(g, n)
-            force = wanted_force(STILL, acceleration, velocity, vec(pull, e, n), attitude, d)
-            moment = hook_moment(n, attitude, vec(pull, e, n), acceleration, g)
+            force = wanted_force(STILL, acceleration, velocity, vec(cable_force, e, n), attitude, d)
+            moment = hook_moment(n, attitude, vec(cable_force, e, n), acceleration, g)
             yaw, yaw_rate = reference.yaw[e, n], reference.yaw_rate[e, n]
             desired = thrust_frame(force, yaw)
             turning = desired_rates(desired, force, STILL, yaw, yaw_rate)
@@ -141,7 +141,7 @@ def fly_acc_rates(lo, hi, state, reference, rates, pull, thrust, g):
 
 
 @kernel
-def fly_attitude(lo, hi, state, attitude, rates, total, pull, thrust, g):
+def fly_attitude(lo, hi, state, attitude, rates, total, cable_force, thrust, g):
     """Compute the rotor thrusts that turn drones to attitudes (E, N, 3, 3), which turn at body rates (E, N, 3) [rad/s].
 
     Args:
@@ -156,14 +156,14 @@ def fly_attitude(lo, hi, state, attitude, rates, total, pull, thrust, g):
         for n in range(thrust.shape[1]):
             own, own_rates = mat(state.drone_rotation, e, n), vec(state.drone_body_rates, e, n)
             desired, desired_rate, d = mat(attitude, e, n), vec(rates, e, n), drone_gains(g, n)
-            moment = hook_moment(n, own, vec(pull, e, n), STILL, g)
+            moment = hook_moment(n, own, vec(cable_force, e, n), STILL, g)
             rotors = follow_attitude(own, own_rates, desired, desired_rate, total[e, n], moment, d)
             for k in range(4):
                 thrust[e, n, k] = rotors[k]
 
 
 @kernel
-def fly_rates(lo, hi, state, rates, total, pull, thrust, g):
+def fly_rates(lo, hi, state, rates, total, cable_force, thrust, g):
     """Compute the rotor thrusts that turn drones at body rates (E, N, 3) [rad/s], at total thrusts (E, N) [N].
 
     The moment of the pulls (E, N, 3) [N] at the hooks is held beside.
@@ -172,7 +172,7 @@ def fly_rates(lo, hi, state, rates, total, pull, thrust, g):
         for n in range(thrust.shape[1]):
             d = drone_gains(g, n)
             torque = rate_torque(vec(state.drone_body_rates, e, n), vec(rates, e, n), d)
-            moment = hook_moment(n, mat(state.drone_rotation, e, n), vec(pull, e, n), STILL, g)
+            moment = hook_moment(n, mat(state.drone_rotation, e, n), vec(cable_force, e, n), STILL, g)
             torque = add(torque, moment)
             rotors = allocate(total[e, n], torque, d.allocation, d.thrust_min, d.thrust_max)
             for k in range(4):

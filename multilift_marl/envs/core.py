@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from multilift_marl._jit import bind
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
-from multilift_marl.config.schema import Config
-from multilift_marl.config.system import whole_ratio
 from multilift_marl.control.actions import Call
-from multilift_marl.control.pilot import Pilot
+from multilift_marl.control.controller import Controller
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.errors import ConfigError
+from multilift_marl.rig.resolve import whole_ratio
 from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks import find_task
@@ -23,7 +23,7 @@ from multilift_marl.tasks.failures import CAUSES, DIVERGED
 from multilift_marl.tasks.observations import observation_names, remember, state_size
 
 TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
-_KEPT = ("_action", "_observation", "_told", "_state", "seeds", "episodes", "steps", "_ended")  # arrays of its own
+_SAVED = ("_action", "_observation", "_stacked", "_state", "seeds", "episodes", "steps", "_ended")  # arrays of its own
 
 
 class MultiliftVec:
@@ -62,10 +62,10 @@ class MultiliftVec:
         if self.max_steps < 1:
             raise ConfigError(f"env.episode_seconds={config.env.episode_seconds} is shorter than one step; raise it")
         self.world = World(config.system, e, config.env.num_threads)
-        self.pilot = Pilot(config, self.world)
-        self.reference = self.pilot.reference
+        self.controller = Controller(config, self.world)
+        self.reference = self.controller.reference
         self.task = task(config, self.world, self.reference)
-        self.action_names = self.pilot.action_names
+        self.action_names = self.controller.action_names
         self.action_size = len(self.action_names)
         self.observation_names = observation_names(self.action_size, task.EXTRA, config.env.history)
         self.observation_size = len(self.observation_names)
@@ -74,7 +74,7 @@ class MultiliftVec:
         self._action = np.zeros((e, n, self.action_size))
         self._previous = np.zeros_like(self._action)
         self._observation = np.zeros((e, n, self.observation_size // config.env.history), np.float32)
-        self._told = self._observation if config.env.history == 1 else np.tile(self._observation, config.env.history)
+        self._stacked = self._observation if config.env.history == 1 else np.tile(self._observation, config.env.history)
         self._state = np.zeros((e, self.state_size), np.float32)
         self._starts = Episodes(
             config, self.world, self.task, (self.action_size, self._observation.shape[2], self.state_size)
@@ -136,7 +136,7 @@ class MultiliftVec:
             RuntimeError: an environment has ended and was not reset.
         """
         begin = self._ended & restart & (self.episodes >= 0)
-        self._accept(action, self._ended & ~begin)
+        self._set_action(action, self._ended & ~begin)
         self.world.run(self._advance)
         self.world.check_warnings()
         self.steps += 1
@@ -150,12 +150,12 @@ class MultiliftVec:
         self._ended = terminated | truncated
         reward = np.repeat(self.task.terms.sum(axis=1, dtype=np.float64)[:, None], self.num_drones, axis=1)
         info = self._info(terminated, truncated)
-        return self._told.copy(), reward.astype(np.float32), terminated, truncated, info
+        return self._stacked.copy(), reward.astype(np.float32), terminated, truncated, info
 
     def current(self) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observation (E, N, D) and info of the episodes in progress, as `reset` does, and change nothing."""
         none = np.zeros(self.num_envs, bool)
-        return self._told.copy(), self._info(none, none)
+        return self._stacked.copy(), self._info(none, none)
 
     @property
     def ended(self) -> np.ndarray:
@@ -177,9 +177,9 @@ class MultiliftVec:
         """Return copies of everything that later steps depend on, by dotted name, environment first."""
         saved = {f"world.{key}": array for key, array in self.world.state_dict().items()}
         saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
-        saved |= self.pilot.state_dict()
-        saved |= {f"imperfections.{key}": array.copy() for key, array in self._starts.imperfections.arrays().items()}
-        saved |= {name: getattr(self, name).copy() for name in _KEPT}
+        saved |= self.controller.state_dict()
+        saved |= {f"sensing.{key}": array.copy() for key, array in self._starts.sensing.arrays().items()}
+        saved |= {name: getattr(self, name).copy() for name in _SAVED}
         saved["task_name"] = fingerprint(self.task.name, self.num_envs)
         return saved
 
@@ -190,16 +190,16 @@ class MultiliftVec:
             ValueError: it is of other environments, or not what `state_dict` returned; nothing is changed then.
         """
         check_saved(saved, self.state_dict(), "world.diverged", "world.system", "task_name")
-        groups: dict[str, Rows] = {"world": {}, "task": {}, "imperfections": {}}
+        groups: dict[str, Rows] = {"world": {}, "task": {}, "sensing": {}}
         for key, array in saved.items():
             group, _, name = key.partition(".")
             if group in groups:
                 groups[group][name] = array
         self.world.load_state_dict(groups["world"])
         self.task.load_state_dict(groups["task"])
-        self.pilot.load_state_dict(saved)
-        self._starts.load_state_dict(groups["imperfections"])
-        for name in _KEPT:
+        self.controller.load_state_dict(saved)
+        self._starts.load_state_dict(groups["sensing"])
+        for name in _SAVED:
             getattr(self, name)[:] = saved[name]
 
     def __reduce__(
@@ -222,40 +222,40 @@ class MultiliftVec:
         self._action[mask] = self._previous[mask] = 0.0
         self.steps[mask], self._ended[mask] = 0, False
         for e in chosen:
-            self.pilot.start(e)
+            self.controller.start(e)
             self.task.observe(e, e + 1, self._action, self._observation, self._state)
-            self._told[e] = np.tile(self._observation[e], self.config.env.history)
+            self._stacked[e] = np.tile(self._observation[e], self.config.env.history)
 
     def _bind(self) -> None:
         """Bind what is called in every step to its arrays, for each shard."""
         self._calls: dict[int, tuple[Sequence[Call], Sequence[Call], Sequence[Call]]] = {}
-        through = self._starts.imperfections
-        flown = through.applied if through.slow else self._action
+        through = self._starts.sensing
+        flown = through.applied if through.delays_action else self._action
         for shard in self.world.shards:
             span = (shard.lo, shard.hi)
-            act, follow = self.pilot.bind(*span, flown, self.task.way, self.task.planner(*span))
+            set_action, control_step = self.controller.bind(*span, flown, self.task.planned, self.task.planner(*span))
             after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
-            if self._told is not self._observation:
-                after.append(bind(remember, *span, self._observation, self._told))
-            before: tuple[Call, ...] = (act,)
-            if through.slow:
+            if self._stacked is not self._observation:
+                after.append(bind(remember, *span, self._observation, self._stacked))
+            before: tuple[Call, ...] = (set_action,)
+            if through.delays_action:
                 send, arguments = through.send(*span, self._action)
-                before = (bind(send, *arguments), act)
-            self._calls[shard.lo] = (before, follow, after)
+                before = (bind(send, *arguments), set_action)
+            self._calls[shard.lo] = (before, control_step, after)
 
     def _advance(self, shard: Shard) -> None:
         """One policy step of one shard, on its own thread."""
-        before, follow, after = self._calls[shard.lo]
+        before, control_step, after = self._calls[shard.lo]
         for call in before:
             call()
         for _ in range(self.control_ticks):
-            for call in follow:
+            for call in control_step:
                 call()
             self.world.advance(shard, self.world.system.control_interval)
         for call in after:
             call()
 
-    def _accept(self, action: np.ndarray, ended: np.ndarray) -> None:
+    def _set_action(self, action: np.ndarray, ended: np.ndarray) -> None:
         action = np.asarray(action)
         if action.shape != self._action.shape:
             raise ValueError(

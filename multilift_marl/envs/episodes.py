@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from multilift_marl.config.feasibility import check_fixed
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.envs.options import Rows, check_delays, check_stretch, read_options
 from multilift_marl.errors import ConfigError
+from multilift_marl.rig.feasibility import check_fixed
 from multilift_marl.sim.parameters import Parameters, check_parameters
 from multilift_marl.sim.randomization import Draw
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.failures import CAUSES
-from multilift_marl.tasks.imperfections import Imperfections
+from multilift_marl.tasks.sensing import Sensing
 
 TURBULENCE, PARAMETERS, SENSORS = 1, 2, 3  # streams of their own, so that none moves what the others draw
 _MAX_REDRAWS = 1000
@@ -38,10 +38,10 @@ class Episodes:
     def __init__(self, config: Config, world: World, task: Task, sizes: tuple[int, int, int]):
         self._world, self._task, ranges = world, task, config.randomization
         shape, attitude = (world.num_envs, world.num_drones, *sizes[:2]), world.system.payload_shape != "point"
-        self.imperfections = Imperfections(ranges, shape, sizes[2], attitude)
-        if self.imperfections.on:
-            task.blur(self.imperfections)
-        self._draw = Draw(world, ranges, self.imperfections.drawn())
+        self.sensing = Sensing(ranges, shape, sizes[2], attitude)
+        if self.sensing.enabled:
+            task.use_sensing(self.sensing)
+        self._draw = Draw(world, ranges, self.sensing.drawn())
         self._longest = {"action_delay": ranges.action_delay[1], "observation_delay": ranges.observation_delay[1]}
         self._tell()
 
@@ -74,8 +74,8 @@ class Episodes:
         """
         if self._world.system.air.turbulence:
             self._world.seed_turbulence(e, np.random.SeedSequence(seed, spawn_key=(*key, TURBULENCE)))
-        if self.imperfections.on:
-            self.imperfections.start(e, np.random.SeedSequence(seed, spawn_key=(*key, SENSORS)))
+        if self.sensing.enabled:
+            self.sensing.start(e, np.random.SeedSequence(seed, spawn_key=(*key, SENSORS)))
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
         self._draw.draw(e, rng, seed, (*key, PARAMETERS))
         for name, rows in fixed["randomization"].items():
@@ -116,7 +116,7 @@ class Episodes:
 
     def load_state_dict(self, saved: Rows) -> None:
         """Restore the imperfections from copies of their arrays, and the draw from what the world has restored."""
-        for name, array in self.imperfections.arrays().items():
+        for name, array in self.sensing.arrays().items():
             array[:] = saved[name]
         self._draw.restore(self._world.parameters)
         self._tell()

@@ -10,13 +10,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import list_configs
-from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec, make_vec
-from multilift_marl.envs.faces import (
+from multilift_marl.envs.wrapper_utils import (
     BATCH_RENDER_MODES,
     RENDER_MODES,
-    Pictures,
+    FrameRenderer,
     mean_reward,
     possible_modes,
     row_spaces,
@@ -62,7 +62,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": self.vec.config.env.policy_hz}
         self.render_mode = render_mode
         self.observation_space, self.action_space = row_spaces(self.vec, self.vec.num_drones)
-        self._pictures = Pictures(self.vec, render_mode)
+        self._pictures = FrameRenderer(self.vec, render_mode)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -172,7 +172,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space, self.single_action_space = row_spaces(self.vec, self.vec.num_drones)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._pictures = Pictures(self.vec, render_mode, BATCH_RENDER_MODES)
+        self._pictures = FrameRenderer(self.vec, render_mode, BATCH_RENDER_MODES)
         self._causes = np.array(self.vec.failure_causes, dtype=object)
         self.closed = False
 

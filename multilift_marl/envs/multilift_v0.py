@@ -9,10 +9,10 @@ import pettingzoo
 from gymnasium.spaces import Box
 from pettingzoo import ParallelEnv
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import list_configs, resolve_config
-from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.envs.faces import RENDER_MODES, Pictures, possible_modes, seed_afresh
+from multilift_marl.envs.wrapper_utils import RENDER_MODES, FrameRenderer, possible_modes, seed_afresh
 from multilift_marl.errors import nearest
 
 
@@ -61,7 +61,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         self.state_space = Box(*unbounded, (vec.state_size,), np.float32)
         self._joint = np.zeros((1, vec.num_drones, vec.action_size))
         self._term_names = [f"reward_terms.{name}" for name in vec.reward_terms]
-        self._pictures = Pictures(vec, render_mode)
+        self._pictures = FrameRenderer(vec, render_mode)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -9,8 +9,8 @@ import numpy as np
 
 from multilift_marl.errors import nearest
 from multilift_marl.math3d import add, matrow, mul, row, sub
+from multilift_marl.sim.hover import hook_position
 from multilift_marl.sim.parameters import CONFIGURED
-from multilift_marl.sim.standing import hook_place
 from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
@@ -125,7 +125,7 @@ def check_stretch(world: World, e: int, length: np.ndarray, stiffness: np.ndarra
         if state.cable_broken[e, n]:
             continue
         foot = add(row(state.payload_position, e), mul(matrow(state.payload_rotation, e), tuple(anchor)))
-        span = float(np.linalg.norm(sub(hook_place(e, n, state, world.drones.hooks), foot)))
+        span = float(np.linalg.norm(sub(hook_position(e, n, state, world.drones.hooks), foot)))
         most = max(MOST_STRETCH * length[n], MOST_TENSION * system.resting_tension[n] / stiffness[n])
         if span > length[n] + most:
             raise ValueError(

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.envs.core import make_vec
-from multilift_marl.envs.faces import BATCH_RENDER_MODES, Pictures, mean_reward, row_spaces, seed_afresh
+from multilift_marl.envs.wrapper_utils import BATCH_RENDER_MODES, FrameRenderer, mean_reward, row_spaces, seed_afresh
 from multilift_marl.errors import pip_install
 
 try:
@@ -63,7 +63,7 @@ class MultiliftSB3VecEnv(VecEnv):
         )  # fmt: skip
         self.shared, self.render_mode = shared, render_mode
         self._rows = vec.num_drones if shared else 1  # of an environment
-        self._pictures = Pictures(vec, render_mode, BATCH_RENDER_MODES)
+        self._pictures = FrameRenderer(vec, render_mode, BATCH_RENDER_MODES)
         super().__init__(vec.num_envs * self._rows, *row_spaces(vec, vec.num_drones // self._rows))
         self._actions = np.zeros((self.num_envs, vec.num_drones // self._rows * vec.action_size), np.float32)
         self._shape = self._actions.shape

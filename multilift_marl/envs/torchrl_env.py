@@ -10,8 +10,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
-from multilift_marl.config.schema import Config
 from multilift_marl.envs.core import TRAINING, MultiliftVec
 
 _CPU = torch.device("cpu")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.evaluation.metrics import compare, summarize
 
 _ROWS = (  # metric, heading, factor, digits

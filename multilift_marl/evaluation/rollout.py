@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.config.schema import Config
 from multilift_marl.control.policy import Policy
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.tasks.failures import MAX_DISTANCE
@@ -93,7 +93,7 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
             square += running * _along_axes(vec) ** 2
             counted += running
         settling = np.where(running & (errors.distance > SETTLED), (step + 1) * dt, settling)
-        if vec.task.counts((step + 1) * dt, vec.max_steps * dt):
+        if vec.task.in_error_window((step + 1) * dt, vec.max_steps * dt):
             final_distance += running * errors.distance
             final_angle += running * np.rad2deg(errors.angle)
             final_tilt += running * _tilt(vec)
@@ -158,8 +158,8 @@ _AT_END = ("cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_se
 
 def _at_end(vec: MultiliftVec) -> dict[str, np.ndarray]:
     """Return what has accumulated over the episodes, (E,) each, in the order of `_AT_END`."""
-    record = vec.world.record
-    values = (record.tension_min, record.tension_peak, record.slack_time, vec.task.min_separation, record.energy)
+    stats = vec.world.stats
+    values = (stats.tension_min, stats.tension_peak, stats.slack_time, vec.task.min_separation, stats.energy)
     return dict(zip(_AT_END, values, strict=True))
 
 

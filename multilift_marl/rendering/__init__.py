@@ -2,7 +2,7 @@
 
 from multilift_marl.rendering.cameras import CAMERAS
 from multilift_marl.rendering.renderer import Renderer
-from multilift_marl.rendering.stage import Stage
+from multilift_marl.rendering.scene import Stage
 from multilift_marl.rendering.video import VideoWriter, write_video
 from multilift_marl.rendering.window import Window
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from multilift_marl.errors import RenderingError
 from multilift_marl.rendering.opengl import free_contexts, make_contexts
-from multilift_marl.rendering.stage import Stage
+from multilift_marl.rendering.scene import Stage
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec

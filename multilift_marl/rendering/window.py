@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 
 from multilift_marl.errors import RenderingError
-from multilift_marl.rendering.stage import Stage
+from multilift_marl.rendering.scene import Stage
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec

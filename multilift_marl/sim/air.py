@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import AIR_DENSITY
 from multilift_marl.math3d import column, mat, norm, put, row, scale, sub, tmul, vec
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import AIR_DENSITY
 
 SPREADING = 0.094  # [-] half-width of a round turbulent jet over the distance (Hussein, Capp and George, JFM 1994)
 GROWTH = SPREADING / sqrt(2.0 * log(2.0))  # half the velocity is where a quarter of the momentum flux is
@@ -31,7 +31,7 @@ class AirConstants(NamedTuple):
     gust_start: float
     gust_rise: float
     gust_hold: float
-    wash: bool
+    downwash: bool
     rotor_radius: np.ndarray
     """(N,) [m]."""
     rotor_positions: np.ndarray
@@ -57,7 +57,7 @@ class AirConstants(NamedTuple):
     @property
     def still(self) -> bool:
         """Whether all of it is switched off."""
-        return not (self.gusts or self.wash or self.ground_effect or self.moments)
+        return not (self.gusts or self.downwash or self.ground_effect or self.moments)
 
 
 def make_air(system: System) -> AirConstants:
@@ -71,7 +71,7 @@ def make_air(system: System) -> AirConstants:
         gust_start=float(air.gust_start),
         gust_rise=float(air.gust_rise),
         gust_hold=float(hold),
-        wash=air.wash,
+        downwash=air.wash,
         rotor_radius=np.array([vehicle.rotor_radius for vehicle in vehicles]),
         rotor_positions=np.array([vehicle.rotor_positions for vehicle in vehicles]),
         arm=np.array([vehicle.arm for vehicle in vehicles]),
@@ -101,14 +101,14 @@ def _images(system: System) -> np.ndarray:
 
 
 @kernel
-def spread_wash(e, state, air, c):
+def update_downwash(e, state, air, c):
     """Find the rotors' wash at every body of environment e, from the state as it is; write `air.wash`."""
-    felt, count = air.wash[e], state.drone_position.shape[1]
+    felt, count = air.downwash[e], state.drone_position.shape[1]
     felt[:] = 0.0
     payload = row(state.payload_position, e)
     for n in range(count):
         attitude, here = mat(state.drone_rotation, e, n), vec(state.drone_position, e, n)
-        speed = _four(state.rotor_speed, e, n)
+        speed = _vec4(state.rotor_speed, e, n)
         for i in range(count + 1):
             if i == n:
                 continue
@@ -126,13 +126,13 @@ def wash_at(e, point, breadth, state, c):
     felt = (0.0, 0.0, 0.0)
     for n in range(state.drone_position.shape[1]):
         attitude, away = mat(state.drone_rotation, e, n), sub(point, vec(state.drone_position, e, n))
-        speed = _four(state.rotor_speed, e, n)
+        speed = _vec4(state.rotor_speed, e, n)
         felt = sub(felt, scale(jet_flux(n, away, breadth, attitude, speed, c), column(attitude, 2)))
     return _velocity(felt)
 
 
 @kernel
-def _four(a, i, j):
+def _vec4(a, i, j):
     """Return row (i, j) of an (E, N, 4) array."""
     return (a[i, j, 0], a[i, j, 1], a[i, j, 2], a[i, j, 3])
 

@@ -17,8 +17,6 @@ import numpy as np
 from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.math3d import (
     add,
     cross,
@@ -34,12 +32,15 @@ from multilift_marl.math3d import (
     sub,
     vec,
 )
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.sim.catenary import hang
 from multilift_marl.sim.chain_arrays import Chain, largest_substep
 from multilift_marl.sim.chain_dynamics import turned
-from multilift_marl.sim.hanging import hang
 from multilift_marl.sim.inertia import Inertias
 from multilift_marl.sim.parameters import Parameters
-from multilift_marl.sim.rows import (
+from multilift_marl.sim.scene import Layout
+from multilift_marl.sim.state_io import (
     MAX_RATE,
     MAX_SPEED,
     MAX_STRETCH,
@@ -47,9 +48,8 @@ from multilift_marl.sim.rows import (
     field_offset,
     note_tensions,
     read_payload,
-    write_rows,
+    write_state,
 )
-from multilift_marl.sim.scene import Layout
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -91,7 +91,7 @@ def update_chain(chain: Chain, system: System, parameters: Parameters) -> None:
 
 
 @kernel
-def read_chains(rows, lo, hi, constraint, state, record, diverged, c, chain, nodes, motion):
+def read_chains(rows, lo, hi, constraint, state, stats, diverged, c, chain, nodes, motion):
     """Read the physical state after MuJoCo's step, and write the bodies' into `batch.state`.
 
     Args:
@@ -125,11 +125,11 @@ def read_chains(rows, lo, hi, constraint, state, record, diverged, c, chain, nod
         for n in range(chain.segments.shape[0]):
             tension = motion.tension[i, n]
             state.cable_tension[e, n] = tension
-            record.tension_peak[e] = max(record.tension_peak[e], motion.peak[i, n])
+            stats.tension_peak[e] = max(stats.tension_peak[e], motion.peak[i, n])
             slack = slack or tension <= GRAVITY * chain.node_mass[e, n] * (chain.segments[n] - 1)  # its own weight
         if slack:
-            record.slack_time[e] += c.timestep
-    note_tensions(lo, hi, diverged, False, state, record, c)
+            stats.slack_time[e] += c.timestep
+    note_tensions(lo, hi, diverged, False, state, stats, c)
 
 
 @kernel
@@ -201,13 +201,13 @@ def _write_bodies(i, line, c, motion):
 
 
 @kernel
-def write_chains(rows, lo, hi, mask, state, record, c, chain, nodes):
+def write_chains(rows, lo, hi, mask, state, stats, c, chain, nodes):
     """Write the state of the environments in `mask` into `batch.state` and the nodes.
 
     A cable hangs between payload and drone as it would at rest, a slack one in an arc; its nodes move as if it were
     stretched evenly, those of an arc without stretch: its dampers would pull.
     """
-    write_rows(rows, lo, hi, mask, state, record, c)
+    write_state(rows, lo, hi, mask, state, stats, c)
     links = np.zeros((chain.segments.max(), 7))
     for e in range(lo, hi):
         if not mask[e]:
@@ -233,5 +233,5 @@ def write_chains(rows, lo, hi, mask, state, record, c, chain, nodes):
             opening = dot(row(links, n - 1), row(links[:, 4:], n - 1))
             tension = chain.stiffness[e, i] * links[n - 1, 3] + chain.damping[i] * opening
             state.cable_tension[e, i] = max(0.0, tension)
-        clear_record(e, record)
-    note_tensions(lo, hi, mask, True, state, record, c)
+        clear_record(e, stats)
+    note_tensions(lo, hi, mask, True, state, stats, c)

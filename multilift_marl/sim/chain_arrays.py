@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl.config.system import System
+from multilift_marl.rig.system import System
 
 UNITS = 1024  # into which a physics step can be cut
 _SUBSTEP = 2.5e-4  # [s] the longest substep
@@ -116,7 +116,7 @@ class Motion(NamedTuple):
     """(1,) that the dampers of bending take [W]."""
     turning: np.ndarray
     """(N, S) by how much a link stretches faster because it turns [m/s]."""
-    pull: np.ndarray
+    cable_force: np.ndarray
     """(N, S) tension of each link [N]."""
     diagonal: np.ndarray
     """(N, S) of the tridiagonal matrices, and the elements beside it, (N, S) of links j - 1 and j [1/kg]."""

@@ -23,7 +23,6 @@ from __future__ import annotations
 from math import sqrt
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.math3d import (
     add,
     axis_angle,
@@ -41,6 +40,7 @@ from multilift_marl.math3d import (
     tmul,
     unit,
 )
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.chain_arrays import UNITS
 from multilift_marl.sim.chain_bending import find_bending
 
@@ -225,25 +225,25 @@ def _solve_tensions(e, h, state, chain, motion):
     for n in range(count):
         top = _top(e, n, state, chain)
         for j in range(chain.segments[n]):
-            motion.pull[n, j] = motion.right[n, j] + motion.turning[n, j] / h
+            motion.cable_force[n, j] = motion.right[n, j] + motion.turning[n, j] / h
         for j in range(top, 0, -1):
-            motion.pull[n, j - 1] -= motion.coupling[n, j] / motion.diagonal[n, j] * motion.pull[n, j]
+            motion.cable_force[n, j - 1] -= motion.coupling[n, j] / motion.diagonal[n, j] * motion.cable_force[n, j]
     for n in range(count):
-        total = motion.pull[n, 0]
+        total = motion.cable_force[n, 0]
         for k in range(n):
-            total -= motion.matrix[n, k] * motion.pull[k, 0]
-        motion.pull[n, 0] = total / motion.matrix[n, n]
+            total -= motion.matrix[n, k] * motion.cable_force[k, 0]
+        motion.cable_force[n, 0] = total / motion.matrix[n, n]
     for n in range(count - 1, -1, -1):
-        total = motion.pull[n, 0]
+        total = motion.cable_force[n, 0]
         for k in range(n + 1, count):
-            total -= motion.matrix[k, n] * motion.pull[k, 0]
-        motion.pull[n, 0] = total / motion.matrix[n, n]
+            total -= motion.matrix[k, n] * motion.cable_force[k, 0]
+        motion.cable_force[n, 0] = total / motion.matrix[n, n]
         top = _top(e, n, state, chain)
         for j in range(1, top + 1):
-            known = motion.pull[n, j] - motion.coupling[n, j] * motion.pull[n, j - 1]
-            motion.pull[n, j] = known / motion.diagonal[n, j]
+            known = motion.cable_force[n, j] - motion.coupling[n, j] * motion.cable_force[n, j - 1]
+            motion.cable_force[n, j] = known / motion.diagonal[n, j]
         for j in range(top + 1, chain.segments[n]):
-            motion.pull[n, j] = 0.0
+            motion.cable_force[n, j] = 0.0
 
 
 @kernel
@@ -270,8 +270,8 @@ def _find_turning(e, i, h, chain, nodes, motion):
         low_velocity = _pulled_end(e, i, 0, n, 0, h, chain, motion)
         for j in range(links):
             if j < links - 1:
-                force = scale(motion.pull[n, j + 1], row(motion.direction[n], j + 1))
-                force = sub(force, scale(motion.pull[n, j], row(motion.direction[n], j)))
+                force = scale(motion.cable_force[n, j + 1], row(motion.direction[n], j + 1))
+                force = sub(force, scale(motion.cable_force[n, j], row(motion.direction[n], j)))
                 high_velocity = _free_node(e, n, j, h, chain, nodes, motion)
                 high_velocity = add(high_velocity, scale(h / chain.node_mass[e, n], force))
             else:
@@ -299,11 +299,14 @@ def _pulled_end(e, i, b, n, end, h, chain, motion):
     arm, impulse, moment = row(motion.ends[n], end), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     if b == 0:
         for m in range(chain.segments.shape[0]):
-            pull = scale(h * motion.pull[m, 0], row(motion.direction[m], 0))
-            impulse, moment = add(impulse, pull), add(moment, scale(h * motion.pull[m, 0], row(motion.twist, m)))
+            cable_force = scale(h * motion.cable_force[m, 0], row(motion.direction[m], 0))
+            impulse, moment = (
+                add(impulse, cable_force),
+                add(moment, scale(h * motion.cable_force[m, 0], row(motion.twist, m))),
+            )
     else:
         last = chain.segments[n] - 1
-        impulse = scale(-h * motion.pull[n, last], row(motion.direction[n], last))
+        impulse = scale(-h * motion.cable_force[n, last], row(motion.direction[n], last))
         attitude = matrow(motion.rotation[i], b)
         moment = mul(attitude, mul(matrow(chain.inverse_inertia[e], b), tmul(attitude, cross(arm, impulse))))
     velocity = add(row(motion.free_velocity, b), scale(1.0 / chain.mass[e, b], impulse))
@@ -317,7 +320,7 @@ def _steepness(e, h, state, chain, motion):
     for n in range(chain.segments.shape[0]):
         inertia = chain.node_mass[e, n] * chain.length[e, n]
         for j in range(chain.segments[n]):
-            worst = max(worst, abs(motion.pull[n, j]) / inertia)
+            worst = max(worst, abs(motion.cable_force[n, j]) / inertia)
     return worst * h * h
 
 
@@ -345,19 +348,19 @@ def _move(e, i, h, state, chain, nodes, motion):
         share = h / chain.node_mass[e, n]
         k, c = chain.stiffness[e, n], chain.damping[n]
         for j in range(links - (1 if state.cable_broken[e, n] else 0)):
-            rate = (motion.pull[n, j] - k * motion.stretch[i, n, j]) / (k * h + c)
+            rate = (motion.cable_force[n, j] - k * motion.stretch[i, n, j]) / (k * h + c)
             motion.dissipated[i] += h * c * rate * rate
         for j in range(links - 1):
-            below, above = motion.pull[n, j], motion.pull[n, j + 1]
+            below, above = motion.cable_force[n, j], motion.cable_force[n, j + 1]
             force = sub(scale(above, row(motion.direction[n], j + 1)), scale(below, row(motion.direction[n], j)))
             velocity = add(_free_node(e, n, j, h, chain, nodes, motion), scale(share, force))
             put(nodes.velocity[e, n, j], velocity)
             put(nodes.position[e, n, j], add(row(nodes.position[e, n], j), scale(h, velocity)))
-        first = scale(h * motion.pull[n, 0], row(motion.direction[n], 0))
-        last = scale(-h * motion.pull[n, top], row(motion.direction[n], top))
+        first = scale(h * motion.cable_force[n, 0], row(motion.direction[n], 0))
+        last = scale(-h * motion.cable_force[n, top], row(motion.direction[n], top))
         _push(e, i, 0, first, row(motion.ends[n], 0), chain, motion)
         _push(e, i, 1 + n, last, row(motion.ends[n], 1), chain, motion)
-        motion.tension[i, n] = tension = max(0.0, motion.pull[n, top])
+        motion.tension[i, n] = tension = max(0.0, motion.cable_force[n, top])
         motion.peak[i, n] = max(motion.peak[i, n], tension)
         if tension > chain.breaking_load[n]:
             state.cable_broken[e, n] = True

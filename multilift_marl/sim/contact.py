@@ -10,9 +10,9 @@ import numpy as np
 from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import Vehicle
 from multilift_marl.math3d import dot, norm, row, sub, vec
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import Vehicle
 
 STIFFNESS = 6e4  # [1/s²] over the effective mass; with DAMPING a penetration fades with a time constant of 80 ms
 DAMPING = 5e3  # [1/s] likewise: takes an approach away within a step, so nothing bounces, nor passes what it has met

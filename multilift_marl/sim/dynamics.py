@@ -13,14 +13,14 @@ import numpy as np
 from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import AIR_DENSITY
 from multilift_marl.math3d import add, clip, cross, mat, matrow, mul, norm, put, row, scale, sub, tmul, vec
-from multilift_marl.sim.air import air_moment, ground_gain, spread_wash
-from multilift_marl.sim.gusts import blow
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import AIR_DENSITY
+from multilift_marl.sim.air import air_moment, ground_gain, update_downwash
+from multilift_marl.sim.gusts import step_gusts
 from multilift_marl.sim.parameters import lag_shares
-from multilift_marl.sim.rows import field_offset
 from multilift_marl.sim.scene import Layout
+from multilift_marl.sim.state_io import field_offset
 
 
 class Constants(NamedTuple):
@@ -80,7 +80,7 @@ def make_constants(system: System, layout: Layout, batch: Batch) -> Constants:
 
 
 @kernel
-def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied):
+def apply_loads(rows, lo, hi, thrust, state, hidden_loads, stats, c, air, flow, varied):
     """Advance the rotors by one physics step and write the loads of that step into `batch.state`.
 
     The rotor speed follows its command with a first-order lag, one for rising and one for falling. The thrust applied
@@ -101,12 +101,12 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
     """
     for e in range(lo, hi):
         line = rows[e - lo]
-        wind = row(plant.wind, e)
+        wind = row(hidden_loads.wind, e)
         if flow is not None:
             if flow.gusts:
-                wind = add(wind, blow(e, wind, state, air, c.timestep, flow))
-            if flow.wash:
-                spread_wash(e, state, air, flow)
+                wind = add(wind, step_gusts(e, wind, state, air, c.timestep, flow))
+            if flow.downwash:
+                update_downwash(e, state, air, flow)
         for n in range(thrust.shape[1]):
             total, mx, my, mz, power = 0.0, 0.0, 0.0, 0.0, 0.0
             turning, change = 0.0, 0.0  # sums over the rotors, against body z: mean speed, and its growth in the step
@@ -116,7 +116,7 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
             for k in range(4):
                 before = state.rotor_speed[e, n, k]
                 target = sqrt(max(thrust[e, n, k], 0.0) / b)
-                target = 0.0 if plant.motors_off[e, n] else clip(target, slowest, fastest)
+                target = 0.0 if hidden_loads.motors_off[e, n] else clip(target, slowest, fastest)
                 gap = before - target
                 if varied is None:
                     decay, mean_first, mean_second = falling if gap > 0.0 else rising
@@ -138,7 +138,7 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
             attitude = mat(state.drone_rotation, e, n)
             here = wind
             if flow is not None:
-                here = add(wind, vec(air.wash, e, n))
+                here = add(wind, vec(air.downwash, e, n))
             through = tmul(attitude, sub(vec(state.drone_velocity, e, n), here))
             if flow is not None:
                 if flow.ground_effect:
@@ -157,10 +157,10 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
             at = c.drone_loads[n]
             put(line[at : at + 3], mul(attitude, body))
             put(line[at + 3 : at + 6], torque)
-            record.energy[e] += c.timestep * power
+            stats.energy[e] += c.timestep * power
         here = wind
         if flow is not None:
-            here = add(wind, vec(air.wash, e, thrust.shape[1]))
+            here = add(wind, vec(air.downwash, e, thrust.shape[1]))
         velocity = row(state.payload_velocity, e)
         if varied is not None and c.center_varies:
             # The true centre of mass is at `center` from the origin of the free joint, where the state is counted.
@@ -170,7 +170,7 @@ def apply_loads(rows, lo, hi, thrust, state, plant, record, c, air, flow, varied
         drag = scale(-c.payload_drag * norm(through), through)
         if varied is not None:
             drag = scale(varied.payload_drag[e], drag)
-        force = add(drag, row(plant.payload_force, e))
+        force = add(drag, row(hidden_loads.payload_force, e))
         put(line[c.force : c.force + 3], force)
         if varied is not None and c.center_varies:
             # Drag and hidden force act at the centre of mass: about the origin that is a torque, too (body frame).

@@ -9,7 +9,7 @@ from math import cos, exp, expm1, hypot, pi, sqrt
 
 from multilift_marl._jit import kernel
 from multilift_marl.math3d import add, clip, norm, put, row, scale, sub
-from multilift_marl.sim.generator import normal_pair
+from multilift_marl.sim.rng import normal_pair
 
 FOOT = 0.3048  # [m]
 LEAST_HEIGHT, LARGEST_HEIGHT = 3.0, 1000 * FOOT  # [m] the low-altitude model's; below 10 ft it is not defined
@@ -105,7 +105,7 @@ def gust_share(t, start, rise, hold):
 
 
 @kernel
-def blow(e, wind, state, air, timestep, c):
+def step_gusts(e, wind, state, air, timestep, c):
     """Return turbulence and gust of this step [m/s], kept in `air.gust`, and go on to the next step.
 
     Height and airspeed are the payload's.

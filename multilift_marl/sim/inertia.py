@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
 from multilift_marl.math3d import add, cross, dot, matrow, mul, quat_to_mat, row, sub, tmul
+from multilift_marl.rig.system import System
 from multilift_marl.sim.parameters import Parameters
 
 

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from multilift_marl.config.system import System
+from multilift_marl.rig.system import System
 from multilift_marl.sim.cables import limit_solref
 from multilift_marl.sim.scene import Layout
 
@@ -51,7 +51,7 @@ CONFIGURED = (  # cost something in every step, so they may only differ where th
 _MASSES = frozenset(("payload_mass", "payload_inertia", "payload_center_of_mass", "vehicle_mass"))
 
 
-class Varied(NamedTuple):
+class RotorVariation(NamedTuple):
     """What the loops over physics steps need of them, where centres of mass, rotors or drag vary at all."""
 
     payload_center_of_mass: np.ndarray
@@ -90,12 +90,12 @@ def lag_shares(h: float) -> tuple[float, float, float]:
     return exp(-h), (1 - exp(-h)) / h, (1 - exp(-2 * h)) / (2 * h)
 
 
-def make_varied(system: System, parameters: Parameters) -> Varied | None:
+def make_rotor_variation(system: System, parameters: Parameters) -> RotorVariation | None:
     """Return what the loops need, None where neither the payload's centre of mass nor rotors nor drag vary."""
     if not system.varied.intersection(CONFIGURED):
         return None
     e, n = parameters.vehicle_mass.shape
-    varied = Varied(
+    varied = RotorVariation(
         payload_center_of_mass=parameters.payload_center_of_mass,
         payload_drag=parameters.payload_drag,
         thrust=parameters.vehicle_thrust_coefficient,
@@ -107,7 +107,7 @@ def make_varied(system: System, parameters: Parameters) -> Varied | None:
     return varied
 
 
-def write_lags(varied: Varied, system: System, parameters: Parameters, mask: np.ndarray) -> None:
+def write_lags(varied: RotorVariation, system: System, parameters: Parameters, mask: np.ndarray) -> None:
     """Bring the rotors' lags of the environments in `mask` into line with their time constants."""
     for e in np.flatnonzero(mask):
         for n, vehicle in enumerate(system.vehicles):
@@ -134,7 +134,7 @@ def check_parameters(system: System, old: Parameters, mask: np.ndarray, values: 
             )
 
 
-def adopt(
+def update_parameters(
     system: System, parameters: Parameters, mask: np.ndarray, values: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, set[str]]:
     """Write values into the parameters of the environments in `mask` (E,); return which of them changed (E,), and what.
@@ -182,7 +182,7 @@ def write_model(
             moments[chosen, layout.drone_bodies[n]] = np.array(vehicle.inertia) * (own / vehicle.mass)[:, None]
     massless, longer = system.cable_model == "massless", "cable_length" in names
     if longer:
-        fit_cables(batch, system, p, broken)
+        apply_cable_limits(batch, system, p, broken)
     heavier = bool(names & _MASSES)
     if massless and (heavier or "cable_stiffness" in names):
         batch.expand("tendon_solref_lim")
@@ -195,7 +195,7 @@ def write_model(
         batch.expand("tendon_solref_lim")[chosen] = solref
 
 
-def fit_cables(batch: Batch, system: System, p: Parameters, broken: np.ndarray) -> None:
+def apply_cable_limits(batch: Batch, system: System, p: Parameters, broken: np.ndarray) -> None:
     """Let the massless cables in `broken` (n, N) bool of a batch's simulations pull no more, all others be whole."""
     if system.cable_model == "massless":
         batch.expand("tendon_range")[..., 1] = np.where(broken, _FAR, p.cable_length)

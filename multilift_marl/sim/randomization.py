@@ -25,12 +25,15 @@ class Draw:
         changing: names of parameters that are not what they are configured to be in every episode.
     """
 
-    def __init__(self, world: World, ranges: RandomizationConfig, imperfections: dict[str, np.ndarray]):
+    def __init__(self, world: World, ranges: RandomizationConfig, sensing: dict[str, np.ndarray]):
         self.system, self.ranges = world.system, ranges
         self._nominal = nominal_parameters(world.system, 1)
         self.parameters = nominal_parameters(world.system, world.num_envs)
-        self.values = self.parameters._asdict() | {"payload_force": world.plant.payload_force, "wind": world.plant.wind}
-        self.values |= imperfections
+        self.values = self.parameters._asdict() | {
+            "payload_force": world.hidden_loads.payload_force,
+            "wind": world.hidden_loads.wind,
+        }
+        self.values |= sensing
         point = world.system.payload_shape == "point"
         for name in (*CONFIGURED, *(("payload_inertia",) if point else ())):
             if name not in world.system.varied:

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from multilift_marl.config.mesh import add_mesh
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.rig.mesh import add_mesh
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables import IMPEDANCE, limit_solref
 from multilift_marl.sim.contact import add_contact, drone_half_size
-from multilift_marl.sim.looks import (
+from multilift_marl.sim.visuals import (
     DRONE_COLOURS,
     PAYLOAD_COLOUR,
     add_light,

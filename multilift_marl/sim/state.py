@@ -45,7 +45,7 @@ class SystemState(NamedTuple):
         return state
 
 
-class Plant(NamedTuple):
+class HiddenLoads(NamedTuple):
     """True parameters and loads that may differ between environments and that no drone is told."""
 
     payload_mass: np.ndarray
@@ -63,7 +63,7 @@ class Air(NamedTuple):
 
     gust: np.ndarray
     """(E, 3) turbulence and gust in the last physics step, the same for all bodies, world frame [m/s]."""
-    wash: np.ndarray
+    downwash: np.ndarray
     """(E, N + 1, 3) wash of the other drones at each drone, then at the payload, likewise [m/s]."""
     filter: np.ndarray
     """(E, 5) states of the turbulence filters: one of u, two each of v and w [-]."""
@@ -81,7 +81,7 @@ class Air(NamedTuple):
         )  # fmt: skip
 
 
-class Record(NamedTuple):
+class EpisodeStats(NamedTuple):
     """What accumulates over an episode, at every physics step."""
 
     energy: np.ndarray
@@ -98,6 +98,6 @@ class Record(NamedTuple):
     """(E,) largest tension over stiffness, relative to the cable's length [-]."""
 
     @classmethod
-    def zeros(cls, num_envs: int) -> Record:
+    def zeros(cls, num_envs: int) -> EpisodeStats:
         """Return an empty record."""
         return cls(*(np.zeros(num_envs) for _ in cls._fields))

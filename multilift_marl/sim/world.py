@@ -14,7 +14,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
-from multilift_marl.config.system import System
+from multilift_marl.rig.system import System
 from multilift_marl.sim.air import make_air
 from multilift_marl.sim.chain import make_chain, read_chains, update_chain, write_chains
 from multilift_marl.sim.chain_arrays import Chain, Motion, Nodes
@@ -22,21 +22,21 @@ from multilift_marl.sim.chain_dynamics import advance_chains
 from multilift_marl.sim.contact import find_fast, make_bodies, set_speculative
 from multilift_marl.sim.dynamics import apply_loads, make_constants
 from multilift_marl.sim.gusts import start_turbulence
+from multilift_marl.sim.hover import hover_drone, make_drones
 from multilift_marl.sim.inertia import make_inertias, update_inertias
 from multilift_marl.sim.parameters import (
     Parameters,
-    adopt,
-    fit_cables,
-    make_varied,
+    apply_cable_limits,
+    make_rotor_variation,
     nominal_parameters,
+    update_parameters,
     write_lags,
     write_model,
 )
-from multilift_marl.sim.rows import make_places, read_rows, write_rows
 from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.scene import build_model
-from multilift_marl.sim.standing import hover_drone, make_drones
-from multilift_marl.sim.state import Air, Plant, Record, SystemState
+from multilift_marl.sim.state import Air, EpisodeStats, HiddenLoads, SystemState
+from multilift_marl.sim.state_io import make_state_layout, read_state, write_state
 
 _log = logging.getLogger("multilift_marl.mujoco")
 REST_HEIGHT = 1.5  # [m] of the payload after World.reset
@@ -51,7 +51,7 @@ class Shard:
     batch: Batch
     apply: Callable[[], None]
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
-    pull: Callable[[], None] | None
+    advance_chains: Callable[[], None] | None
     """`advance_chains` of these environments; None with massless cables, which MuJoCo advances."""
     read: Callable[[], None]
     """`read_rows` or `read_chains` of these environments."""
@@ -101,19 +101,19 @@ class World:
         self.thrust, self.drones = np.zeros((num_envs, self.num_drones, 4)), make_drones(system)
         self.state = SystemState.zeros(num_envs, self.num_drones)
         self.parameters = nominal_parameters(system, num_envs)
-        self._varied = make_varied(system, self.parameters)
-        self.plant = Plant(
+        self._varied = make_rotor_variation(system, self.parameters)
+        self.hidden_loads = HiddenLoads(
             payload_mass=self.parameters.payload_mass, payload_force=np.zeros((num_envs, 3)),
             wind=np.tile(system.wind, (num_envs, 1)), motors_off=np.zeros((num_envs, self.num_drones), bool),
         )  # fmt: skip
         self.air, self.seed = Air.zeros(num_envs, self.num_drones), seed
-        self.record, self.diverged = Record.zeros(num_envs), np.zeros(num_envs, bool)
+        self.stats, self.diverged = EpisodeStats.zeros(num_envs), np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
         self.nodes = Nodes.zeros(num_envs, system) if system.cable_model == "chain" else None
         self._inertias = make_inertias(system, self.parameters)
         self._chain: Chain | None = None
-        self._write: Callable[..., None] = write_rows
-        self._places: tuple[object, ...] = ()
+        self._write: Callable[..., None] = write_state
+        self._state_layout: tuple[object, ...] = ()
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool: tuple[int, ThreadPoolExecutor] | None = None  # with its process
         self.reset()
@@ -128,10 +128,10 @@ class World:
         state.drone_position[mask] = system.slots + [0, 0, REST_HEIGHT]
         state.drone_velocity[mask] = state.drone_body_rates[mask] = 0
         for e in np.flatnonzero(mask).tolist():
-            for n, pull in enumerate(system.drone_pull):
-                hover_drone(e, n, state, tuple(pull), 0.0, self.drones)
+            for n, force in enumerate(system.hook_force):
+                hover_drone(e, n, state, tuple(force), 0.0, self.drones)
         self.set_parameters(mask, **nominal_parameters(system, self.num_envs)._asdict())
-        self.plant.payload_force[mask], self.plant.wind[mask] = 0, system.wind
+        self.hidden_loads.payload_force[mask], self.hidden_loads.wind[mask] = 0, system.wind
         if system.air.turbulence:
             for e in np.flatnonzero(mask).tolist():
                 self.seed_turbulence(e, np.random.SeedSequence(self.seed, spawn_key=(e,)))
@@ -167,15 +167,15 @@ class World:
             shard.apply()
             if shard.find_fast():
                 set_speculative(shard.batch, shard.fast)
-            if shard.pull is not None:
-                shard.pull()
+            if shard.advance_chains is not None:
+                shard.advance_chains()
             try:
                 shard.batch.step()
             except SimulationError as error:
                 self.diverged[shard.lo + np.asarray(error.ids, int)] = True
             shard.read()
             if self.breakable:
-                self._cut(shard)
+                self._sync_broken(shard)
 
     def run(self, work: Callable[[Shard], None]) -> None:
         """Call `work` for every shard, each on a thread of its own."""
@@ -200,7 +200,7 @@ class World:
         Raises:
             ValueError: a value that cannot be, or of what the configuration does not vary at a cost.
         """
-        changed, names = adopt(self.system, self.parameters, mask, values)
+        changed, names = update_parameters(self.system, self.parameters, mask, values)
         if not names:
             return
         if self._varied is not None and "vehicle_rotor_time_constant" in names:
@@ -212,7 +212,7 @@ class World:
             local = changed[shard.lo : shard.hi]
             if local.any():
                 shared = self.model, self.layout, self.system
-                write_model(shard.batch, *shared, self._own(shard), local, names, shard.broken)
+                write_model(shard.batch, *shared, self._shard_parameters(shard), local, names, shard.broken)
 
     def seed_turbulence(self, env: int, seed: np.random.SeedSequence) -> None:
         """Start the turbulence of environment `env` anew from its stationary distribution, drawn from `seed`."""
@@ -223,21 +223,21 @@ class World:
         """Let the cables in `mask` (E, N) bool break; `reset` and `load` make them whole again."""
         self.state.cable_broken[mask] = True
         for shard in self.shards:
-            self._cut(shard)
+            self._sync_broken(shard)
 
     def load(self, mask: np.ndarray) -> None:
         """Make `state` of the environments in `mask` (E,) the simulations' own.
 
         Records and gusts start anew, cables are whole, motors run.
         """
-        self.state.cable_broken[mask] = self.plant.motors_off[mask] = False
-        self.air.gust[mask] = self.air.wash[mask] = self.air.steps[mask] = 0
+        self.state.cable_broken[mask] = self.hidden_loads.motors_off[mask] = False
+        self.air.gust[mask] = self.air.downwash[mask] = self.air.steps[mask] = 0
         for shard in self.shards:
             local = mask[shard.lo : shard.hi]
             if local.any():
-                self._cut(shard)
+                self._sync_broken(shard)
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
-                self._write(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.record, *self._places)
+                self._write(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.stats, *self._state_layout)
         self.diverged[mask] = False
 
     def check_warnings(self) -> None:
@@ -290,21 +290,21 @@ class World:
         for shard in self.shards:
             shard.batch.state[:] = saved["rows"][shard.lo : shard.hi]
             shard.batch.warning[:] = saved["warning"][shard.lo : shard.hi]
-            self._cut(shard)
+            self._sync_broken(shard)
         self.diverged[:] = saved["diverged"]
 
-    def _groups(self) -> dict[str, SystemState | Plant | Parameters | Air | Record | Nodes]:
-        names = ("state", "plant", "parameters", "air", "record", *(("nodes",) if self.nodes is not None else ()))
+    def _groups(self) -> dict[str, SystemState | HiddenLoads | Parameters | Air | EpisodeStats | Nodes]:
+        names = ("state", "hidden_loads", "parameters", "air", "stats", *(("nodes",) if self.nodes is not None else ()))
         return {name: getattr(self, name) for name in names}
 
-    def _cut(self, shard: Shard) -> None:
+    def _sync_broken(self, shard: Shard) -> None:
         """Bring the shard's models into line with `state.cable_broken`."""
         broken = self.state.cable_broken[shard.lo : shard.hi]
         if (broken != shard.broken).any():
-            fit_cables(shard.batch, self.system, self._own(shard), broken)
+            apply_cable_limits(shard.batch, self.system, self._shard_parameters(shard), broken)
             shard.broken[:] = broken
 
-    def _own(self, shard: Shard) -> Parameters:
+    def _shard_parameters(self, shard: Shard) -> Parameters:
         """Return the parameters of a shard's environments."""
         return Parameters(*(array[shard.lo : shard.hi] for array in self.parameters))
 
@@ -314,29 +314,29 @@ class World:
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
             batch = Batch(self.model, hi - lo, nthread=1)
             constants = make_constants(self.system, self.layout, batch)
-            places = make_places(
+            rows = make_state_layout(
                 self.system, self.layout, self.parameters, self._inertias, batch
             )  # the same for every shard
             span, flow = (batch.state, lo, hi), make_air(self.system)
             air = (None, None) if flow.still else (self.air, flow)
-            blown = (self.thrust, self.state, self.plant, self.record, constants, *air, self._varied)
-            apply, seen = bind(apply_loads, *span, *blown), (self.state, self.record, self.diverged, places)
-            pull = motion = None
+            blown = (self.thrust, self.state, self.hidden_loads, self.stats, constants, *air, self._varied)
+            apply, seen = bind(apply_loads, *span, *blown), (self.state, self.stats, self.diverged, rows)
+            chains_step = motion = None
             if self.nodes is None:
-                self._write, self._places = write_rows, (places,)
-                read = bind(read_rows, *span, batch.bind("sensordata"), *seen)
+                self._write, self._state_layout = write_state, (rows,)
+                read = bind(read_state, *span, batch.bind("sensordata"), *seen)
             else:
                 if self._chain is None:
                     self._chain = make_chain(self.system, self.layout, self.parameters, self._inertias, batch)
                 chains = self._chain, self.nodes
-                self._write, self._places = write_chains, (places, *chains)
+                self._write, self._state_layout = write_chains, (rows, *chains)
                 motion = Motion.zeros(hi - lo, self.system)
-                pull = bind(advance_chains, *span, self.state, self.diverged, *chains, motion)
+                chains_step = bind(advance_chains, *span, self.state, self.diverged, *chains, motion)
                 read = bind(read_chains, *span, batch.bind("qfrc_constraint"), *seen, *chains, motion)
             broken = np.zeros((hi - lo, self.num_drones), bool)
             fast = np.zeros(hi - lo, bool)
             watch: Any = bind(find_fast, lo, hi, self.state, fast, bodies)
-            shards.append(Shard(lo, hi, batch, apply, pull, read, broken, motion, watch, fast))
+            shards.append(Shard(lo, hi, batch, apply, chains_step, read, broken, motion, watch, fast))
         return shards
 
 

@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Section
 from multilift_marl.control.formation import Goal, Reference, make_rig, place_formation
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
-from multilift_marl.tasks.failures import Watch, find_failures, make_limits
-from multilift_marl.tasks.imperfections import Imperfections
+from multilift_marl.tasks.failures import FailureMask, find_failures, make_limits
 from multilift_marl.tasks.observations import Component, observation_names, observe_team
+from multilift_marl.tasks.rewards import Errors, update_errors
+from multilift_marl.tasks.sensing import Sensing
 from multilift_marl.tasks.starts import make_hanging, true_hanging
-from multilift_marl.tasks.terms import Errors, measure
 
 Look = tuple[Callable[..., None], tuple[Any, ...]]  # a kernel and its arguments
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
@@ -40,9 +40,9 @@ class Box(NamedTuple):
 
 
 @kernel
-def check_team(lo, hi, state, goal, way, led, errors, dt, limits, watch, cause, min_separation):
+def check_team(lo, hi, state, goal, planned, is_planned, errors, dt, limits, watch, cause, min_separation):
     """Measure the errors of environments lo to hi, integrate them over `dt` [s], look for failures."""
-    measure(lo, hi, state, goal, way, led, errors, dt, INTEGRAL_LIMIT)
+    update_errors(lo, hi, state, goal, planned, is_planned, errors, dt, INTEGRAL_LIMIT)
     find_failures(lo, hi, state, errors, limits, watch, cause, min_separation)
 
 
@@ -59,7 +59,7 @@ class Task:
         REWARD: default weight of every reward term; `reward.<term>` overrides.
         EXTRA: what its observations have beside the common components.
         EXTRA_STATE: how many numbers it adds to the global state.
-        LEAST_DRONES: with fewer it makes no sense.
+        MIN_DRONES: with fewer it makes no sense.
         KEPT: names of further arrays, environment first, that outlive a step.
 
     Args:
@@ -97,22 +97,20 @@ class Task:
     REWARD: ClassVar[dict[str, float]] = {}
     EXTRA: ClassVar[tuple[Component, ...]] = ()
     EXTRA_STATE: ClassVar[int] = 0
-    LEAST_DRONES: ClassVar[int] = 1
-    KEPT: ClassVar[tuple[str, ...]] = ()
+    MIN_DRONES: ClassVar[int] = 1
+    SAVED: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: Config, world: World, reference: Reference):
         e, n, system = world.num_envs, world.num_drones, world.system
         self.world, self.reference, self.seen = world, reference, world.state
-        self._imperfections: Imperfections | None = None
-        if n < self.LEAST_DRONES:
-            raise ConfigError(
-                f"task {self.name} needs more drones; raise env.num_drones to {self.LEAST_DRONES} or more"
-            )
+        self._sensing: Sensing | None = None
+        if n < self.MIN_DRONES:
+            raise ConfigError(f"task {self.name} needs more drones; raise env.num_drones to {self.MIN_DRONES} or more")
         self.options = validate(self.Options, config.task_options, "task_options")
         self.weights = self._weights(config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
-        self.way = self.goal
+        self.planned = self.goal
         self.rig = make_rig(system)
         self.limits, self.nominal_hanging = make_limits(system), make_hanging(system)
         self.hanging = self.nominal_hanging
@@ -120,7 +118,7 @@ class Task:
         self._nominal = np.append(np.stack([system.cable_length, tension], axis=1), [[system.payload_mass, 0]], axis=0)
         self.cause, self.good_time = np.zeros(e, np.int64), np.zeros(e)
         self.min_separation, self.time = np.zeros(e), np.zeros(e)
-        self.watch = Watch.zeros(e, n)
+        self.watch = FailureMask.zeros(e, n)
         self.rmse_after = 0.0
         self.terms = np.zeros((e, len(self.REWARD)))
 
@@ -134,7 +132,7 @@ class Task:
         """
         raise NotImplementedError
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Return what, after each policy step, writes `terms` and updates `good_time` of environments lo to hi.
 
         Args:
@@ -170,11 +168,11 @@ class Task:
             self.goal.rotation[env] = rotation
         place_formation(env, self.goal, self.rig)
 
-    def counts(self, time: float, length: float) -> bool:
+    def in_error_window(self, time: float, length: float) -> bool:
         """Return whether errors at `time` [s] of an episode of `length` [s] belong to those that are reported."""
         return time > length - FINAL_SECONDS + 1e-9
 
-    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None] | None:
+    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None] | None:
         """Return what writes `EXTRA` and `EXTRA_STATE`, the last numbers of each row, of environments lo to hi.
 
         Args:
@@ -184,10 +182,10 @@ class Task:
         """
         return None
 
-    def blur(self, imperfections: Imperfections) -> None:
+    def use_sensing(self, sensing: Sensing) -> None:
         """Let the drones observe through these from now on."""
-        self._imperfections = imperfections
-        self.seen = imperfections.state if imperfections.noisy else self.world.state
+        self._sensing = sensing
+        self.seen = sensing.state if sensing.has_noise else self.world.state
 
     def draw_start(self, env: int, rng: np.random.Generator, parameters: Parameters) -> bool:
         """Draw a start of environment `env`, whose team has true `parameters`; return whether it is sound.
@@ -199,7 +197,7 @@ class Task:
         self.hanging = self.nominal_hanging
         return self.begin(env)
 
-    def route(self, env: int) -> np.ndarray:
+    def target_path(self, env: int) -> np.ndarray:
         """Return points (P, 3) [m] of the way that the target takes in this episode, to draw it; none if it stays."""
         return np.zeros((0, 3))
 
@@ -220,12 +218,12 @@ class Task:
 
     def observe(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> None:
         """Write observations (E, N, D) and global states (E, S) of environments lo to hi."""
-        looks, late = self._looks(lo, hi, 0.0, action, observation, critic)
+        looks, delays = self._observe_kernels(lo, hi, 0.0, action, observation, critic)
         for function, arguments in looks:
             function(*arguments)
-        if extra := self.observer(lo, hi, observation, critic):
+        if extra := self.observe_extra(lo, hi, observation, critic):
             extra()
-        for function, arguments in late:
+        for function, arguments in delays:
             function(*arguments)
 
     def after_step(
@@ -238,47 +236,49 @@ class Task:
             action, previous: this action and the last one (E, N, A), live arrays.
             observation, critic: observations (E, N, D) and global states (E, S), written.
         """
-        extra = self.observer(lo, hi, observation, critic)
-        looks, late = self._looks(lo, hi, self.dt, action, observation, critic)
+        extra = self.observe_extra(lo, hi, observation, critic)
+        looks, delays = self._observe_kernels(lo, hi, self.dt, action, observation, critic)
         return [
             bind(check_team, *self._checked(lo, hi, self.dt)),
-            self.scorer(lo, hi, action, previous),
+            self.reward(lo, hi, action, previous),
             *(bind(function, *arguments) for function, arguments in looks),
             *([extra] if extra else []),
-            *(bind(function, *arguments) for function, arguments in late),
+            *(bind(function, *arguments) for function, arguments in delays),
         ]
 
-    def _looks(
+    def _observe_kernels(
         self, lo: int, hi: int, dt: float, action: np.ndarray, observation: np.ndarray, critic: np.ndarray
     ) -> tuple[list[Look], list[Look]]:
         """Return the kernels that observe, before and after the task's own, with their arguments."""
-        plant, goal, reference, rig, nominal = self.world.plant, self.goal, self.reference, self.rig, self._nominal
-        common, span, through = (action, rig, nominal, observation), (lo, hi), self._imperfections
+        loads, goal, reference = self.world.hidden_loads, self.goal, self.reference
+        rig, nominal = self.rig, self._nominal
+        common, span, sensing = (action, rig, nominal, observation), (lo, hi), self._sensing
         state, errors = self.world.state, self.errors
-        looks: list[Look] = [(observe_team, (*span, state, plant, goal, reference, errors, *common, critic))]
-        if through is None:
+        looks: list[Look] = [(observe_team, (*span, state, loads, goal, reference, errors, *common, critic))]
+        if sensing is None:
             return looks, []
-        if through.noisy:
-            state, errors = through.state, through.errors
+        if sensing.has_noise:
+            led = self.planned, self.planned is not goal
+            state, errors = sensing.state, sensing.errors
             looks += [
-                through.sense(*span, self.world.state),
-                (measure, (*span, state, goal, self.way, self.way is not goal, errors, dt, INTEGRAL_LIMIT)),
-                (observe_team, (*span, state, plant, goal, reference, errors, *common, through.unused)),
+                sensing.sense(*span, self.world.state),
+                (update_errors, (*span, state, goal, *led, errors, dt, INTEGRAL_LIMIT)),
+                (observe_team, (*span, state, loads, goal, reference, errors, *common, sensing.unused)),
             ]
         own = len(observation_names(0))
-        late = [through.delay(*span, observation, (own, own + action.shape[2]))] if through.late else []
-        return looks, late
+        delays = [sensing.delay(*span, observation, (own, own + action.shape[2]))] if sensing.delays_observation else []
+        return looks, delays
 
     def _checked(self, lo: int, hi: int, dt: float) -> tuple[Any, ...]:
-        state, goal, way, errors = self.world.state, self.goal, self.way, self.errors
+        state, goal, planned, errors = self.world.state, self.goal, self.planned, self.errors
         found = (self.limits, self.watch, self.cause, self.min_separation)
-        return lo, hi, state, goal, way, way is not goal, errors, dt, *found
+        return lo, hi, state, goal, planned, planned is not goal, errors, dt, *found
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""
-        kept = ("cause", "good_time", "min_separation", "time", *self.KEPT)
+        kept = ("cause", "good_time", "min_separation", "time", *self.SAVED)
         saved = {name: operator.attrgetter(name)(self).copy() for name in kept}
-        for group in ("goal", "errors", "watch", *(() if self.way is self.goal else ("way",))):
+        for group in ("goal", "errors", "watch", *(() if self.planned is self.goal else ("planned",))):
             saved |= {f"{group}.{name}": array.copy() for name, array in getattr(self, group)._asdict().items()}
         return saved
 

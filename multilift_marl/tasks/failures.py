@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import MIN_SEPARATION, System
 from multilift_marl.math3d import (
     add,
     column,
@@ -24,8 +23,10 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
+from multilift_marl.rig.resolve import MIN_SEPARATION
+from multilift_marl.rig.system import System
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.sim.standing import hook_place
+from multilift_marl.sim.hover import hook_position
 
 CAUSES = (
     "none",
@@ -50,16 +51,16 @@ _MIN_UP = cos(radians(80.0))
 _MIN_CABLE_PAYLOAD = cos(radians(135.0))
 
 
-class Watch(NamedTuple):
+class FailureMask(NamedTuple):
     """What does not count as a failure for now; all zero unless a task says otherwise."""
 
-    forgiven: np.ndarray
+    ignored: np.ndarray
     """(E,) int64, a bit for every cause, see `forgive`."""
     lost: np.ndarray
     """(E, N) bool, drones that count no more."""
 
     @classmethod
-    def zeros(cls, num_envs: int, num_drones: int) -> Watch:
+    def zeros(cls, num_envs: int, num_drones: int) -> FailureMask:
         """Return a watch that forgives nothing."""
         return cls(np.zeros(num_envs, np.int64), np.zeros((num_envs, num_drones), bool))
 
@@ -113,55 +114,55 @@ def find_failures(lo, hi, state, errors, limits, watch, cause, min_separation):
         cause[e] = _cause(e, state, errors, limits, watch, min_separation)
 
 
-def forgive(*causes: int) -> int:
+def ignore(*causes: int) -> int:
     """Return the value of `Watch.forgiven` that lets pass `causes`."""
     return sum(1 << cause for cause in causes)
 
 
 @kernel
-def _counts(cause, forgiven):
+def _counts(cause, ignored):
     """Return whether a cause is a failure."""
-    return (forgiven >> cause) & 1 == 0
+    return (ignored >> cause) & 1 == 0
 
 
 @kernel
 def _cause(e, state, errors, limits, watch, min_separation):
-    forgiven = watch.forgiven[e]
+    ignored = watch.ignored[e]
     payload, attitude = row(state.payload_position, e), matrow(state.payload_rotation, e)
     up = column(attitude, 2)
     count = state.drone_position.shape[1]
     if not errors.distance[e] <= MAX_DISTANCE:
         return RANGE
-    if payload_height(payload, attitude, limits) < TOUCH and _counts(LOAD_GROUND, forgiven):
+    if payload_height(payload, attitude, limits) < TOUCH and _counts(LOAD_GROUND, ignored):
         return GROUND
     for n in range(count):
         if watch.lost[e, n]:
             continue
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
         anchor = add(payload, mul(attitude, (limits.anchors[n, 0], limits.anchors[n, 1], limits.anchors[n, 2])))
-        end = hook_place(e, n, state, limits.hooks)
+        end = hook_position(e, n, state, limits.hooks)
         cable = unit(sub(end, anchor))
-        if drone[2] - _extent(frame, limits.drone_half[n]) < TOUCH and _counts(GROUND, forgiven):
+        if drone[2] - _extent(frame, limits.drone_half[n]) < TOUCH and _counts(GROUND, ignored):
             return GROUND
-        if state.cable_broken[e, n] and _counts(BROKEN, forgiven):
+        if state.cable_broken[e, n] and _counts(BROKEN, ignored):
             return BROKEN
-        if frame[8] < _MIN_UP and _counts(TILT, forgiven):
+        if frame[8] < _MIN_UP and _counts(TILT, ignored):
             return TILT
-        if drone[2] < payload[2] and _counts(BELOW, forgiven):
+        if drone[2] < payload[2] and _counts(BELOW, ignored):
             return BELOW
         if dot(cable, column(frame, 2)) < 0.0 or dot(cable, up) < _MIN_CABLE_PAYLOAD:
-            if _counts(CABLE, forgiven):
+            if _counts(CABLE, ignored):
                 return CABLE
         for m in range(n):
             if watch.lost[e, m]:
                 continue
             apart = norm(sub(drone, vec(state.drone_position, e, m)))
             min_separation[e] = min(min_separation[e], apart)
-            if apart < limits.separation[n, m] and _counts(COLLISION, forgiven):
+            if apart < limits.separation[n, m] and _counts(COLLISION, ignored):
                 return COLLISION
             foot = add(payload, mul(attitude, (limits.anchors[m, 0], limits.anchors[m, 1], limits.anchors[m, 2])))
-            other = hook_place(e, m, state, limits.hooks)
-            if segment_distance(anchor, end, foot, other) < limits.cables[n, m] and _counts(CROSSING, forgiven):
+            other = hook_position(e, m, state, limits.hooks)
+            if segment_distance(anchor, end, foot, other) < limits.cables[n, m] and _counts(CROSSING, ignored):
                 return CROSSING
     return 0
 

@@ -10,19 +10,19 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.values import Float, Int, Section
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import add, ease, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, triple, turn, vec
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.sim.standing import hook_place
+from multilift_marl.sim.hover import hook_position
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Box, Task
 from multilift_marl.tasks.failures import WALL
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.paths import STEP, differences, set_goal
+from multilift_marl.tasks.rewards import RestBounds, action_rate, is_at_rest, tolerance, update_peak_tension
 from multilift_marl.tasks.starts import hang_team, in_ball
-from multilift_marl.tasks.terms import RestBounds, is_at_rest, mean_change, tolerance, update_peak_tension
 
 THICKNESS = 0.1  # [m] of the walls
 PASSED = 0.8  # [m] that a payload is past a wall when its last drone is, too
@@ -105,7 +105,7 @@ class Gate(Task):
         Component("clearance", 1, "-", "m", "own room to the next wall's edges, within ± 0.5"),
     )
     EXTRA_STATE: ClassVar[int] = 6
-    KEPT: ClassVar[tuple[str, ...]] = ("gap_y", "peak_tension")
+    SAVED: ClassVar[tuple[str, ...]] = ("gap_y", "peak_tension")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
@@ -134,12 +134,14 @@ class Gate(Task):
         tensions = (self.world.state, self.watch, self.world.system.resting_tension, self.peak_tension)
         return bind(_plan, lo, hi, self.time, self.control_dt, self.gates, self.goal, self.rig, tensions)
 
-    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell where the next gap is; see `Task.observer`."""
         state = self.world.state
-        return bind(_tell, lo, hi, state, self.seen, self.goal, self.gates, self.bodies, observation, critic)
+        return bind(
+            _write_observation, lo, hi, state, self.seen, self.goal, self.gates, self.bodies, observation, critic
+        )
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness to the moving target and for room; a touched wall is a failure. See `Task.scorer`."""
         option = self.options
         bounds = RestBounds(
@@ -155,7 +157,7 @@ class Gate(Task):
         rested = self.good_time >= self.options.success_seconds - 1e-9
         return rested & (self.peak_tension <= self.options.success_tension)
 
-    def route(self, env: int) -> np.ndarray:
+    def target_path(self, env: int) -> np.ndarray:
         """Return points of the way through the gaps; see `Task.route`."""
         return np.array([_place(env, t, self.gates) for t in np.linspace(0, self.options.arrival, 61)])
 
@@ -256,7 +258,7 @@ def _least_room(e, state, gates, bodies):
             drone = vec(state.drone_position, e, n)
             room = min(room, _room(e, g, drone, mat(state.drone_rotation, e, n), bodies.drone[n], gates))
             anchor = add(payload, mul(attitude, row(bodies.anchors, n)))
-            room = min(room, _cable_room(e, g, anchor, hook_place(e, n, state, bodies.hooks), gates))
+            room = min(room, _cable_room(e, g, anchor, hook_position(e, n, state, bodies.hooks), gates))
     return room
 
 
@@ -268,7 +270,7 @@ def _clearance(e, n, g, state, gates, bodies):
 
 
 @kernel
-def _tell(lo, hi, state, seen, goal, gates, bodies, observation, critic):
+def _write_observation(lo, hi, state, seen, goal, gates, bodies, observation, critic):
     for e in range(lo, hi):
         g = _next(e, state.payload_position[e, 0], gates)
         middle = (gates.x[g], gates.y[e, g], gates.level)
@@ -303,7 +305,7 @@ def _score(
         terms[e, 3] = weights[3] * tolerance(slip, 0.2)
         terms[e, 4] = weights[4] * tolerance(errors.angle[e], radians(6.0))
         terms[e, 5] = weights[5] * tolerance(norm(row(state.payload_body_rates, e)), 0.3)
-        terms[e, 6] = weights[6] * mean_change(e, action, previous)
+        terms[e, 6] = weights[6] * action_rate(e, action, previous)
         good = time[e] >= arrival and is_at_rest(e, state, errors, bounds)
         good_time[e] = good_time[e] + dt if good else 0.0
         if cause[e] == 0 and _least_room(e, state, gates, bodies) < 0.0:

@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import MIN_SEPARATION, System
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
+from multilift_marl.rig.resolve import MIN_SEPARATION
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.tasks.terms import tolerance
+from multilift_marl.tasks.rewards import tolerance
 
 _SLACK_REACH = 0.9  # of its cable: the farthest that a drone stands from its anchor
 
@@ -29,7 +30,7 @@ class Ground(NamedTuple):
     """(N,) speed of its rotors that idle [rad/s]."""
     size: float
     """Span of the largest vehicle over a falcon's, by which lengths scale."""
-    rope: np.ndarray
+    cable_weight: np.ndarray
     """(N,) weight of each cable [N]."""
 
 
@@ -41,7 +42,7 @@ def make_ground(system: System) -> Ground:
         drone=np.array([drone_half_size(vehicle)[2] for vehicle in system.vehicles]),
         idle=np.array([vehicle.rotor_speed_min for vehicle in system.vehicles], float),
         size=float(system.min_separation.max()) / MIN_SEPARATION,
-        rope=GRAVITY * system.cable_mass,
+        cable_weight=GRAVITY * system.cable_mass,
     )
 
 
@@ -91,7 +92,7 @@ def stand_team(e, rng, state, goal, rig, ground, distance, spread):
 
 
 @kernel
-def rest_goal(e, goal, position):
+def set_resting_goal(e, goal, position):
     """Put the target of environment e at `position` [m], at rest."""
     put(goal.position[e], position)
     goal.velocity[e] = goal.acceleration[e] = goal.jerk[e] = 0.0
@@ -115,15 +116,15 @@ def cable_chord(e, n, goal, rig):
 
 
 @kernel
-def share_pull(e, n, goal, share, rig, rope):
+def share_force(e, n, goal, share, rig, cable_weight):
     """Scale the nominal pull of drone n by `share`; of a slack cable the drone carries half its weight `rope` [N].
 
     What the drone's slot does about the target, the load does not: its inertia, which the controller feeds forward
     with all accelerations, is taken off again.
     """
-    pull = scale(share, vec(goal.pull, e, n))
+    cable_force = scale(share, vec(goal.cable_force, e, n))
     idle = scale(-rig.force[n, 2] / GRAVITY, vec(goal.slot_acceleration, e, n))
-    put(goal.pull[e, n], add(add(pull, idle), (0.0, 0.0, 0.5 * (1.0 - share) * rope)))
+    put(goal.cable_force[e, n], add(add(cable_force, idle), (0.0, 0.0, 0.5 * (1.0 - share) * cable_weight)))
 
 
 @kernel

@@ -10,13 +10,13 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.rewards import action_rate, pose_reward
 from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
-from multilift_marl.tasks.terms import mean_change, pay_pose
 
 
 class HoverOptions(StartOptions):
@@ -52,7 +52,7 @@ class Hover(Task):
         """Draw target, displacement, tilt and velocity; see `Task.start`."""
         start_near_target(env, rng, self.world.state, self.goal, self.rig, self._ranges, self.hanging, mass)
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
         success = (self.options.success_distance, radians(self.options.success_angle))
         return bind(
@@ -68,7 +68,7 @@ class Hover(Task):
 @kernel
 def _score(lo, hi, state, goal, errors, action, previous, weights, success, dt, terms, good_time):
     for e in range(lo, hi):
-        pay_pose(e, state, goal, errors, 1.0, weights, terms)
-        terms[e, 5] = weights[5] * mean_change(e, action, previous)
+        pose_reward(e, state, goal, errors, 1.0, weights, terms)
+        terms[e, 5] = weights[5] * action_rate(e, action, previous)
         good = errors.distance[e] <= success[0] and errors.angle[e] <= success[1]
         good_time[e] = good_time[e] + dt if good else 0.0

@@ -10,25 +10,25 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import add, ease, matrow, norm, put, putmat, rot_z, row, scale, sub, tmul, turn, vec
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.failures import LOAD_GROUND, TOUCH, forgive, payload_height
+from multilift_marl.tasks.failures import LOAD_GROUND, TOUCH, ignore, payload_height
 from multilift_marl.tasks.ground import (
     cable_chord,
     make_ground,
     mean_slot_tolerance,
     move_goal,
-    rest_goal,
-    share_pull,
+    set_resting_goal,
+    share_force,
 )
 from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.rewards import action_rate, pose_reward, tolerance
 from multilift_marl.tasks.starts import hang_team
-from multilift_marl.tasks.terms import mean_change, pay_pose, tolerance
 
 APPROACH, DESCEND, SETTLE = (0.1, 2.7), (2.0, 2.8), (4.8, 1.6)  # begin and length of each phase [s]
 RELEASE, LOWER = (6.4, 2.2), (8.6, 1.4)
@@ -36,7 +36,7 @@ DOWN = SETTLE[0] + SETTLE[1]  # [s] when the target is on the ground
 NEAR = 0.12  # [m] above the ground where the slow last part of the way begins, for the span of a falcon
 SHORTER = 0.15  # of its length: how much nearer to its anchor a drone comes in the end
 AIRBORNE, LANDED, CRASHED = range(3)
-_LANDED_WELL = forgive(LOAD_GROUND)
+_LANDED_WELL = ignore(LOAD_GROUND)
 _AT_REST = 0.02  # [m/s]
 
 
@@ -54,7 +54,7 @@ class LandOptions(Section):
     success_seconds: Float = Field(1.0, gt=0, description="[s] at rest, slack and clear throughout the last seconds")
 
 
-class Down(NamedTuple):
+class LandingLimits(NamedTuple):
     """What counts as down, in SI units."""
 
     radius: float
@@ -91,17 +91,17 @@ class Land(Task):
         Component("target_velocity", 3, "slot", "m/s", "velocity of the target"),
     )
     EXTRA_STATE: ClassVar[int] = 5
-    KEPT: ClassVar[tuple[str, ...]] = ("course", "touch", "speed", "share")
+    SAVED: ClassVar[tuple[str, ...]] = ("course", "touch", "speed", "share")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
         e, system, option = world.num_envs, world.system, self.options
         self._ground = make_ground(system)
-        size, rope = self._ground.size, self._ground.rope
+        size, cable_weight = self._ground.size, self._ground.cable_weight
         half = max((drone_half_size(vehicle) for vehicle in system.vehicles), key=np.linalg.norm)
-        self._down = Down(
-            option.pad_radius, option.touch_speed, option.clearance * min(size, 1.0), float(np.linalg.norm(half)), rope,
-            system.resting_tension,
+        self._down = LandingLimits(
+            option.pad_radius, option.touch_speed, option.clearance * min(size, 1.0), float(np.linalg.norm(half)),
+            cable_weight, system.resting_tension,
         )  # fmt: skip
         self.course, self.touch = np.zeros((e, 3)), np.zeros(e, np.int64)
         self.speed, self.share = np.zeros(e), np.zeros(e)
@@ -120,11 +120,11 @@ class Land(Task):
         """Fly to the pad, descend, settle, release, come lower; see `Task.planner`."""
         return bind(_plan, lo, hi, self.control_dt, *self._planned())
 
-    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell where in the plan the team is; see `Task.observer`."""
         return bind(_observe, lo, hi, self.time, self.share, self.goal, observation, critic)
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for keeping the plan, as payload first and as slack drones later; see `Task.scorer`."""
         return bind(
             _score, lo, hi, self.world.state, self.goal, self.errors, self.course, self.share, self.limits, self._down,
@@ -153,7 +153,7 @@ class Land(Task):
 @kernel
 def _start(e, rng, state, goal, rig, hanging, mass, xy, yaw, low, high, way):
     put(way[e], (rng.uniform(-xy, xy), rng.uniform(-xy, xy), low - high))
-    rest_goal(e, goal, (0.0, 0.0, high))
+    set_resting_goal(e, goal, (0.0, 0.0, high))
     putmat(goal.rotation[e], rot_z(rng.uniform(-yaw, yaw)))
     place_formation(e, goal, rig)
     still = (0.0, 0.0, 0.0)
@@ -167,7 +167,7 @@ def _plan(lo, hi, dt, time, way, touch, speed, share, state, goal, rig, ground, 
     for e in range(lo, hi):
         time[e] += dt
         t, near = time[e], min(NEAR * ground.size, -way[e, 2])
-        rest_goal(e, goal, (0.0, 0.0, ground.payload - way[e, 2]))
+        set_resting_goal(e, goal, (0.0, 0.0, ground.payload - way[e, 2]))
         move_goal(e, goal, (way[e, 0], way[e, 1], 0.0), ease(t, APPROACH[0], APPROACH[1]))
         move_goal(e, goal, (0.0, 0.0, way[e, 2] + near), ease(t, DESCEND[0], DESCEND[1]))
         move_goal(e, goal, (0.0, 0.0, -near), ease(t, SETTLE[0], SETTLE[1]))
@@ -179,7 +179,7 @@ def _plan(lo, hi, dt, time, way, touch, speed, share, state, goal, rig, ground, 
             put(goal.slots[e, n], add(vec(goal.slots, e, n), scale(-SHORTER * lower[0], chord)))
             put(goal.slot_velocity[e, n], scale(-SHORTER * lower[1], chord))
             put(goal.slot_acceleration[e, n], scale(-SHORTER * lower[2], chord))
-            share_pull(e, n, goal, share[e], rig, ground.rope[n])
+            share_force(e, n, goal, share[e], rig, ground.cable_weight[n])
 
 
 @kernel
@@ -194,7 +194,7 @@ def _touch_down(lo, hi, way, touch, speed, state, limits, down, watch):
             soft = max(velocity, speed[e]) <= down.speed
             touch[e] = LANDED if soft and off_pad(e, way, state) <= down.radius else CRASHED
         speed[e] = velocity
-        watch.forgiven[e] = _LANDED_WELL if touch[e] == LANDED else 0
+        watch.ignored[e] = _LANDED_WELL if touch[e] == LANDED else 0
 
 
 @kernel
@@ -225,14 +225,14 @@ def _drone_clear(e, n, state, limits, down):
 def _observe(lo, hi, time, share, goal, observation, critic):
     for e in range(lo, hi):
         c, s, velocity = cos(goal.yaw[e]), -sin(goal.yaw[e]), row(goal.velocity, e)
-        _tell(critic[e, critic.shape[1] - 5 :], time[e], share[e], turn(c, s, velocity))
+        _write_observation(critic[e, critic.shape[1] - 5 :], time[e], share[e], turn(c, s, velocity))
         for n in range(observation.shape[1]):
             cn, sn = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
-            _tell(observation[e, n, observation.shape[2] - 5 :], time[e], share[e], turn(cn, sn, velocity))
+            _write_observation(observation[e, n, observation.shape[2] - 5 :], time[e], share[e], turn(cn, sn, velocity))
 
 
 @kernel
-def _tell(out, time, share, velocity):
+def _write_observation(out, time, share, velocity):
     out[0], out[1] = DOWN - time, share
     put(out[2:], velocity)
 
@@ -243,7 +243,7 @@ def _score(
 ):  # fmt: skip
     for e in range(lo, hi):
         near = tolerance(errors.distance[e], 0.5)  # a payload that lies still elsewhere earns little
-        pay_pose(e, state, goal, errors, share[e] * near, weights, terms)
+        pose_reward(e, state, goal, errors, share[e] * near, weights, terms)
         loose, good, count = 0.0, off_pad(e, way, state) <= down.radius, goal.slots.shape[1]
         for n in range(count):
             excess = max(state.cable_tension[e, n] - down.slack[n], 0.0)
@@ -251,6 +251,6 @@ def _score(
             good = good and excess == 0.0 and _drone_clear(e, n, state, limits, down)
         terms[e, 5] = weights[5] * (1.0 - share[e]) * mean_slot_tolerance(e, state, goal, 0.25)
         terms[e, 6] = weights[6] * (1.0 - share[e]) * loose
-        terms[e, 7] = weights[7] * mean_change(e, action, previous)
+        terms[e, 7] = weights[7] * action_rate(e, action, previous)
         good = good and norm(row(state.payload_velocity, e)) <= _AT_REST and load_height(e, state, limits) < TOUCH
         good_time[e] = good_time[e] + dt if good else 0.0

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.gains import make_gains
@@ -20,8 +20,8 @@ from multilift_marl.math3d import norm, put, row, scale
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.rewards import RestBounds, action_rate, is_at_rest, tolerance, update_peak_tension
 from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
-from multilift_marl.tasks.terms import RestBounds, is_at_rest, mean_change, tolerance, update_peak_tension
 
 
 class LossOptions(StartOptions):
@@ -61,8 +61,8 @@ class Loss(Task):
         Component("planned_offset", 3, "slot", "m", "by how much the own slot is to move after a loss, by a plan"),
     )
     EXTRA_STATE: ClassVar[int] = 4
-    LEAST_DRONES: ClassVar[int] = 2
-    KEPT: ClassVar[tuple[str, ...]] = ("when", "who", "peak_tension")
+    MIN_DRONES: ClassVar[int] = 2
+    SAVED: ClassVar[tuple[str, ...]] = ("when", "who", "peak_tension")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
@@ -85,19 +85,19 @@ class Loss(Task):
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
         """Stop the motors when their time has come; see `Task.planner`."""
-        state, plant = self.world.state, self.world.plant
+        state, hidden_loads = self.world.state, self.world.hidden_loads
         tensions = (self.world.system.resting_tension, self.peak_tension)
         return bind(
-            _lose, lo, hi, self.time, self.control_dt, self.when, self.who, self.options.snap, state, plant, self.watch,
-            tensions,
+            _lose, lo, hi, self.time, self.control_dt, self.when, self.who, self.options.snap, state, hidden_loads,
+            self.watch, tensions,
         )  # fmt: skip
 
-    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell who is lost; see `Task.observer`."""
         told = (self.time, self.when, self.who, self._held)
-        return bind(_tell, lo, hi, told, not self.options.snap, self.watch, self.rig, observation, critic)
+        return bind(_write_observation, lo, hi, told, not self.options.snap, self.watch, self.rig, observation, critic)
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
         option = self.options
         bounds = RestBounds(
@@ -115,20 +115,20 @@ class Loss(Task):
 
 
 @kernel
-def _lose(lo, hi, time, dt, when, who, snap, state, plant, watch, tensions):
+def _lose(lo, hi, time, dt, when, who, snap, state, hidden_loads, watch, tensions):
     resting, peak = tensions
     for e in range(lo, hi):
         time[e] += dt
         if time[e] >= when[e] and not watch.lost[e, who[e]]:
             watch.lost[e, who[e]] = True
-            plant.motors_off[e, who[e]] = True
+            hidden_loads.motors_off[e, who[e]] = True
             if snap:
                 state.cable_broken[e, who[e]] = True
         update_peak_tension(e, state, watch, resting, peak)
 
 
 @kernel
-def _tell(lo, hi, told, hangs, watch, rig, observation, critic):
+def _write_observation(lo, hi, told, hangs, watch, rig, observation, critic):
     time, when, who, held = told
     for e in range(lo, hi):
         lost, seconds = who[e], time[e] - when[e]
@@ -153,5 +153,5 @@ def _score(lo, hi, state, errors, action, previous, weights, bounds, dt, terms, 
         terms[e, 1] = weights[1] * tolerance(distance, 0.03)
         terms[e, 2] = weights[2] * tolerance(angle, radians(20.0))
         terms[e, 3] = weights[3] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
-        terms[e, 4] = weights[4] * mean_change(e, action, previous)
+        terms[e, 4] = weights[4] * action_rate(e, action, previous)
         good_time[e] = good_time[e] + dt if is_at_rest(e, state, errors, bounds) else 0.0

@@ -110,7 +110,7 @@ def _write(out, at, v):
 
 
 @kernel
-def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nominal, observation, critic):
+def observe_team(lo, hi, state, hidden_loads, goal, reference, errors, action, rig, nominal, observation, critic):
     """Write observations (E, N, D) and global states (E, S) of environments lo to hi.
 
     The global state holds, in the target's heading frame, the payload's errors, velocities and integrals, then what
@@ -140,9 +140,9 @@ def observe_team(lo, hi, state, plant, goal, reference, errors, action, rig, nom
         at = _write(out, at, turn(c, s, spin))
         at = _write(out, at, turn(c, s, row(errors.position_integral, e)))
         at = _write(out, at, turn(c, s, row(errors.rotation_integral, e)))
-        at = _write(out, at, turn(c, s, row(plant.payload_force, e)))
-        at = _write(out, at, turn(c, s, row(plant.wind, e)))
-        out[at] = plant.payload_mass[e] / nominal[count, 0] - 1.0
+        at = _write(out, at, turn(c, s, row(hidden_loads.payload_force, e)))
+        at = _write(out, at, turn(c, s, row(hidden_loads.wind, e)))
+        out[at] = hidden_loads.payload_mass[e] / nominal[count, 0] - 1.0
         out[at + 1] = target[2]
         at += 2
         for n in range(count):

@@ -12,9 +12,9 @@ import numpy as np
 
 from multilift_marl.config.files import read_pinned
 from multilift_marl.config.schema import RandomizationConfig
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.errors import ConfigError
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.tasks.failures import TOUCH
 from multilift_marl.tasks.spline import fit_spline, sample_spline
 
@@ -200,7 +200,7 @@ def _check_thrust(name: str, table: np.ndarray, system: System, ranges: Randomiz
             "would go slack; make the path slower or smoother (t in s, x, y, z in m; it begins and ends at rest)"
         )
     own = (1 + ranges.vehicle_mass) * system.drone_mass
-    hover = (1 + ranges.payload_mass) * system.drone_pull + own[:, None] * [0.0, 0.0, GRAVITY]
+    hover = (1 + ranges.payload_mass) * system.hook_force + own[:, None] * [0.0, 0.0, GRAVITY]
     swing = np.hypot(rate[:, 3] ** 2, bend[:, 3])[:, None] * np.linalg.norm(system.slots[:, :2], axis=1)
     thrust = np.linalg.norm(gravity, axis=1)[:, None] / GRAVITY * np.linalg.norm(hover, axis=1) + own * swing
     most = 4 * np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])

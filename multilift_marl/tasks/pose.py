@@ -10,19 +10,19 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.values import Float, Section
+from multilift_marl.control.cable_forces import make_wrench_distribution
 from multilift_marl.control.formation import Goal, Reference
-from multilift_marl.control.pulls import make_spread
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import matmul, matrow, norm, put, rotation_vector, row, sub, transpose, turn
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.rewards import action_rate, tolerance
 from multilift_marl.tasks.starts import hang_team
 from multilift_marl.tasks.targets import draw_plan, make_bounds
-from multilift_marl.tasks.terms import mean_change, tolerance
-from multilift_marl.tasks.way import Plan, aim, choose_courses, lead, rest
+from multilift_marl.tasks.trajectory import Plan, advance_plan, hold_plan_pose, select_candidate, set_goal_from_plan
 
 
 class PoseOptions(Section):
@@ -54,13 +54,13 @@ class Pose(Task):
         "action_rate": -0.05,
     }
     EXTRA: ClassVar[tuple[Component, ...]] = (
-        Component("way_position", 3, "slot", "m", "the planned way's present position minus target"),
-        Component("way_velocity", 3, "slot", "m/s", "the way's velocity"),
-        Component("way_rotation", 3, "slot", "rad", "rotation vector from target to the way's attitude"),
+        Component("planned_position", 3, "slot", "m", "the planned way's present position minus target"),
+        Component("planned_velocity", 3, "slot", "m/s", "the way's velocity"),
+        Component("planned_rotation", 3, "slot", "rad", "rotation vector from target to the way's attitude"),
         Component("time_left", 1, "-", "-", "until the next target, over the time that each one has"),
     )
     EXTRA_STATE: ClassVar[int] = 10
-    KEPT: ClassVar[tuple[str, ...]] = ("reached", "_pose", "_pull", "_course", "_stage")
+    SAVED: ClassVar[tuple[str, ...]] = ("reached", "_pose", "_pull", "_course", "_stage")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
@@ -77,9 +77,9 @@ class Pose(Task):
         self.reached = np.zeros((e, self.targets), bool)
         self.plan = Plan.zeros(e, self.targets, world.num_drones)
         self._pose, self._pull, self._course, self._stage = self.plan
-        way = Goal.zeros(e, world.num_drones)
-        self.way = way._replace(slot_frame=self.goal.slot_frame)  # actions point as the observations do
-        self._balance = make_spread(self.rig.anchors)
+        planned = Goal.zeros(e, world.num_drones)
+        self.planned = planned._replace(slot_frame=self.goal.slot_frame)  # actions point as the observations do
+        self._balance = make_wrench_distribution(self.rig.anchors)
         self._bounds = make_bounds(system, config.control, self.limits, 1 + config.randomization.payload_mass)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
@@ -92,21 +92,21 @@ class Pose(Task):
                 "this team can hold hardly any of the poses of task pose; lower task_options.target_tilt, raise "
                 "target_height or change the rig"
             )
-        way, inertia, nominal = self.way, self.world.system.inertia_matrix, self.nominal_hanging
+        planned, inertia, nominal = self.planned, self.world.system.inertia_matrix, self.nominal_hanging
         known = inertia, self._balance, self._hold, option.way_seconds, self._bounds
-        choose_courses(env, self.time, self.plan, way, self.rig, nominal, *known)
-        _start(env, self.world.state, self.plan, self.goal, way, self.rig, nominal, self.hanging, mass)
+        select_candidate(env, self.time, self.plan, planned, self.rig, nominal, *known)
+        _start(env, self.world.state, self.plan, self.goal, planned, self.rig, nominal, self.hanging, mass)
         self.reached[env] = False
 
     def planner(self, lo: int, hi: int) -> Callable[[], None]:
         """Lead the way to each target in turn; see `Task.planner`."""
         inertia, attitude = self.world.system.inertia_matrix, self.world.state.payload_rotation
         return bind(
-            lead, lo, hi, self.time, self.control_dt, self.plan, self.goal, self.way, self.rig, self.hanging,
-            inertia, self._balance, attitude, self._hold, self.options.way_seconds,
+            advance_plan, lo, hi, self.time, self.control_dt, self.plan, self.goal, self.planned, self.rig,
+            self.hanging, inertia, self._balance, attitude, self._hold, self.options.way_seconds,
         )  # fmt: skip
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; note which targets were reached; see `Task.scorer`."""
         option = self.options
         success = (option.success_distance, radians(option.success_angle), option.success_seconds)
@@ -120,7 +120,7 @@ class Pose(Task):
         """Within the success region throughout the last second of every target."""
         return np.asarray(self.reached.all(axis=1))
 
-    def counts(self, time: float, length: float) -> bool:
+    def in_error_window(self, time: float, length: float) -> bool:
         """Count the last second of every target."""
         gone = time - self._hold * (ceil(time / self._hold - 1e-9) - 1)
         return (
@@ -128,18 +128,20 @@ class Pose(Task):
             or gone > self._hold - self.options.success_seconds + 1e-9
         )
 
-    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell where the way is; see `Task.observer`."""
-        return bind(_observe, lo, hi, self.goal, self.way, self.time, self.plan, self._hold, observation, critic)
+        return bind(_observe, lo, hi, self.goal, self.planned, self.time, self.plan, self._hold, observation, critic)
 
 
 @kernel
-def _start(e, state, plan, goal, way, rig, nominal, hanging, mass):
-    rest(e, 0, plan, way, rig, nominal)
+def _start(e, state, plan, goal, planned, rig, nominal, hanging, mass):
+    hold_plan_pose(e, 0, plan, planned, rig, nominal)
     still = (0.0, 0.0, 0.0)
-    hang_team(e, state, way, rig, hanging, mass, row(way.position, e), matrow(way.rotation, e), still, still)
+    hang_team(
+        e, state, planned, rig, hanging, mass, row(planned.position, e), matrow(planned.rotation, e), still, still
+    )
     plan.stage[e] = 0
-    aim(e, 1, plan, goal, rig, nominal)  # last, since it shares the slot frames with the way
+    set_goal_from_plan(e, 1, plan, goal, rig, nominal)  # last, since it shares the slot frames with the way
 
 
 @kernel
@@ -153,7 +155,7 @@ def _score(lo, hi, state, errors, action, previous, weights, success, clock, tim
         terms[e, 2] = weights[2] * tolerance(angle, radians(20.0))
         terms[e, 3] = weights[3] * tolerance(angle, radians(2.0))
         terms[e, 4] = weights[4] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
-        terms[e, 5] = weights[5] * mean_change(e, action, previous)
+        terms[e, 5] = weights[5] * action_rate(e, action, previous)
         good = distance <= success[0] and angle <= success[1]
         good_time[e] = good_time[e] + dt if good else 0.0
         begun = plan.stage[e] * hold
@@ -163,20 +165,20 @@ def _score(lo, hi, state, errors, action, previous, weights, success, clock, tim
 
 
 @kernel
-def _observe(lo, hi, goal, way, time, plan, hold, observation, critic):
+def _observe(lo, hi, goal, planned, time, plan, hold, observation, critic):
     size, state = observation.shape[2], critic.shape[1]
     for e in range(lo, hi):
-        ahead, velocity = sub(row(way.position, e), row(goal.position, e)), row(way.velocity, e)
-        twisted = rotation_vector(matmul(matrow(way.rotation, e), transpose(matrow(goal.rotation, e))))
+        ahead, velocity = sub(row(planned.position, e), row(goal.position, e)), row(planned.velocity, e)
+        twisted = rotation_vector(matmul(matrow(planned.rotation, e), transpose(matrow(goal.rotation, e))))
         left = (plan.stage[e] + 1) - time[e] / hold
         for n in range(observation.shape[1]):
             c, s = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]  # world to slot frame
-            _tell(observation[e, n, size - 10 :], c, s, ahead, velocity, twisted, left)
-        _tell(critic[e, state - 10 :], cos(goal.yaw[e]), -sin(goal.yaw[e]), ahead, velocity, twisted, left)
+            _write_observation(observation[e, n, size - 10 :], c, s, ahead, velocity, twisted, left)
+        _write_observation(critic[e, state - 10 :], cos(goal.yaw[e]), -sin(goal.yaw[e]), ahead, velocity, twisted, left)
 
 
 @kernel
-def _tell(out, c, s, ahead, velocity, twisted, left):
+def _write_observation(out, c, s, ahead, velocity, twisted, left):
     put(out[0:3], turn(c, s, ahead))
     put(out[3:6], turn(c, s, velocity))
     put(out[6:9], turn(c, s, twisted))

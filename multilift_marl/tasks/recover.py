@@ -10,9 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.values import Float, Section
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import (
     add,
@@ -31,14 +30,15 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-from multilift_marl.sim.hanging import SLACK
-from multilift_marl.sim.standing import hold_hook, hook_place
+from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.sim.catenary import SLACK
+from multilift_marl.sim.hover import hook_position, place_at_hook
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, forgive
+from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
 from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.rewards import action_rate, tolerance
 from multilift_marl.tasks.starts import TargetOptions, check_heights, in_ball
-from multilift_marl.tasks.terms import mean_change, tolerance
 
 
 class RecoverOptions(TargetOptions):
@@ -78,9 +78,9 @@ class Recover(Task):
         check_heights(self.options)
         taut = SLACK if world.system.cable_model == "chain" else 1.0  # chains that hang straighter pull at once
         self._slack = min(self.options.start_slack, taut), taut
-        self._early = forgive(TILT, CABLE)
+        self._early = ignore(TILT, CABLE)
         if self.options.start == "crazymarl":  # a quarter of its teams start on the ground
-            self._early = forgive(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
+            self._early = ignore(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target and team; see `Task.start`."""
@@ -89,8 +89,8 @@ class Recover(Task):
         goal.position[env] = *flat, rng.uniform(*option.target_height)
         putmat(goal.rotation[env], rot_z(radians(rng.uniform(-option.target_yaw, option.target_yaw))))
         place_formation(env, goal, self.rig)
-        self.watch.forgiven[env] = self._early
-        throw = Throw(option.start_radius, radians(option.start_tilt), option.start_speed, *self._slack)
+        self.watch.ignored[env] = self._early
+        throw = SlackStart(option.start_radius, radians(option.start_tilt), option.start_speed, *self._slack)
         if option.start == "slack":
             _throw(env, rng, state, goal, self.rig, self.hanging, throw)
         else:
@@ -106,13 +106,22 @@ class Recover(Task):
         """Count the time; the goals stay. See `Task.planner`."""
         return bind(_wait, lo, hi, self.time, self.control_dt, self.options.grace, self.watch)
 
-    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell grace and slack; see `Task.observer`."""
         return bind(
-            _tell, lo, hi, self.time, self.options.grace, self.seen, self.rig, self.hanging, observation, critic
+            _write_observation,
+            lo,
+            hi,
+            self.time,
+            self.options.grace,
+            self.seen,
+            self.rig,
+            self.hanging,
+            observation,
+            critic,
         )
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness, attitude and stillness; see `Task.scorer`."""
         return bind(
             _score, lo, hi, self.world.state, self.errors, action, previous, self.weights,
@@ -124,7 +133,7 @@ class Recover(Task):
         return self.good_time >= self.options.success_seconds - 1e-9
 
 
-class Throw(NamedTuple):
+class SlackStart(NamedTuple):
     """RecoverOptions of the start `slack`, in SI units."""
 
     radius: float
@@ -157,7 +166,7 @@ def _throw(e, rng, state, goal, rig, hanging, throw):
         span = hanging.length[n] * rng.uniform(throw.slack, throw.taut)
         put(state.drone_velocity[e, n], in_ball(rng, throw.speed))
         putmat(state.drone_rotation[e, n], _tilted(rng, throw.tilt, goal.drone_yaw[e]))
-        hold_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.drones.hooks)
+        place_at_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.drones.hooks)
         state.drone_body_rates[e, n] = 0.0
 
 
@@ -199,7 +208,7 @@ def _throw_as_crazymarl(e, rng, state, goal, drones, hanging):
             roll, pitch = 0.0, 0.0
         level = matmul(axis_angle((0.0, 1.0, 0.0), pitch), axis_angle((1.0, 0.0, 0.0), roll))
         putmat(state.drone_rotation[e, n], matmul(rot_z(rng.uniform(-pi, pi)), level))
-        hold_hook(e, n, state, vec(state.drone_position, e, n), drones.hooks)
+        place_at_hook(e, n, state, vec(state.drone_position, e, n), drones.hooks)
         for k in range(3):
             state.drone_velocity[e, n, k] = rng.normal(0.0, 0.2)
             state.drone_body_rates[e, n, k] = rng.normal(0.0, radians(20.0))
@@ -223,18 +232,18 @@ def _wait(lo, hi, time, dt, grace, watch):
     for e in range(lo, hi):
         time[e] += dt
         if time[e] > grace:
-            watch.forgiven[e] = 0
+            watch.ignored[e] = 0
 
 
 @kernel
-def _tell(lo, hi, time, grace, state, rig, hanging, observation, critic):
+def _write_observation(lo, hi, time, grace, state, rig, hanging, observation, critic):
     for e in range(lo, hi):
         left = clip(1.0 - time[e] / max(grace, 1e-9), 0.0, 1.0)
         critic[e, critic.shape[1] - 1] = left
         attitude = matrow(state.payload_rotation, e)
         for n in range(observation.shape[1]):
             anchor = add(row(state.payload_position, e), mul(attitude, row(rig.anchors, n)))
-            span = norm(sub(hook_place(e, n, state, rig.drones.hooks), anchor))
+            span = norm(sub(hook_position(e, n, state, rig.drones.hooks), anchor))
             own = observation[e, n, observation.shape[2] - 2 :]
             own[0], own[1] = left, 1.0 - span / hanging.length[n]
 
@@ -248,5 +257,5 @@ def _score(lo, hi, state, errors, action, previous, weights, near, dt, terms, go
         terms[e, 1] = weights[1] * tolerance(distance, 0.01)
         terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
         terms[e, 3] = weights[3] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
-        terms[e, 4] = weights[4] * mean_change(e, action, previous)
+        terms[e, 4] = weights[4] * action_rate(e, action, previous)
         good_time[e] = good_time[e] + dt if distance <= near else 0.0

@@ -9,19 +9,19 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
 from multilift_marl.config.values import Float, Section
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import Goal, Rig, goal_hook, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables import cable_end
+from multilift_marl.sim.hover import Drones, hover_drone, make_drones, place_at_hook
 from multilift_marl.sim.parameters import Parameters
-from multilift_marl.sim.standing import Drones, hold_hook, hover_drone, make_drones
 from multilift_marl.sim.state import SystemState
 
 
-class Hanging(NamedTuple):
+class CableEquilibrium(NamedTuple):
     """Numbers of a team that hangs in equilibrium."""
 
     length: np.ndarray
@@ -34,9 +34,9 @@ class Hanging(NamedTuple):
     drones: Drones
 
 
-def make_hanging(system: System) -> Hanging:
+def make_hanging(system: System) -> CableEquilibrium:
     """Return the nominal numbers of `system`."""
-    return Hanging(
+    return CableEquilibrium(
         length=system.cable_length,
         stiffness=system.cable_stiffness,
         weight=system.cable_mass * GRAVITY,
@@ -46,7 +46,7 @@ def make_hanging(system: System) -> Hanging:
     )
 
 
-def true_hanging(nominal: Hanging, parameters: Parameters, e: int) -> Hanging:
+def true_hanging(nominal: CableEquilibrium, parameters: Parameters, e: int) -> CableEquilibrium:
     """Return the numbers of the team in environment e."""
     p, drones = parameters, nominal.drones
     return nominal._replace(
@@ -93,15 +93,15 @@ def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, m
         cable = sub(add(goal_hook(e, n, goal, rig), moved), anchor)
         direction = scale(1.0 / norm(cable), cable)
         half = (0.0, 0.0, 0.5 * hanging.weight[n])
-        tension = load * norm(sub(vec(goal.pull, e, n), half))  # in the middle, whose direction is the cable's
+        tension = load * norm(sub(vec(goal.cable_force, e, n), half))  # in the middle, whose direction is the cable's
         end = cable_end(
             direction, tension, hanging.length[n], hanging.stiffness[n], hanging.segments[n], hanging.weight[n]
         )
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
-        pull = add(scale(tension, direction), half)
-        hover_drone(e, n, state, pull, goal.drone_yaw[e], hanging.drones)
-        hold_hook(e, n, state, add(anchor, end), hanging.drones.hooks)
+        cable_force = add(scale(tension, direction), half)
+        hover_drone(e, n, state, cable_force, goal.drone_yaw[e], hanging.drones)
+        place_at_hook(e, n, state, add(anchor, end), hanging.drones.hooks)
 
 
 class TargetOptions(Section):
@@ -149,8 +149,8 @@ def make_ranges(option: StartOptions) -> StartRanges:
 
 @kernel
 def start_near_target(
-    e: int, rng: np.random.Generator, state: SystemState, goal: Goal, rig: Rig, ranges: StartRanges, hanging: Hanging,
-    mass: float,
+    e: int, rng: np.random.Generator, state: SystemState, goal: Goal, rig: Rig, ranges: StartRanges,
+    hanging: CableEquilibrium, mass: float,
 ) -> None:  # fmt: skip
     """Draw a target, and a team in hanging equilibrium there, then moved, tilted and set in motion as one."""
     x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)

@@ -10,32 +10,32 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import add, clip, ease, matrow, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, forgive, payload_height
+from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, ignore, payload_height
 from multilift_marl.tasks.ground import (
     cable_chord,
     cable_rise,
     make_ground,
     mean_slot_tolerance,
     move_goal,
-    rest_goal,
-    share_pull,
+    set_resting_goal,
+    share_force,
     stand_team,
     standing_distance,
 )
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.terms import mean_change, pay_pose, tolerance
+from multilift_marl.tasks.rewards import action_rate, pose_reward, tolerance
 
 RISE, TIGHTEN, PULL, LIFT = (0.1, 1.6), (1.7, 1.2), (2.9, 1.2), (4.1, 2.5)  # begin and length of each phase [s]
 ARRIVED = LIFT[0] + LIFT[1]  # [s] from when on the target stays
 SLACK, TAUT = 0.006, 0.002  # of a cable's length: short of taut after the rise, beyond taut before the pull
 STANDING, FLYING, LIFTED = range(3)
-FORGIVEN = (forgive(GROUND, LOAD_GROUND, BELOW, CABLE), forgive(LOAD_GROUND, CABLE), 0)
+FORGIVEN = (ignore(GROUND, LOAD_GROUND, BELOW, CABLE), ignore(LOAD_GROUND, CABLE), 0)
 _HALF_WAY = 0.5  # of the formation's height: every drone that far above its anchor, and the team counts as flying
 _LIFTED = 0.02  # [m] of the payload's lowest point above the ground, for the span of a falcon
 _HARMLESS = 1.5  # times the resting tension that costs nothing
@@ -76,7 +76,7 @@ class Takeoff(Task):
         Component("climb_rate", 1, "world", "m/s", "vertical velocity of the target"),
     )
     EXTRA_STATE: ClassVar[int] = 3
-    KEPT: ClassVar[tuple[str, ...]] = ("place", "stand", "stage", "share", "peak")
+    SAVED: ClassVar[tuple[str, ...]] = ("place", "stand", "stage", "share", "peak")
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
@@ -97,7 +97,7 @@ class Takeoff(Task):
         )  # fmt: skip
         self.place[env], self.stand[env] = self.goal.position[env], state.drone_position[env]
         self.stage[env], self.share[env], self.peak[env] = STANDING, 0.0, 0.0
-        self.watch.forgiven[env] = FORGIVEN[STANDING]
+        self.watch.ignored[env] = FORGIVEN[STANDING]
         self.time[env] = 0.0
         _plan(env, env + 1, 0.0, *self._planned())
 
@@ -105,11 +105,11 @@ class Takeoff(Task):
         """Raise drones, tighten cables, pull, lift; see `Task.planner`."""
         return bind(_plan, lo, hi, self.control_dt, *self._planned())
 
-    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell where in the plan the team is; see `Task.observer`."""
         return bind(_observe, lo, hi, self.time, self.share, self.goal, observation, critic)
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for keeping the plan, as drones first and as payload later; see `Task.scorer`."""
         success = (self.options.success_distance, radians(self.options.success_angle))
         return bind(
@@ -119,8 +119,8 @@ class Takeoff(Task):
 
     def succeeded(self) -> np.ndarray:
         """At the final target throughout the last seconds, and never too large a tension."""
-        static = self._static.max() * self.world.plant.payload_mass / self._mass
-        gentle = self.world.record.tension_max <= self.options.success_tension * static
+        static = self._static.max() * self.world.hidden_loads.payload_mass / self._mass
+        gentle = self.world.stats.tension_max <= self.options.success_tension * static
         return gentle & (self.good_time >= self.options.success_seconds - 1e-9)
 
     def _planned(self) -> tuple[Any, ...]:
@@ -132,7 +132,7 @@ class Takeoff(Task):
 
 @kernel
 def _start(e, rng, state, goal, rig, ground, xy, yaw, distance, spread):
-    rest_goal(e, goal, (rng.uniform(-xy, xy), rng.uniform(-xy, xy), ground.payload))
+    set_resting_goal(e, goal, (rng.uniform(-xy, xy), rng.uniform(-xy, xy), ground.payload))
     putmat(goal.rotation[e], rot_z(rng.uniform(-yaw, yaw)))
     place_formation(e, goal, rig)
     stand_team(e, rng, state, goal, rig, ground, distance, spread)
@@ -144,24 +144,28 @@ def _plan(lo, hi, dt, time, place, stand, stage, share, peak, state, goal, rig, 
     for e in range(lo, hi):
         time[e] += dt
         t = time[e]
-        rest_goal(e, goal, row(place, e))
+        set_resting_goal(e, goal, row(place, e))
         move_goal(e, goal, (0.0, 0.0, climb), ease(t, LIFT[0], LIFT[1]))
         place_formation(e, goal, rig)
-        pull, risen, tight = ease(t, PULL[0], PULL[1]), ease(t, RISE[0], RISE[1]), ease(t, TIGHTEN[0], TIGHTEN[1])
-        share[e] = pull[0]
+        cable_force, risen, tight = (
+            ease(t, PULL[0], PULL[1]),
+            ease(t, RISE[0], RISE[1]),
+            ease(t, TIGHTEN[0], TIGHTEN[1]),
+        )
+        share[e] = cable_force[0]
         for n in range(rig.slots.shape[0]):
             chord = cable_chord(e, n, goal, rig)
-            reach = -SLACK + (SLACK + TAUT) * tight[0] - TAUT * pull[0]
+            reach = -SLACK + (SLACK + TAUT) * tight[0] - TAUT * cable_force[0]
             slot = add(vec(goal.slots, e, n), scale(reach, chord))
             under = sub(vec(stand, e, n), add(vec(goal.slots, e, n), scale(-SLACK, chord)))
             put(goal.slots[e, n], add(slot, _way(under, 1.0 - risen[0] ** 2, 1.0 - risen[0])))
             put(goal.slot_velocity[e, n], _way(under, -2.0 * risen[0] * risen[1], -risen[1]))
             curved = risen[1] ** 2 + risen[0] * risen[2]
             put(goal.slot_acceleration[e, n], _way(under, -2.0 * curved, -risen[2]))
-            share_pull(e, n, goal, share[e], rig, ground.rope[n])
+            share_force(e, n, goal, share[e], rig, ground.cable_weight[n])
             peak[e] = max(peak[e], state.cable_tension[e, n] / static[n])
         stage[e] = _stage(e, stage[e], state, rig, limits, ground.size)
-        watch.forgiven[e] = FORGIVEN[stage[e]]
+        watch.ignored[e] = FORGIVEN[stage[e]]
 
 
 @kernel
@@ -199,10 +203,10 @@ def _score(
 ):  # fmt: skip
     for e in range(lo, hi):
         near = tolerance(errors.distance[e], 0.5)  # a payload that lies still elsewhere earns little
-        pay_pose(e, state, goal, errors, share[e] * near, weights, terms)
+        pose_reward(e, state, goal, errors, share[e] * near, weights, terms)
         terms[e, 5] = weights[5] * (1.0 - share[e]) * mean_slot_tolerance(e, state, goal, 0.1)
         terms[e, 6] = weights[6] * clip(peak[e] - _HARMLESS, 0.0, 1.0)
-        terms[e, 7] = weights[7] * mean_change(e, action, previous)
+        terms[e, 7] = weights[7] * action_rate(e, action, previous)
         peak[e] = 0.0
         good = time[e] >= ARRIVED and errors.distance[e] <= success[0] and errors.angle[e] <= success[1]
         good_time[e] = good_time[e] + dt if good else 0.0

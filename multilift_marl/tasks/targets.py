@@ -9,14 +9,14 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.control.cable_forces import is_stable, place_balanced
 from multilift_marl.control.formation import goal_hook
 from multilift_marl.control.gains import make_gains
-from multilift_marl.control.pulls import place_balanced, settles
 from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, row, scale, segment_distance, sub, turn, vec
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.tasks.failures import MAX_DISTANCE, Limits
-from multilift_marl.tasks.way import attitude_of
+from multilift_marl.tasks.trajectory import attitude_of
 
 MAX_LEAP = MAX_DISTANCE - 0.25  # [m] from a target to the next one: nearer than what counts as failure
 CLEARANCE = 0.1  # [m] of the payload from the ground at a target
@@ -90,8 +90,8 @@ def draw_plan(e, rng, ranges, plan, goal, rig, hanging, bounds):
             continue
         c, s = cos(pose[3]), -sin(pose[3])
         for n in range(rig.slots.shape[0]):
-            pull = sub(vec(goal.pull, e, n), (0.0, 0.0, hanging.weight[n]))
-            put(plan.pull[e, k, n], turn(c, s, pull))
+            cable_force = sub(vec(goal.cable_force, e, n), (0.0, 0.0, hanging.weight[n]))
+            put(plan.cable_force[e, k, n], turn(c, s, cable_force))
         k += 1
     return vain
 
@@ -105,9 +105,9 @@ def _within(e, goal, rig, hanging, bounds):
     if position[2] - below < CLEARANCE:
         return False
     for n in range(rig.slots.shape[0]):
-        slot, rope = vec(goal.slots, e, n), (0.0, 0.0, hanging.weight[n])
-        pull = sub(vec(goal.pull, e, n), rope)
-        carried = add(scale(bounds.load, pull), add(rope, (0.0, 0.0, rig.drones.mass[n] * GRAVITY)))
+        slot, cable_weight = vec(goal.slots, e, n), (0.0, 0.0, hanging.weight[n])
+        cable_force = sub(vec(goal.cable_force, e, n), cable_weight)
+        carried = add(scale(bounds.load, cable_force), add(cable_weight, (0.0, 0.0, rig.drones.mass[n] * GRAVITY)))
         if norm(carried) > bounds.thrust[n]:
             return False
         if slot[2] - position[2] < ABOVE * hanging.length[n]:
@@ -121,4 +121,4 @@ def _within(e, goal, rig, hanging, bounds):
             end, beside = goal_hook(e, n, goal, rig), goal_hook(e, m, goal, rig)
             if segment_distance(anchor, end, foot, beside) < bounds.cables[n, m]:
                 return False
-    return target[8] > 1.0 - 1e-12 or settles(e, goal, rig, hanging, bounds.stiffness)
+    return target[8] > 1.0 - 1e-12 or is_stable(e, goal, rig, hanging, bounds.stiffness)

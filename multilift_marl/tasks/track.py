@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.config.values import Choice, Float, Section, Span, Vector
-from multilift_marl.control.formation import Reference, face, place_formation
+from multilift_marl.control.formation import Reference, place_formation, set_heading
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, matrow, norm, put, putmat, rot_z, row, scale, sub, turn, vec
 from multilift_marl.sim.world import World
@@ -38,9 +38,9 @@ from multilift_marl.tasks.paths import (
     place,
     set_goal,
 )  # fmt: skip
+from multilift_marl.tasks.rewards import action_rate, tolerance
 from multilift_marl.tasks.spline import NO_FILE, spline_yaw
 from multilift_marl.tasks.starts import hang_team, in_ball
-from multilift_marl.tasks.terms import mean_change, tolerance
 
 AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
 _DRAWN = 400  # points of a path that is drawn
@@ -98,7 +98,7 @@ class Track(Task):
         ),
     )
     EXTRA_STATE: ClassVar[int] = 6 + 3 * len(AHEAD)
-    KEPT: ClassVar[tuple[str, ...]] = ("worst", *(f"path.{name}" for name in Path._fields if name != "table"))
+    SAVED: ClassVar[tuple[str, ...]] = ("worst", *(f"path.{name}" for name in Path._fields if name != "table"))
 
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
@@ -149,11 +149,11 @@ class Track(Task):
         """Move the goals along their paths; see `Task.planner`."""
         return bind(_plan, lo, hi, self.time, self.control_dt, self.path, self.goal, self.rig)
 
-    def observer(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
+    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
         """Tell how the target will move; see `Task.observer`."""
         return bind(_look_ahead, lo, hi, self.time, self.path, self.goal, observation, critic)
 
-    def route(self, env: int) -> np.ndarray:
+    def target_path(self, env: int) -> np.ndarray:
         """Return the path, one round of it if it repeats; see `Task.route`."""
         points, kind = np.zeros((_DRAWN, 3)), self.path.kind[env]
         turns = 4 if kind == HELIX else 1
@@ -164,7 +164,7 @@ class Track(Task):
         _trace(env, min(self.seconds, lap), self.path, points)
         return points
 
-    def scorer(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
+    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
         """Pay for closeness to the moving target; see `Task.scorer`."""
         return bind(
             _score, lo, hi, self.world.state, self.goal, self.errors, action, previous, self.weights, self.terms,
@@ -206,7 +206,7 @@ def _aim(e, t, path, goal, rig):
         return
     place_formation(e, goal, rig)
     if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
-        face(e, path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi, goal, rig)
+        set_heading(e, path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi, goal, rig)
         goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
 
 
@@ -248,7 +248,7 @@ def _look_ahead(lo, hi, time, path, goal, observation, critic):
     for e in range(lo, hi):
         c, s = cos(goal.yaw[e]), -sin(goal.yaw[e])
         told = critic[e, critic.shape[1] - many :]
-        _tell(e, c, s, time[e], path, goal, told)
+        _write_observation(e, c, s, time[e], path, goal, told)
         for n in range(observation.shape[1]):
             cn, sn = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
             own = observation[e, n, observation.shape[2] - many :]
@@ -259,7 +259,7 @@ def _look_ahead(lo, hi, time, path, goal, observation, critic):
 
 
 @kernel
-def _tell(e, c, s, t, path, goal, out):
+def _write_observation(e, c, s, t, path, goal, out):
     """Write velocity, acceleration and places to come of a target, in its heading frame."""
     put(out[0:3], turn(c, s, row(goal.velocity, e)))
     put(out[3:6], turn(c, s, row(goal.acceleration, e)))
@@ -277,5 +277,5 @@ def _score(lo, hi, state, goal, errors, action, previous, weights, terms, worst)
         terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
         terms[e, 3] = weights[3] * tolerance(slip, 0.2)
         terms[e, 4] = weights[4] * tolerance(errors.rotation[e, 2], radians(0.5))
-        terms[e, 5] = weights[5] * mean_change(e, action, previous)
+        terms[e, 5] = weights[5] * action_rate(e, action, previous)
         worst[e] = max(worst[e], distance)

@@ -10,7 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from multilift_marl.errors import nearest, pip_install
-from multilift_marl.validation import air, bodies, cables, conservation, flight, momentum, release, symmetry, teams
+from multilift_marl.validation import (
+    air,
+    bodies,
+    cables,
+    conservation,
+    flight,
+    momentum,
+    release,
+    symmetry,
+    team_cables,
+)
 from multilift_marl.validation.document import describe, format_table, write_document
 from multilift_marl.validation.draw import draw
 from multilift_marl.validation.experiment import Experiment, Result
@@ -20,8 +30,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     "six_cables": cables.six_cables,
     "stiff_cables": cables.stiff_cables,
     "integrators": cables.integrators,
-    "slack_taut": teams.slack_taut,
-    "static_teams": teams.static_teams,
+    "slack_taut": team_cables.slack_taut,
+    "static_teams": team_cables.static_teams,
     "swing": bodies.swing,
     "free_fall": bodies.free_fall,
     "spin": bodies.spin,

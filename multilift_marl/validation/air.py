@@ -9,8 +9,8 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.load import load_config
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import AIR_DENSITY, GRAVITY
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import AIR_DENSITY, GRAVITY
 from multilift_marl.sim.air import GROWTH, SPREADING, ground_gain, make_air, wash_at
 from multilift_marl.sim.gusts import advance_turbulence, dryden, start_turbulence, turbulence
 from multilift_marl.sim.state import Air

@@ -7,9 +7,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
-from multilift_marl.config.schema import Config
-from multilift_marl.config.vehicles import AIR_DENSITY, GRAVITY
+from multilift_marl.rig.vehicles import AIR_DENSITY, GRAVITY
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.world import World
 from multilift_marl.validation.cables import hanging_load

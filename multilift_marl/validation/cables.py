@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables import IMPEDANCE, limit_solref
 from multilift_marl.sim.scene import set_options
 from multilift_marl.sim.world import World
@@ -191,7 +191,7 @@ def stiff_cables(fast: bool) -> Result:
 def hover_thrust(world: World) -> np.ndarray:
     """Return rotor thrusts (E, N, 4) [N] that hold drones and nominal pulls of their cables in equilibrium."""
     system = world.system
-    force = np.linalg.norm(system.drone_pull + GRAVITY * system.drone_mass[:, None] * [0, 0, 1], axis=1)
+    force = np.linalg.norm(system.hook_force + GRAVITY * system.drone_mass[:, None] * [0, 0, 1], axis=1)
     return np.broadcast_to(force[:, None] / 4, (world.num_envs, world.num_drones, 4)).copy()
 
 

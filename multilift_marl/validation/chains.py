@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.world import REST_HEIGHT, World
 
 ROPE = 0.01  # [kg/m]
@@ -51,7 +51,7 @@ def hanging_chain(
     share = np.arange(1, SEGMENTS)[:, None] / SEGMENTS
     world.nodes.position[0] = world.state.payload_position[0] + system.anchors[:, None] + share * direction[:, None]
     world.nodes.velocity[:] = 0.0
-    force = np.linalg.norm(system.drone_pull + [0, 0, _ANCHOR_MASS * GRAVITY], axis=1)
+    force = np.linalg.norm(system.hook_force + [0, 0, _ANCHOR_MASS * GRAVITY], axis=1)
     return world, np.tile(force[:, None] / 4, (1, 1, 4))
 
 

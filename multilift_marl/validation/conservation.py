@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row
 
@@ -85,7 +85,7 @@ def tumbling_team(
     state.drone_body_rates[0] = np.einsum("nji,j->ni", state.drone_rotation[0], turning)
     state.rotor_speed[:] = 0.0
     world.load(np.ones(1, bool))
-    world.plant.motors_off[:] = True
+    world.hidden_loads.motors_off[:] = True
     return world
 
 

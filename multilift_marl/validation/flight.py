@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
-from multilift_marl.config.schema import Config
-from multilift_marl.config.system import System
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.gains import Gains, make_gains
 from multilift_marl.control.geometric import fly
+from multilift_marl.rig.system import System
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row
 from multilift_marl.validation.trajectory import (
@@ -120,7 +120,7 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
     world = World(system, len(ways), 1)
     _put_down(world)
     state, reference = world.state, Reference.zeros(len(ways), system.num_drones)
-    pull = np.zeros((len(ways), system.num_drones, 3))
+    cable_force = np.zeros((len(ways), system.num_drones, 3))
     reject = _make_rejection(config, world, reference)
     gains = make_gains(config.control, system)
     gains = gains._replace(load_share=np.zeros(system.num_drones))  # the pulls hold the load's inertia
@@ -129,7 +129,7 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
         for e, way in enumerate(ways):
             reference.position[e], reference.velocity[e] = way.position[i], way.velocity[i]
             reference.acceleration[e], reference.jerk[e] = way.acceleration[i], way.jerk[i]
-            reference.yaw[e], reference.yaw_rate[e], pull[e] = way.yaw[i], way.yaw_rate[i], way.pull[i]
+            reference.yaw[e], reference.yaw_rate[e], cable_force[e] = way.yaw[i], way.yaw_rate[i], way.cable_force[i]
         rotation = state.drone_rotation[0]
         turned = np.arctan2(-rotation[:, 0, 1], rotation[:, 1, 1]) - ways[0].yaw[i]
         yaw_error.append(np.rad2deg(np.arctan2(np.sin(turned), np.cos(turned))))
@@ -138,7 +138,7 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
         if t < plan.start[1]:
             world.thrust[:] = 0.0  # at rest the rotors idle
         else:
-            fly(0, len(ways), state, reference, reject(pull, gains), world.thrust, gains)
+            fly(0, len(ways), state, reference, reject(cable_force, gains), world.thrust, gains)
         world.step(world.thrust, system.control_interval)
         tension.append(state.cable_tension[0].copy())
     both = np.array(payload)
@@ -150,15 +150,15 @@ def _make_rejection(config: Config, world: World, reference: Reference) -> Calla
     """Return what turns nominal pulls (E, N, 3) [N] and gains into the pulls to fly with: the configured rejection."""
     kind = config.control.disturbance
     if kind == "none":
-        return lambda pull, gains: pull
+        return lambda cable_force, gains: cable_force
     rejection = make_rejection(
         config.control, world.system, make_gains(config.control, world.system), 1 / config.sim.control_hz
     )
     disturbance = Disturbance.zeros(world.num_envs, world.num_drones)
 
-    def reject(pull: np.ndarray, gains: Gains) -> np.ndarray:
-        REJECTIONS[kind](0, world.num_envs, world.state, reference, pull, disturbance, gains, rejection)
-        return disturbance.pull
+    def reject(cable_force: np.ndarray, gains: Gains) -> np.ndarray:
+        REJECTIONS[kind](0, world.num_envs, world.state, reference, cable_force, disturbance, gains, rejection)
+        return disturbance.cable_force
 
     return reject
 
@@ -222,12 +222,12 @@ def _phases(plan: Plan, until: str) -> list[tuple[str, float, float]]:
 def _take_off_plot(rig: str, flown: Flight) -> Plot:
     shown = flown.time < flown.plan.start[flown.plan.names.index("slow circle")]
     time, phases = flown.time[shown], _phases(flown.plan, "gather")
-    pull = Plot(f"tension_{rig}", "", "time [s]", "tension [N]", phases=phases)
+    cable_force = Plot(f"tension_{rig}", "", "time [s]", "tension [N]", phases=phases)
     for n in range(flown.system.num_drones):
-        pull.curves.append(Curve(f"cable {n}", time, flown.tension[shown, n]))
+        cable_force.curves.append(Curve(f"cable {n}", time, flown.tension[shown, n]))
     caption = f"{rig} takes off: altitudes, and the tension of each cable below."
     plot = Plot(f"take_off_{rig}", f"{rig}: take-off", "time [s]", "altitude [m]", caption=caption, phases=phases)
-    plot.below = pull
+    plot.below = cable_force
     plot.curves.append(Curve("drones (mean)", time, flown.drones[shown, :, 2].mean(axis=1)))
     plot.curves.append(Curve("payload", time, flown.payload[shown, 2]))
     plot.curves.append(Curve("references", time, flown.way.position[shown, :, 2].mean(axis=1), theory=True))

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.dynamics import make_constants
 from multilift_marl.sim.world import World
+from multilift_marl.validation.asymmetric_team import Team, make_team, poses, take_off, velocities
 from multilift_marl.validation.conservation import totals
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row, order_row
-from multilift_marl.validation.team import Team, make_team, poses, take_off, velocities
 
 _LIMIT = 1e-9
 

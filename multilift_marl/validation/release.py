@@ -6,11 +6,11 @@ import numpy as np
 
 from multilift_marl.config.load import load_config
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.config.vehicles import GRAVITY, PRESETS
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import fly
 from multilift_marl.math3d import axis_angle, quat_to_mat
+from multilift_marl.rig.vehicles import GRAVITY, PRESETS
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Result, Row
 

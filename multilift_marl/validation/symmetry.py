@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from multilift_marl.validation.asymmetric_team import CONTROL_HZ, Team, about_z, make_team, poses, take_off
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row
-from multilift_marl.validation.team import CONTROL_HZ, Team, about_z, make_team, poses, take_off
 
 Map = Callable[[np.ndarray], np.ndarray]
 _LIMIT = 1e-6

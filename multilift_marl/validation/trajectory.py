@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import AIR_DENSITY
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import AIR_DENSITY
 from multilift_marl.sim.contact import drone_half_size
 
 RADIUS, HEIGHT = 5.0, 1.5  # [m] of the circle
@@ -40,7 +40,7 @@ class Trajectory(NamedTuple):
     velocity: np.ndarray
     acceleration: np.ndarray
     jerk: np.ndarray
-    pull: np.ndarray
+    cable_force: np.ndarray
     """(T, N, 3) of the drones on their cables [N]."""
     yaw: np.ndarray
     """(T,) along the circle [rad]."""
@@ -88,8 +88,8 @@ def make_trajectory(system: System, plan: Plan, time: np.ndarray, plain: bool = 
     angle, rate, _ = _turning(plan, time)
     position, velocity, acceleration, jerk = _derivatives(around)
     payload = load_path(system, plan, time)[0]
-    pull = _team(system, plan, time, plain)[1]
-    return Trajectory(payload, position, velocity, acceleration, jerk, pull, angle + np.pi / 2, rate)
+    cable_force = _team(system, plan, time, plain)[1]
+    return Trajectory(payload, position, velocity, acceleration, jerk, cable_force, angle + np.pi / 2, rate)
 
 
 def load_path(system: System, plan: Plan, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -129,12 +129,12 @@ def _team(system: System, plan: Plan, time: np.ndarray, plain: bool) -> tuple[np
     if not plain:
         force = force + carrying_forces(system, acceleration, velocity)
     direction = force / np.linalg.norm(force, axis=2, keepdims=True)
-    pull = _smooth(_share(plan, "tighten", time)[0])[:, None, None] * force
-    tension = np.linalg.norm(pull, axis=2, keepdims=True)
+    cable_force = _smooth(_share(plan, "tighten", time)[0])[:, None, None] * force
+    tension = np.linalg.norm(cable_force, axis=2, keepdims=True)
     length = system.cable_length[:, None] + tension / system.cable_stiffness[:, None]
     aloft = payload[:, None] + system.anchors + length * direction
     ground = on_the_ground(system)[1]
-    return ground + _smooth(_share(plan, "climb", time)[0])[:, None, None] * (aloft - ground), pull
+    return ground + _smooth(_share(plan, "climb", time)[0])[:, None, None] * (aloft - ground), cable_force
 
 
 def _turning(plan: Plan, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

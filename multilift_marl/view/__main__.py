@@ -9,8 +9,8 @@ from typing import Any
 
 from multilift_marl.cli.common import run_command, whole_number
 from multilift_marl.cli.policies import NamedPolicy, find_policy
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
-from multilift_marl.config.schema import Config
 from multilift_marl.control.scripted import SCRIPTED
 from multilift_marl.view.page import HOST, Page
 from multilift_marl.view.session import Session

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.control.policy import Policy
 from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
@@ -77,7 +77,7 @@ class Session:
             if self._push_left:
                 self._push_left -= 1
                 if not self._push_left:
-                    vec.world.plant.payload_force[0] = self._calm
+                    vec.world.hidden_loads.payload_force[0] = self._calm
             if vec.ended[0]:
                 cause = vec.failure_causes[info["failure_cause"][0]]
                 ended = "success" if info["success"][0] else f"failure: {cause}" if terminated[0] else "no success"
@@ -119,10 +119,10 @@ class Session:
         with self._lock:
             heading, elevation = np.deg2rad(heading), np.deg2rad(elevation)
             direction = [np.cos(elevation) * np.cos(heading), np.cos(elevation) * np.sin(heading), np.sin(elevation)]
-            plant = self.vec.world.plant
+            hidden_loads = self.vec.world.hidden_loads
             if not self._push_left:
-                self._calm = plant.payload_force[0].copy()
-            plant.payload_force[0] = self._calm + force * np.array(direction)
+                self._calm = hidden_loads.payload_force[0].copy()
+            hidden_loads.payload_force[0] = self._calm + force * np.array(direction)
             self._push_left = max(1, round(PUSH_SECONDS / self.vec.task.dt))
 
     def locked(self) -> threading.RLock:

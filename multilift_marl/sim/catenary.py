@@ -54,9 +54,9 @@ def hang(chord, opening, length, stiffness, weight, links):
         _hang_slack(chord, distance, length, links)
         return
     for j in range(n):
-        pull = add(force, (0.0, 0.0, j * weight))
-        put(links[j], unit(chord if straight else pull))
-        links[j, 3] = distance / n - length if straight else norm(pull) / stiffness
+        cable_force = add(force, (0.0, 0.0, j * weight))
+        put(links[j], unit(chord if straight else cable_force))
+        links[j, 3] = distance / n - length if straight else norm(cable_force) / stiffness
 
 
 @kernel
@@ -65,17 +65,17 @@ def _complementary(chord, force, length, stiffness, weight, n):
     energy, gap = -dot(force, chord), chord
     xx, yy, zz, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(n):
-        pull = add(force, (0.0, 0.0, j * weight))
-        size = max(norm(pull), 1e-9)
+        cable_force = add(force, (0.0, 0.0, j * weight))
+        size = max(norm(cable_force), 1e-9)
         energy += length * size + 0.5 * size * size / stiffness
-        gap = sub(gap, scale(length / size + 1.0 / stiffness, pull))
+        gap = sub(gap, scale(length / size + 1.0 / stiffness, cable_force))
         flat, bend = length / size + 1.0 / stiffness, length / size**3
-        xx += flat - bend * pull[0] * pull[0]
-        yy += flat - bend * pull[1] * pull[1]
-        zz += flat - bend * pull[2] * pull[2]
-        xy -= bend * pull[0] * pull[1]
-        xz -= bend * pull[0] * pull[2]
-        yz -= bend * pull[1] * pull[2]
+        xx += flat - bend * cable_force[0] * cable_force[0]
+        yy += flat - bend * cable_force[1] * cable_force[1]
+        zz += flat - bend * cable_force[2] * cable_force[2]
+        xy -= bend * cable_force[0] * cable_force[1]
+        xz -= bend * cable_force[0] * cable_force[2]
+        yz -= bend * cable_force[1] * cable_force[2]
     return energy, gap, _solve(xx, yy, zz, xy, xz, yz, gap)
 
 

@@ -11,7 +11,7 @@ from multilift_marl._jit import kernel
 from multilift_marl.control.formation import Goal
 from multilift_marl.math3d import clip, matmul, matrow, norm, put, rotation_vector, row, sub, transpose
 from multilift_marl.sim.state import SystemState
-from multilift_marl.tasks.failures import Watch
+from multilift_marl.tasks.failures import FailureMask
 
 
 @kernel
@@ -21,7 +21,7 @@ def tolerance(value: float, margin: float) -> float:
 
 
 @kernel
-def mean_change(e: int, action: np.ndarray, previous: np.ndarray) -> float:
+def action_rate(e: int, action: np.ndarray, previous: np.ndarray) -> float:
     """Return the mean square of how an action (E, N, A) of environment e differs from the last one."""
     change, count = 0.0, action.shape[1] * action.shape[2]
     for n in range(action.shape[1]):
@@ -75,7 +75,7 @@ def is_at_rest(e: int, state: SystemState, errors: Errors, bounds: RestBounds) -
 
 
 @kernel
-def update_peak_tension(e: int, state: SystemState, watch: Watch, resting: np.ndarray, peak: np.ndarray) -> None:
+def update_peak_tension(e: int, state: SystemState, watch: FailureMask, resting: np.ndarray, peak: np.ndarray) -> None:
     """Raise `peak` (E,) to the largest tension of environment e over the resting tension of its cable [-].
 
     The tension is `state.cable_tension`, the mean over the last physics step. The cables of lost drones do not count.
@@ -91,11 +91,11 @@ def update_peak_tension(e: int, state: SystemState, watch: Watch, resting: np.nd
 
 
 @kernel
-def measure(lo, hi, state, goal, way, led, errors, dt, largest):
+def update_errors(lo, hi, state, goal, planned, is_planned, errors, dt, largest):
     """Update the errors of environments lo to hi and integrate them over `dt` [s], each integral within ± `largest`.
 
-    If the team is `led`, it is the distance from the way that is integrated: that from a goal still far away would
-    only wind the integrals up.
+    Where the payload follows a planned trajectory, its distance from that is integrated: the distance from a goal still
+    far away would only wind the integrals up.
     """
     for e in range(lo, hi):
         put(errors.position[e], sub(row(state.payload_position, e), row(goal.position, e)))
@@ -104,9 +104,9 @@ def measure(lo, hi, state, goal, way, led, errors, dt, largest):
         errors.distance[e] = norm(row(errors.position, e))
         errors.angle[e] = norm(row(errors.rotation, e))
         apart, twisted = row(errors.position, e), row(errors.rotation, e)
-        if led:
-            apart = sub(row(state.payload_position, e), row(way.position, e))
-            twisted = rotation_vector(matmul(matrow(state.payload_rotation, e), transpose(matrow(way.rotation, e))))
+        if is_planned:
+            apart = sub(row(state.payload_position, e), row(planned.position, e))
+            twisted = rotation_vector(matmul(matrow(state.payload_rotation, e), transpose(matrow(planned.rotation, e))))
         for j in range(3):
             moved = errors.position_integral[e, j] + dt * apart[j]
             errors.position_integral[e, j] = clip(moved, -largest, largest)
@@ -115,7 +115,7 @@ def measure(lo, hi, state, goal, way, led, errors, dt, largest):
 
 
 @kernel
-def pay_pose(
+def pose_reward(
     e: int, state: SystemState, goal: Goal, errors: Errors, share: float, weights: np.ndarray, terms: np.ndarray
 ) -> None:
     """Write the first five reward terms of environment e, those of a payload that is to be at its target.

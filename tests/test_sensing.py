@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import bold_actions, make, mask, same, zeros
 
-from multilift_marl.tasks.imperfections import STANDARD
+from multilift_marl.tasks.sensing import STANDARD
 
 NOISE = {"randomization.observation_noise": "standard"}
 BIAS = {"randomization.observation_bias": "standard"}

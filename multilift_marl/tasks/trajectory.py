@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.control.cable_forces import drone_offset, place_slots, spread
 from multilift_marl.control.formation import hook_arm, place_formation, wrap
-from multilift_marl.control.pulls import place_slots, reach, spread
 from multilift_marl.math3d import (
     add,
     cross,
@@ -35,8 +34,9 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
+from multilift_marl.rig.vehicles import GRAVITY
 
-COURSES = (  # the usual one first: whether to turn the longer way round, and two shares, see `Plan.course`
+CANDIDATES = (  # the usual one first: whether to turn the longer way round, and two shares, see `Plan.course`
     (False, 0.5, 0.0),
     (False, 1.0, 0.3),
     (True, 0.25, 0.3),
@@ -56,7 +56,7 @@ class Plan(NamedTuple):
 
     pose: np.ndarray
     """(E, K + 1, 6) x, y, z [m], yaw, roll, pitch [rad]; the attitude is Rz(yaw) Rx(roll) Ry(pitch)."""
-    pull: np.ndarray
+    cable_force: np.ndarray
     """(E, K + 1, N, 3) of the cables on the payload at rest there, in the frame turned by the yaw alone [N]."""
     course: np.ndarray
     """(E, K, 3) of the way to each target: by how much it turns [rad], which share of roll and pitch is taken away
@@ -69,8 +69,8 @@ class Plan(NamedTuple):
     def zeros(cls, num_envs: int, targets: int, num_drones: int) -> Plan:
         """Return empty plans."""
         e, k = num_envs, targets
-        pose, pull = np.zeros((e, k + 1, 6)), np.zeros((e, k + 1, num_drones, 3))
-        return cls(pose, pull, np.zeros((e, k, 3)), np.zeros(e, np.int64))
+        pose, cable_force = np.zeros((e, k + 1, 6)), np.zeros((e, k + 1, num_drones, 3))
+        return cls(pose, cable_force, np.zeros((e, k, 3)), np.zeros(e, np.int64))
 
 
 @kernel
@@ -86,7 +86,7 @@ def _tilt(roll, pitch):
 
 
 @kernel
-def aim(e, k, plan, goal, rig, hanging):
+def set_goal_from_plan(e, k, plan, goal, rig, hanging):
     """Let pose k of the plan be the goal of environment e: its slots and pulls too."""
     pose = plan.pose[e, k]
     put(goal.position[e], (pose[0], pose[1], pose[2]))
@@ -94,7 +94,7 @@ def aim(e, k, plan, goal, rig, hanging):
     place_formation(e, goal, rig)
     c, s = cos(pose[3]), sin(pose[3])
     for n in range(rig.slots.shape[0]):
-        put(goal.pull[e, n], turn(c, s, mat_row(plan.pull, e, k, n)))
+        put(goal.cable_force[e, n], turn(c, s, mat_row(plan.cable_force, e, k, n)))
     place_slots(e, goal, rig, hanging)
 
 
@@ -105,7 +105,7 @@ def mat_row(a, i, j, n):
 
 
 @kernel
-def choose_courses(e, time, plan, way, rig, hanging, inertia, balance, hold, seconds, bounds):
+def select_candidate(e, time, plan, planned, rig, hanging, inertia, balance, hold, seconds, bounds):
     """Choose the course of each way of environment e: the first of `COURSES` that is gentle, else the gentlest one.
 
     What decides is how a slot is accelerated: a drone whose cable is nearly slack is swung about by little changes.
@@ -119,9 +119,9 @@ def choose_courses(e, time, plan, way, rig, hanging, inertia, balance, hold, sec
     """
     for k in range(plan.course.shape[1]):
         least, best = np.inf, 0
-        for i in range(len(COURSES)):
+        for i in range(len(CANDIDATES)):
             _take(e, k, plan, i)
-            asked = _asked(e, k, time, plan, way, rig, hanging, inertia, balance, hold, seconds, bounds)
+            asked = _peak_acceleration(e, k, time, plan, planned, rig, hanging, inertia, balance, hold, seconds, bounds)
             if asked < GAIN * least:
                 least, best = asked, i
             if asked <= GENTLE:
@@ -133,43 +133,45 @@ def choose_courses(e, time, plan, way, rig, hanging, inertia, balance, hold, sec
 @kernel
 def _take(e, k, plan, i):
     """Let way k have course i."""
-    longer, dip, level = COURSES[i]
+    longer, dip, level = CANDIDATES[i]
     turned = wrap(plan.pose[e, k + 1, 3] - plan.pose[e, k, 3])
     put(plan.course[e, k], (turned - 2.0 * pi * np.sign(turned) if longer else turned, dip, level))
 
 
 @kernel
-def _asked(e, k, time, plan, way, rig, hanging, inertia, balance, hold, seconds, bounds):
+def _peak_acceleration(e, k, time, plan, planned, rig, hanging, inertia, balance, hold, seconds, bounds):
     """Return the largest acceleration of a slot on way k [m/s²], or more where drones or cables come too close."""
-    rest(e, k, plan, way, rig, hanging)
+    hold_plan_pose(e, k, plan, planned, rig, hanging)
     plan.stage[e], most, room, dt = k, 0.0, 1.0, seconds / _SAMPLES
     for i in range(_SAMPLES):
         time[e] = k * hold + (i + 1) * dt
-        _go(e, e + 1, time, dt, plan, way, rig, hanging, inertia, balance, hold, seconds)
-        position, attitude = row(way.position, e), matrow(way.rotation, e)
+        _evaluate_plan(e, e + 1, time, dt, plan, planned, rig, hanging, inertia, balance, hold, seconds)
+        position, attitude = row(planned.position, e), matrow(planned.rotation, e)
         for n in range(rig.slots.shape[0]):
-            most = max(most, norm(add(row(way.acceleration, e), vec(way.slot_acceleration, e, n))))
-            slot, foot = vec(way.slots, e, n), add(position, mul(attitude, row(rig.anchors, n)))
+            most = max(most, norm(add(row(planned.acceleration, e), vec(planned.slot_acceleration, e, n))))
+            slot, foot = vec(planned.slots, e, n), add(position, mul(attitude, row(rig.anchors, n)))
             for m in range(n):
-                other, beside = vec(way.slots, e, m), add(position, mul(attitude, row(rig.anchors, m)))
+                other, beside = vec(planned.slots, e, m), add(position, mul(attitude, row(rig.anchors, m)))
                 room = min(room, norm(sub(slot, other)) / bounds.separation[n, m])
                 room = min(room, segment_distance(foot, slot, beside, other) / bounds.cables[n, m])
     return most if room >= 1.0 else max(most, GENTLE) + CLOSE * (1.0 - room)
 
 
 @kernel
-def rest(e, k, plan, way, rig, hanging):
+def hold_plan_pose(e, k, plan, planned, rig, hanging):
     """Let the way of environment e be at rest at pose k of the plan."""
-    aim(e, k, plan, way, rig, hanging)
-    for moving in (way.velocity, way.acceleration, way.jerk, way.angular_velocity):
+    set_goal_from_plan(e, k, plan, planned, rig, hanging)
+    for moving in (planned.velocity, planned.acceleration, planned.jerk, planned.angular_velocity):
         moving[e] = 0.0
-    for moving in (way.slot_velocity, way.slot_acceleration, way.slot_jerk):
+    for moving in (planned.slot_velocity, planned.slot_acceleration, planned.slot_jerk):
         moving[e] = 0.0
-    way.drone_yaw_rate[e] = 0.0
+    planned.drone_yaw_rate[e] = 0.0
 
 
 @kernel
-def lead(lo, hi, time, dt, plan, goal, way, rig, hanging, inertia, balance, payload_rotation, hold, seconds):
+def advance_plan(
+    lo, hi, time, dt, plan, goal, planned, rig, hanging, inertia, balance, payload_rotation, hold, seconds
+):
     """Go on by one control step: the way of environments lo to hi, and their goals where a new target's time has come.
 
     Args:
@@ -191,15 +193,15 @@ def lead(lo, hi, time, dt, plan, goal, way, rig, hanging, inertia, balance, payl
         stage = min(int((time[e] - 0.5 * dt) / hold), plan.pose.shape[1] - 2)
         if stage != plan.stage[e]:
             plan.stage[e] = stage
-            aim(e, stage + 1, plan, goal, rig, hanging)
-    _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, seconds)
+            set_goal_from_plan(e, stage + 1, plan, goal, rig, hanging)
+    _evaluate_plan(lo, hi, time, dt, plan, planned, rig, hanging, inertia, balance, hold, seconds)
     if not np.any(rig.anchors != 0.0):
         for e in range(lo, hi):
-            putmat(payload_rotation[e], matrow(way.rotation, e))
+            putmat(payload_rotation[e], matrow(planned.rotation, e))
 
 
 @kernel
-def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, seconds):
+def _evaluate_plan(lo, hi, time, dt, plan, planned, rig, hanging, inertia, balance, hold, seconds):
     """Write the way of environments lo to hi; arguments as of `lead`.
 
     The loop is in here because a call for each environment would take longer than the work: see docs/architecture.md.
@@ -212,7 +214,7 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
             continue
         s, ds, dds, ddds = ease(gone, 0.0, seconds)
         a, b = plan.pose[e, k], plan.pose[e, k + 1]
-        before, start, step = row(way.position, e), (a[0], a[1], a[2]), (b[0] - a[0], b[1] - a[1], b[2] - a[2])
+        before, start, step = row(planned.position, e), (a[0], a[1], a[2]), (b[0] - a[0], b[1] - a[1], b[2] - a[2])
         turned, dip, level = plan.course[e, k]
         yaw = a[3] + s * turned
         roll, rolled, rolling = _dipped(a[4], b[4], s, dip)
@@ -222,41 +224,44 @@ def _go(lo, hi, time, dt, plan, way, rig, hanging, inertia, balance, hold, secon
         swing = add(swing, _spin(yaw, roll, 0.0, rolling, pitching)[0])
         acceleration, turning = scale(dds, step), add(scale(dds, spin), scale(ds * ds, swing))
         rates, c, si = scale(ds, spin), cos(yaw), sin(yaw)
-        put(way.position[e], position)
-        put(way.velocity[e], scale(ds, step))
-        put(way.acceleration[e], acceleration)
-        put(way.jerk[e], scale(ddds, step))
-        put(way.angular_velocity[e], rates)
-        putmat(way.rotation[e], attitude)
-        way.yaw[e], way.drone_yaw[e], way.drone_yaw_rate[e] = yaw, yaw, ds * turned
+        put(planned.position[e], position)
+        put(planned.velocity[e], scale(ds, step))
+        put(planned.acceleration[e], acceleration)
+        put(planned.jerk[e], scale(ddds, step))
+        put(planned.angular_velocity[e], rates)
+        putmat(planned.rotation[e], attitude)
+        planned.yaw[e], planned.drone_yaw[e], planned.drone_yaw_rate[e] = yaw, yaw, ds * turned
         # the pulls of the two poses, mixed, lack some of the force and the moment of this motion
         body = matmul(matmul(attitude, inertia), transpose(attitude))
         moment = add(mul(body, turning), cross(rates, mul(body, rates)))
         force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
         share = level * 16.0 * s * s * (1.0 - s) * (1.0 - s)
         for n in range(count):
-            old, new = mat_row(plan.pull, e, k, n), mat_row(plan.pull, e, k + 1, n)
+            old, new = mat_row(plan.cable_force, e, k, n), mat_row(plan.cable_force, e, k + 1, n)
             mixed = scale(1.0 - share, add(scale(1.0 - s, old), scale(s, new)))
-            pull = turn(c, si, add(mixed, scale(share, mat_row(plan.pull, e, 0, n))))
-            put(way.pull[e, n], pull)
-            force, moment = sub(force, pull), sub(moment, cross(mul(attitude, row(rig.anchors, n)), pull))
+            cable_force = turn(c, si, add(mixed, scale(share, mat_row(plan.cable_force, e, 0, n))))
+            put(planned.cable_force[e, n], cable_force)
+            force, moment = sub(force, cable_force), sub(moment, cross(mul(attitude, row(rig.anchors, n)), cable_force))
         linear, angular = spread(force, moment, attitude, balance)
         moved = sub(position, before)
         for n in range(count):
             arm = mul(attitude, row(rig.anchors, n))
-            pull = add(vec(way.pull, e, n), add(linear, cross(angular, arm)))
-            held, hook = add(pull, (0.0, 0.0, hanging.weight[n])), add(add(position, arm), reach(n, pull, hanging))
+            cable_force = add(vec(planned.cable_force, e, n), add(linear, cross(angular, arm)))
+            held, hook = (
+                add(cable_force, (0.0, 0.0, hanging.weight[n])),
+                add(add(position, arm), drone_offset(n, cable_force, hanging)),
+            )
             slot = sub(hook, hook_arm(n, held, yaw, rig))
-            velocity, past = vec(way.slot_velocity, e, n), vec(way.slot_acceleration, e, n)
-            gained = scale(1.0 / dt, sub(sub(slot, vec(way.slots, e, n)), moved))
+            velocity, past = vec(planned.slot_velocity, e, n), vec(planned.slot_acceleration, e, n)
+            gained = scale(1.0 / dt, sub(sub(slot, vec(planned.slots, e, n)), moved))
             change = scale(1.0 / dt, sub(gained, velocity))
-            put(way.slots[e, n], slot)
-            put(way.slot_velocity[e, n], gained)
-            put(way.slot_acceleration[e, n], change)
-            put(way.slot_jerk[e, n], scale(1.0 / dt, sub(change, past)))
+            put(planned.slots[e, n], slot)
+            put(planned.slot_velocity[e, n], gained)
+            put(planned.slot_acceleration[e, n], change)
+            put(planned.slot_jerk[e, n], scale(1.0 / dt, sub(change, past)))
             # the drones' controllers add the inertia of their share of the load, which these pulls hold already
             share = rig.force[n, 2] / GRAVITY
-            put(way.pull[e, n], sub(held, scale(share, add(acceleration, change))))
+            put(planned.cable_force[e, n], sub(held, scale(share, add(acceleration, change))))
 
 
 @kernel

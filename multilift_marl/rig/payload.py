@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from multilift_marl.config.mesh import Mesh, read_mesh
+from multilift_marl.config.schema import PayloadConfig, SystemConfig
 from multilift_marl.errors import ConfigError
-
-if TYPE_CHECKING:
-    from multilift_marl.config.schema import Config, PayloadConfig
+from multilift_marl.rig.mesh import Mesh, read_mesh
 
 MAX_ANCHOR_DISTANCE = 0.1  # [m] of an anchor from the payload's surface
 REST_SEPARATION = 0.6  # [m] between falcons at rest, by which the standard rig is sized
 
 
-def standard_length(config: Config, scale: float) -> float:
+def standard_length(config: SystemConfig, scale: float) -> float:
     """Return 1 m for a falcon's span, or more where a ring of drones about one point would be too narrow."""
     n, spread = config.env.num_drones, np.sin(np.deg2rad(config.cable.angle))
     if config.payload.shape != "point" or n == 1 or spread == 0:
@@ -36,7 +34,7 @@ def find_mesh(payload: PayloadConfig) -> Mesh | None:
 
 
 def place_anchors(
-    config: Config, n: int, length: np.ndarray, scale: float, mesh: Mesh | None
+    config: SystemConfig, n: int, length: np.ndarray, scale: float, mesh: Mesh | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return anchors (n, 3) from the geometric centre and edges (3,) [m]: the configured or the standard ones.
 

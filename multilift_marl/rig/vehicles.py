@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from multilift_marl.config.files import is_yaml, parse_mapping, read_pinned
+from multilift_marl.config.schema import VehicleConfig
+from multilift_marl.config.validate import validate
+from multilift_marl.errors import ConfigError, nearest
 
 GRAVITY = 9.81  # [m/s²]
 AIR_DENSITY = 1.225  # [kg/m³] at sea level, 15 °C (ISA)
@@ -212,3 +220,136 @@ _IRIS = Vehicle(
 PRESETS: dict[str, Vehicle] = {
     vehicle.name: vehicle for vehicle in (_FALCON, _CRAZYFLIE, _CRAZYFLIE_ID, _HUMMINGBIRD, _IRIS)
 }
+
+
+_SHIPPED = frozenset(PRESETS)
+_VECTORS = ("inertia", "rotor_azimuth", "rotor_spin", "drag")
+
+
+def resolve_vehicles(config: VehicleConfig, n: int) -> tuple[Vehicle, ...]:
+    """Return the vehicle of each of n drones: its preset with the configured fields in place of the preset's own.
+
+    Raises:
+        ConfigError: a list of another length, an unknown preset, or a vehicle that cannot be or cannot hover.
+    """
+    fields = config.model_dump(exclude_none=True)
+    values = {key: _one_each(value, n, key) for key, value in fields.items()}
+    alike = all(len(set(each)) == 1 for each in values.values())
+    vehicles = []
+    for i in range(n):
+        try:
+            vehicles.append(_resolve({key: each[i] for key, each in values.items()}))
+        except ConfigError as error:
+            raise error if alike else ConfigError(f"drone {i}: {error}") from None
+    return tuple(vehicles)
+
+
+def register_vehicle(name: str, **fields: Any) -> Vehicle:
+    """Make a vehicle of one's own known by name, `vehicle.preset=<name>`.
+
+    Args:
+        name: not that of a shipped vehicle; of one's own, the latest counts.
+        **fields: as in the section `vehicle` of a configuration, in its units; what is left out is that of `preset`, a
+            falcon unless another is named.
+
+    Returns:
+        The vehicle.
+
+    Raises:
+        ConfigError: an unknown field, a wrong value, a name that is taken, or a vehicle that cannot be or cannot hover.
+    """
+    if name in _SHIPPED or is_yaml(name):
+        raise ConfigError(f"a vehicle of one's own cannot have the name '{name}': choose one that is not taken")
+    PRESETS[name] = _make_vehicle(name, fields)
+    return PRESETS[name]
+
+
+def describe_team(vehicles: tuple[Vehicle, ...]) -> str:
+    """Return how many of which vehicles, such as "2 × falcon, 1 × iris"."""
+    return ", ".join(f"{count} × {name}" for name, count in Counter(vehicle.name for vehicle in vehicles).items())
+
+
+def _one_each(value: Any, n: int, key: str) -> tuple[Any, ...]:
+    """Return the value of each of n drones, of one for all or a list with one for each."""
+    vector = key in _VECTORS and value and not isinstance(value[0], tuple)
+    if vector or not isinstance(value, tuple):
+        return (value,) * n
+    if len(value) != n:
+        raise ConfigError(
+            f"vehicle.{key} lists {len(value)} values for env.num_drones={n}: give one value or one for each drone"
+        )
+    return value
+
+
+def _find_vehicle(preset: str) -> Vehicle:
+    """Return the vehicle of a name or of a YAML file."""
+    if is_yaml(preset):
+        path, content = read_pinned("vehicle.preset", preset)
+        return _make_vehicle(path.stem, parse_mapping(content, path, "fields of a vehicle, such as 'mass: 0.7',"), path)
+    if preset not in PRESETS:
+        cure = "; one's own needs import=<module>, or is a file, <name>.yaml"
+        raise ConfigError(f"unknown vehicle.preset '{preset}'{nearest(preset, PRESETS, otherwise=cure)}")
+    return PRESETS[preset]
+
+
+def _make_vehicle(name: str, fields: dict[str, Any], file: Path | str = "") -> Vehicle:
+    """Return a vehicle of `fields` as in the section `vehicle`, from a `file` if one is named."""
+    config = validate(VehicleConfig, fields, "vehicle", where=str(file))
+    if file and is_yaml(str(config.preset)):  # it might be the file itself
+        raise ConfigError(f"preset={fields['preset']} in {file} must be the name of a vehicle, not another file")
+    (vehicle,) = resolve_vehicles(config, 1)
+    return replace(vehicle, name=name)
+
+
+def _resolve(fields: dict[str, Any]) -> Vehicle:
+    base = _find_vehicle(fields.pop("preset"))
+    if "rotor_azimuth" in fields:
+        fields["rotor_azimuth"] = tuple(float(angle) for angle in np.deg2rad(fields["rotor_azimuth"]))
+    vehicle = replace(base, **fields)
+    _check_vehicle(vehicle)
+    return vehicle
+
+
+def check_rotors(vehicle: Vehicle) -> None:
+    """Refuse rotors that overlap, which the models of wash and ground effect know nothing of: a ConfigError."""
+    rotors = vehicle.rotor_positions
+    apart = min(float(np.linalg.norm(a - b)) for i, a in enumerate(rotors) for b in rotors[:i])
+    if 2 * vehicle.rotor_radius > apart:
+        raise ConfigError(
+            f"rotors of vehicle.rotor_radius={vehicle.rotor_radius:g} m overlap, their axes {apart:.3g} m apart; "
+            "lower it or raise vehicle.arm, or switch wind.wash and wind.ground_effect off"
+        )
+
+
+def _check_vehicle(vehicle: Vehicle) -> None:
+    inertia, spin, position = np.array(vehicle.inertia), np.array(vehicle.rotor_spin), vehicle.rotor_positions
+    if 2 * inertia.max() > inertia.sum() * (1 + 1e-9):
+        raise ConfigError(
+            f"vehicle.inertia {inertia.tolist()} is impossible: no moment may exceed the sum of the other two"
+        )
+    if vehicle.rotor_speed_min >= vehicle.rotor_speed_max:
+        raise ConfigError(
+            f"vehicle.rotor_speed_min={vehicle.rotor_speed_min:g} rad/s must be less than the "
+            f"{vehicle.rotor_speed_max:g} rad/s that vehicle.rotor_thrust_max={vehicle.rotor_thrust_max:g} N takes"
+        )
+    if not np.all(np.abs(spin) == 1) or spin.sum() != 0:
+        raise ConfigError(
+            f"vehicle.rotor_spin {spin.tolist()} must hold 1 for two rotors and -1 for the other two, or yaw is out of "
+            "control"
+        )
+    if np.abs(position.sum(axis=0)).max() > 1e-6 * vehicle.arm:
+        raise ConfigError(
+            f"vehicle.rotor_azimuth {np.rad2deg(vehicle.rotor_azimuth).round(3).tolist()} does not balance: equal "
+            "thrusts must give no torque, so place the rotors in opposite pairs"
+        )
+    unit = np.stack([np.ones(4), position[:, 0] / vehicle.arm, position[:, 1] / vehicle.arm, spin])
+    if np.linalg.svd(unit, compute_uv=False).min() < 0.05:
+        raise ConfigError(
+            f"vehicle.rotor_azimuth {np.rad2deg(vehicle.rotor_azimuth).round(3).tolist()} with vehicle.rotor_spin "
+            f"{spin.tolist()} cannot turn the drone about each axis: let opposite rotors turn alike"
+        )
+    if vehicle.spare_lift <= 0:
+        raise ConfigError(
+            f"a {vehicle.name} of vehicle.mass={vehicle.mass:g} kg cannot lift itself with "
+            f"{4 * vehicle.rotor_thrust_max:g} N; raise vehicle.rotor_thrust_max"
+        )

@@ -11,19 +11,20 @@ from conftest import floats, make
 
 import multilift_marl as ml
 from multilift_marl.math3d import rotation_vector, segment_distance
-from multilift_marl.tasks.way import COURSES, GENTLE, rest
+from multilift_marl.tasks.trajectory import CANDIDATES, GENTLE, hold_plan_pose
 
 
 def test_the_way_moves_as_its_velocities_say_and_ends_at_the_target():
     vec = make("pose", num_envs=4)
     vec.reset(seed=0)
     task, dt = vec.task, vec.task.control_dt
-    lead, way, kept = task.planner(0, 4), task.way, []
+    advance_plan, planned, kept = task.planner(0, 4), task.planned, []
     for _ in range(1000):
-        lead()
+        advance_plan()
         kept.append([array.copy() for array in (
-            way.position, way.velocity, way.acceleration, way.jerk, way.slots, way.slot_velocity, way.slot_acceleration,
-            way.slot_jerk, way.rotation, way.angular_velocity,
+            planned.position, planned.velocity, planned.acceleration, planned.jerk, planned.slots,
+            planned.slot_velocity, planned.slot_acceleration, planned.slot_jerk, planned.rotation,
+            planned.angular_velocity,
         )])  # fmt: skip
     position, velocity, acceleration, jerk, slots, slot_v, slot_a, slot_j, rotation, spin = (
         np.array(part) for part in zip(*kept, strict=True)
@@ -38,10 +39,16 @@ def test_the_way_moves_as_its_velocities_say_and_ends_at_the_target():
         for e in range(4):
             rate = np.array(rotation_vector(floats(turned[t, e]))) / (2 * dt)
             np.testing.assert_allclose(rate, spin[t + 1, e], atol=0.01)
-    np.testing.assert_allclose(way.position, task.goal.position, atol=1e-12)
-    np.testing.assert_allclose(way.rotation, task.goal.rotation, atol=1e-12)
-    np.testing.assert_allclose(way.slots, task.goal.slots, atol=1e-9)
-    for still in (way.velocity, way.angular_velocity, way.slot_velocity, way.slot_acceleration, way.slot_jerk):
+    np.testing.assert_allclose(planned.position, task.goal.position, atol=1e-12)
+    np.testing.assert_allclose(planned.rotation, task.goal.rotation, atol=1e-12)
+    np.testing.assert_allclose(planned.slots, task.goal.slots, atol=1e-9)
+    for still in (
+        planned.velocity,
+        planned.angular_velocity,
+        planned.slot_velocity,
+        planned.slot_acceleration,
+        planned.slot_jerk,
+    ):
         assert (np.abs(still) < 1e-12).all()
 
 
@@ -50,22 +57,22 @@ def test_pulls_of_the_way_give_the_payload_the_motion_of_the_way(num_drones):
     vec = make("pose", num_envs=4, num_drones=num_drones)
     vec.reset(seed=0)
     task, system = vec.task, vec.world.system
-    lead, way = task.planner(0, 4), task.way
+    advance_plan, planned = task.planner(0, 4), task.planned
     for _ in range(350):
-        before = way.angular_velocity.copy(), way.rotation.copy()
-        lead()
-    inertial = way.acceleration[:, None] + way.slot_acceleration
-    pull = way.pull + (system.drone_pull[:, 2] / 9.81)[None, :, None] * inertial
-    wanted = system.payload_mass * (way.acceleration + [0, 0, 9.81])
-    np.testing.assert_allclose(pull.sum(axis=1), wanted, atol=1e-8)
-    arms = np.einsum("eij,nj->eni", way.rotation, system.anchors)
-    moment = np.cross(arms, pull).sum(axis=1)
+        before = planned.angular_velocity.copy(), planned.rotation.copy()
+        advance_plan()
+    inertial = planned.acceleration[:, None] + planned.slot_acceleration
+    cable_force = planned.cable_force + (system.hook_force[:, 2] / 9.81)[None, :, None] * inertial
+    wanted = system.payload_mass * (planned.acceleration + [0, 0, 9.81])
+    np.testing.assert_allclose(cable_force.sum(axis=1), wanted, atol=1e-8)
+    arms = np.einsum("eij,nj->eni", planned.rotation, system.anchors)
+    moment = np.cross(arms, cable_force).sum(axis=1)
     body = np.reshape(system.inertia_matrix, (3, 3))
 
     def momentum(rotation, spin):
         return np.einsum("eij,jk,elk,el->ei", rotation, body, rotation, spin)
 
-    change = (momentum(way.rotation, way.angular_velocity) - momentum(before[1], before[0])) / task.control_dt
+    change = (momentum(planned.rotation, planned.angular_velocity) - momentum(before[1], before[0])) / task.control_dt
     np.testing.assert_allclose(moment, change, atol=0.01 * np.abs(change).max() + 1e-3)
 
 
@@ -74,21 +81,21 @@ def test_drones_and_cables_stay_apart_and_no_drone_leans_far_on_the_way(name):
     vec = ml.make_vec(name, num_envs=64, num_threads=1)
     vec.reset(seed=0)
     task, system, weight = vec.task, vec.world.system, 9.81 * vec.world.system.vehicles[0].mass
-    lead, way, pairs = task.planner(0, 64), task.way, list(combinations(range(vec.num_drones), 2))
+    advance_plan, planned, pairs = task.planner(0, 64), task.planned, list(combinations(range(vec.num_drones), 2))
     drones, cables, upright = 9.0, 9.0, 1.0
     for step in range(3000):
-        lead()
+        advance_plan()
         if step % 10:
             continue
-        feet = way.position[:, None] + np.einsum("eij,nj->eni", way.rotation, system.anchors)
+        feet = planned.position[:, None] + np.einsum("eij,nj->eni", planned.rotation, system.anchors)
         for i, j in pairs:
-            drones = min(drones, np.linalg.norm(way.slots[:, i] - way.slots[:, j], axis=-1).min())
+            drones = min(drones, np.linalg.norm(planned.slots[:, i] - planned.slots[:, j], axis=-1).min())
             for e in range(64):
-                ends = (floats(line[e, n]) for n in (i, j) for line in (feet, way.slots))
+                ends = (floats(line[e, n]) for n in (i, j) for line in (feet, planned.slots))
                 cables = min(cables, segment_distance(*ends))
-        inertial = way.acceleration[:, None] + way.slot_acceleration
-        share = (system.drone_pull[:, 2] / 9.81)[None, :, None] * inertial
-        thrust = way.pull + share + weight / 9.81 * inertial + [0.0, 0.0, weight]
+        inertial = planned.acceleration[:, None] + planned.slot_acceleration
+        share = (system.hook_force[:, 2] / 9.81)[None, :, None] * inertial
+        thrust = planned.cable_force + share + weight / 9.81 * inertial + [0.0, 0.0, weight]
         upright = min(upright, (thrust[..., 2] / np.linalg.norm(thrust, axis=-1)).min())
     assert drones > system.min_separation.max()
     assert cables > 0.12
@@ -99,7 +106,7 @@ def test_ways_that_would_swing_a_drone_about_take_another_course():
     vec = ml.make_vec("pose_falcon3", num_envs=512, num_threads=1)
     vec.reset(seed=0)
     task, plan = vec.task, vec.task.plan
-    usual = plan.course[..., 1:] == COURSES[0][1:]
+    usual = plan.course[..., 1:] == CANDIDATES[0][1:]
     turned = np.diff(plan.pose[..., 3], axis=1)
     assert 0.9 < usual.all(axis=-1).mean() < 0.99
     np.testing.assert_allclose(np.exp(1j * plan.course[..., 0]), np.exp(1j * turned), atol=1e-9)
@@ -110,18 +117,20 @@ def test_ways_that_would_swing_a_drone_about_take_another_course():
         """Return the largest acceleration of a slot on each way (512, 3) [m/s²]."""
         task.time[:], plan.stage[:] = 0.0, 0
         for e in range(512):
-            rest(e, 0, plan, task.way, task.rig, task.nominal_hanging)
-        lead, most = task.planner(0, 512), np.zeros((512, 3))
+            hold_plan_pose(e, 0, plan, task.planned, task.rig, task.nominal_hanging)
+        advance_plan, most = task.planner(0, 512), np.zeros((512, 3))
         for step in range(3000):
-            lead()
-            size = np.linalg.norm(task.way.acceleration[:, None] + task.way.slot_acceleration, axis=-1).max(axis=1)
+            advance_plan()
+            size = np.linalg.norm(task.planned.acceleration[:, None] + task.planned.slot_acceleration, axis=-1).max(
+                axis=1
+            )
             if step % 1000 > 2:  # a new way's slots take a step or two to be where they should
                 most[:, step // 1000] = np.maximum(most[:, step // 1000], size)
         return most
 
     chosen = hardest()
     plan.course[..., 0] = (turned + pi) % (2 * pi) - pi
-    plan.course[..., 1:] = COURSES[0][1:]
+    plan.course[..., 1:] = CANDIDATES[0][1:]
     before = hardest()
     kept = usual.all(axis=-1)
     np.testing.assert_allclose(chosen[kept], before[kept], atol=1e-6)
@@ -134,16 +143,16 @@ def test_drones_and_cables_stay_apart_on_every_course():
     vec = ml.make_vec("pose", num_envs=1000, num_threads=1)
     vec.reset(seed=0)
     task, system, plan = vec.task, vec.world.system, vec.task.plan
-    ways = np.argwhere((plan.course[..., 1:] != COURSES[0][1:]).any(axis=-1))
+    ways = np.argwhere((plan.course[..., 1:] != CANDIDATES[0][1:]).any(axis=-1))
     assert len(ways) > 60
-    lead, way, limits = task.planner(0, 1000), task.way, task.limits
+    advance_plan, planned, limits = task.planner(0, 1000), task.planned, task.limits
     for step in range(3000):
-        lead()
+        advance_plan()
         if step % 25:
             continue
-        feet = way.position[:, None] + np.einsum("eij,nj->eni", way.rotation, system.anchors)
+        feet = planned.position[:, None] + np.einsum("eij,nj->eni", planned.rotation, system.anchors)
         for e in ways[ways[:, 1] == step // 1000, 0]:
             for i, j in combinations(range(4), 2):
-                assert np.linalg.norm(way.slots[e, i] - way.slots[e, j]) > limits.separation[i, j]
-                ends = (floats(line[e, n]) for n in (i, j) for line in (feet, way.slots))
+                assert np.linalg.norm(planned.slots[e, i] - planned.slots[e, j]) > limits.separation[i, j]
+                ends = (floats(line[e, n]) for n in (i, j) for line in (feet, planned.slots))
                 assert segment_distance(*ends) > limits.cables[i, j]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from multilift_marl._jit import bind
-from multilift_marl.config.schema import Config
+from multilift_marl.config.config import Config
 from multilift_marl.control.actions import ACTIONS, Call, Team
-from multilift_marl.control.disturbance import REJECTIONS, Disturbance, forget, make_rejection
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
 from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.setpoints import Setpoint
@@ -15,7 +15,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.sim.world import World
 
 
-class Pilot:
+class Controller:
     """From the actions of E teams to their rotor thrusts.
 
     Args:
@@ -43,8 +43,8 @@ class Pilot:
         self.gains = make_gains(settings, world.system)
         self._kind = settings.disturbance
         if self._kind != "none":
-            if self._kind not in self.interface.rejects:
-                able = [name for name, interface in ACTIONS.items() if self._kind in interface.rejects]
+            if self._kind not in self.interface.supports:
+                able = [name for name, interface in ACTIONS.items() if self._kind in interface.supports]
                 raise ConfigError(
                     f"control.disturbance={self._kind} has nothing to correct with control.action={settings.action}; "
                     f"use it with {' or '.join(able)}, or set control.disturbance=none"
@@ -65,21 +65,25 @@ class Pilot:
         """
         state, thrust, g = self.world.state, self.world.thrust, self.gains
         rejection = self.disturbance
-        pull = goal.pull if rejection is None else rejection.pull
-        team = Team(state, goal, self.reference, self._setpoint, pull, thrust, g)
-        act = self.interface.act(lo, hi, action, team)
-        follow = self.interface.follow(lo, hi, team) if plan is None else self.interface.ride(lo, hi, plan, act, team)
+        cable_force = goal.cable_force if rejection is None else rejection.cable_force
+        team = Team(state, goal, self.reference, self._setpoint, cable_force, thrust, g)
+        set_action = self.interface.set_action(lo, hi, action, team)
+        control_step = (
+            self.interface.control_step(lo, hi, team)
+            if plan is None
+            else self.interface.control_step_moving_goal(lo, hi, plan, set_action, team)
+        )
         if rejection is None:
-            return act, follow
-        known, own = (state, self.reference, goal.pull), (rejection, g, self._rejection)
+            return set_action, control_step
+        known, own = (state, self.reference, goal.cable_force), (rejection, g, self._rejection)
         estimate = bind(REJECTIONS[self._kind], lo, hi, *known, *own)
-        return act, (*follow[:-1], estimate, follow[-1])
+        return set_action, (*control_step[:-1], estimate, control_step[-1])
 
     def start(self, e: int) -> None:
         """Let references and estimates of environment e start from the state of its drones."""
         start_reference(e, self.world.state, self.reference)
         if self.disturbance is not None:
-            forget(e, self.world.state, self.disturbance)
+            reset_estimate(e, self.world.state, self.disturbance)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the arrays that outlive a step."""

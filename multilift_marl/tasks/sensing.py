@@ -14,9 +14,9 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import RandomizationConfig
 from multilift_marl.math3d import add, axis_angle, mat, matmul, matrow, norm, put, putmat, row, scale, vec
-from multilift_marl.sim.generator import normal_pair
+from multilift_marl.sim.rng import normal_pair
 from multilift_marl.sim.state import SystemState
-from multilift_marl.tasks.terms import Errors
+from multilift_marl.tasks.rewards import Errors
 
 STANDARD = np.array([0.005, 0.05, 0.01, 0.1])  # position [m], velocity [m/s], rotation [rad], angular velocity [rad/s]
 
@@ -42,7 +42,7 @@ class Memory(NamedTuple):
     """(E, K, N, D) likewise."""
 
 
-class Imperfections:
+class Sensing:
     """Noise, bias and delays of E teams.
 
     Args:
@@ -65,16 +65,18 @@ class Imperfections:
         self.noise = STANDARD * ranges.observation_noise
         self.bias = STANDARD * ranges.observation_bias
         (_, slowest), (_, latest) = ranges.action_delay, ranges.observation_delay
-        self.noisy, self.late, self.slow = bool(self.noise.any() or self.bias.any()), latest > 0, slowest > 0
+        self.has_noise = bool(self.noise.any() or self.bias.any())
+        self.delays_observation, self.delays_action = latest > 0, slowest > 0
+        acted, observed = (slowest + 1) * self.delays_action, (latest + 1) * self.delays_observation
         sent, seen, action_delay, observation_delay = (np.zeros(e, np.int64) for _ in range(4))
         self.memory = Memory(
             np.zeros(e, np.uint64), np.zeros((e, n + 1, 4, 3)), sent, seen, action_delay, observation_delay,
-            np.zeros((e, (slowest + 1) * self.slow, n, a)), np.zeros((e, (latest + 1) * self.late, n, d), np.float32),
+            np.zeros((e, acted, n, a)), np.zeros((e, observed, n, d), np.float32),
         )  # fmt: skip
         self.state, self.errors = SystemState.zeros(e, n), Errors.zeros(e)
         self.applied = np.zeros((e, n, a))
         self.unused = np.zeros((e, critic), np.float32)
-        self.on = self.noisy or self.late or self.slow
+        self.enabled = self.has_noise or self.delays_observation or self.delays_action
         self._attitude = attitude
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:
@@ -101,13 +103,13 @@ class Imperfections:
     def drawn(self) -> dict[str, np.ndarray]:
         """Return the live arrays of what an episode draws of it, by the names of `randomization`."""
         memory = self.memory
-        drawn = {"action_delay": memory.action_delay} if self.slow else {}
-        drawn |= {"observation_delay": memory.observation_delay} if self.late else {}
+        drawn = {"action_delay": memory.action_delay} if self.delays_action else {}
+        drawn |= {"observation_delay": memory.observation_delay} if self.delays_observation else {}
         return drawn | ({"observation_bias": memory.bias} if self.bias.any() else {})
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the live arrays that outlive a step."""
-        if not self.on:
+        if not self.enabled:
             return {}
         return self.memory._asdict() | {f"errors_{name}": array for name, array in self.errors._asdict().items()}
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.math3d import add, cross, mat, mul, norm, put, putmat, row, sub, thrust_frame, tmul, vec
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 
 
 class Drones(NamedTuple):
@@ -40,26 +40,26 @@ def make_drones(system: System) -> Drones:
 
 
 @kernel
-def hook_place(e, n, state, hooks):
+def hook_position(e, n, state, hooks):
     """Return where cable n is tied to its drone, world frame [m]."""
     return add(vec(state.drone_position, e, n), mul(mat(state.drone_rotation, e, n), row(hooks, n)))
 
 
 @kernel
-def hold_hook(e, n, state, place, hooks):
+def place_at_hook(e, n, state, place, hooks):
     """Put drone n where its hook is at `place`, with the attitude that it has."""
     put(state.drone_position[e, n], sub(place, mul(mat(state.drone_rotation, e, n), row(hooks, n))))
 
 
 @kernel
-def hover_drone(e, n, state, pull, yaw, drones):
+def hover_drone(e, n, state, cable_force, yaw, drones):
     """Let drone n of environment e hold still: attitude and rotor speeds that pull its cable by `pull` [N]."""
-    force = add(pull, (0.0, 0.0, drones.mass[n] * GRAVITY))
+    force = add(cable_force, (0.0, 0.0, drones.mass[n] * GRAVITY))
     attitude = thrust_frame(force, yaw)
     putmat(state.drone_rotation[e, n], attitude)
     total, torque = norm(force), (0.0, 0.0, 0.0)
     if drones.hooked:
-        torque = cross(row(drones.hooks, n), tmul(attitude, pull))
+        torque = cross(row(drones.hooks, n), tmul(attitude, cable_force))
     for k in range(4):
         square = total / (4.0 * drones.thrust_coefficient[n])
         if drones.hooked:

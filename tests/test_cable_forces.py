@@ -7,11 +7,18 @@ import pytest
 from conftest import floats, make_system
 
 from multilift_marl.config.load import load_config
+from multilift_marl.control.cable_forces import (
+    BALANCED,
+    is_stable,
+    make_wrench_distribution,
+    place_balanced,
+    solve_cable_forces,
+    spread,
+)
 from multilift_marl.control.formation import Goal, make_rig, place_formation
-from multilift_marl.control.pulls import BALANCED, make_spread, place_balanced, settles, solve_pulls, spread
 from multilift_marl.math3d import axis_angle
 from multilift_marl.tasks.starts import make_hanging
-from multilift_marl.tasks.way import attitude_of
+from multilift_marl.tasks.trajectory import attitude_of
 
 LEVEL = floats(np.eye(3))
 SQUARE = np.array([[0.3, 0.2, 0.1], [-0.3, 0.2, 0.1], [-0.3, -0.2, 0.1], [0.3, -0.2, 0.1]])
@@ -20,9 +27,9 @@ OUTWARD = np.array([[1.0, 1.0, 3.0], [-1.0, 1.0, 3.0], [-1.0, -1.0, 3.0], [1.0, 
 
 def solve(force, moment, given, anchors=SQUARE, attitude=LEVEL, least=-np.inf) -> tuple[np.ndarray, float]:
     """Return the pulls (N, 3) and the imbalance."""
-    pull = np.array(given, float)
-    left = solve_pulls(floats(force), floats(moment), attitude, anchors, least, pull)
-    return pull, left
+    cable_force = np.array(given, float)
+    left = solve_cable_forces(floats(force), floats(moment), attitude, anchors, least, cable_force)
+    return cable_force, left
 
 
 def balance_matrix(anchors: np.ndarray) -> np.ndarray:
@@ -32,8 +39,8 @@ def balance_matrix(anchors: np.ndarray) -> np.ndarray:
 
 
 def test_pulls_that_already_balance_stay_as_they_are():
-    pull, left = solve([0, 0, 12], [0, 0, 0], OUTWARD)
-    np.testing.assert_allclose(pull, OUTWARD, atol=1e-12)
+    cable_force, left = solve([0, 0, 12], [0, 0, 0], OUTWARD)
+    np.testing.assert_allclose(cable_force, OUTWARD, atol=1e-12)
     assert left < 1e-9
 
 
@@ -41,9 +48,9 @@ def test_without_bounds_the_change_is_the_pseudo_inverses():
     rng = np.random.default_rng(0)
     turn = np.reshape(axis_angle((0.6, 0.0, 0.8), 0.7), (3, 3))
     wrench, matrix = rng.normal(size=6) + [0, 0, 12, 0, 0, 0], balance_matrix(SQUARE @ turn.T)
-    pull, left = solve(wrench[:3], wrench[3:], OUTWARD, attitude=floats(turn))
+    cable_force, left = solve(wrench[:3], wrench[3:], OUTWARD, attitude=floats(turn))
     expected = OUTWARD.ravel() + np.linalg.pinv(matrix) @ (wrench - matrix @ OUTWARD.ravel())
-    np.testing.assert_allclose(pull.ravel(), expected, atol=1e-9)
+    np.testing.assert_allclose(cable_force.ravel(), expected, atol=1e-9)
     assert left < 1e-9
 
 
@@ -54,18 +61,20 @@ def test_the_spread_of_what_is_lacking_is_the_solution_without_bounds(anchors):
     arms = anchors @ turn.T
     for _ in range(20):
         wrench, matrix = rng.normal(size=6) + [0, 0, 12, 0, 0, 0], balance_matrix(arms)
-        pull, _ = solve(wrench[:3], wrench[3:], given, anchors, floats(turn))
+        cable_force, _ = solve(wrench[:3], wrench[3:], given, anchors, floats(turn))
         lacking = wrench - matrix @ given.ravel()
-        linear, angular = spread(floats(lacking[:3]), floats(lacking[3:]), floats(turn), make_spread(anchors))
+        linear, angular = spread(
+            floats(lacking[:3]), floats(lacking[3:]), floats(turn), make_wrench_distribution(anchors)
+        )
         np.testing.assert_allclose(
-            given + linear + np.cross(angular, arms), pull, atol=1e-5 if len(anchors) < 3 else 1e-10
+            given + linear + np.cross(angular, arms), cable_force, atol=1e-5 if len(anchors) < 3 else 1e-10
         )
 
 
 def test_a_moment_shifts_pull_from_one_side_to_the_other():
-    pull, _ = solve([0, 0, 12], [0.8, 0, 0], [[0, 0, 3.0]] * 4, anchors=SQUARE * [1, 1, 0])
-    np.testing.assert_allclose(pull[:, 2], 3 + 0.8 / (4 * 0.2) * np.sign(SQUARE[:, 1]), atol=1e-9)
-    np.testing.assert_allclose(pull[:, :2], 0, atol=1e-9)
+    cable_force, _ = solve([0, 0, 12], [0.8, 0, 0], [[0, 0, 3.0]] * 4, anchors=SQUARE * [1, 1, 0])
+    np.testing.assert_allclose(cable_force[:, 2], 3 + 0.8 / (4 * 0.2) * np.sign(SQUARE[:, 1]), atol=1e-9)
+    np.testing.assert_allclose(cable_force[:, :2], 0, atol=1e-9)
 
 
 def test_bounded_pulls_meet_the_conditions_of_a_minimum():
@@ -74,10 +83,10 @@ def test_bounded_pulls_meet_the_conditions_of_a_minimum():
     bound = 0.5 * np.linalg.norm(OUTWARD, axis=1)
     for _ in range(200):
         wrench = rng.normal(size=6) * [2, 2, 2, 0.5, 0.5, 0.5] + [0, 0, 12, 0, 0, 0]
-        pull, left = solve(wrench[:3], wrench[3:], OUTWARD, least=0.5)
+        cable_force, left = solve(wrench[:3], wrench[3:], OUTWARD, least=0.5)
         if left > 1e-9:
             continue  # these cables cannot exert it
-        spare = (direction * pull).sum(axis=1) - bound
+        spare = (direction * cable_force).sum(axis=1) - bound
         assert spare.min() > -1e-9
         tight = spare < 1e-7
         met += tight.any()
@@ -87,22 +96,22 @@ def test_bounded_pulls_meet_the_conditions_of_a_minimum():
             column = np.zeros((4, 3))
             column[i] = direction[i]
             columns.append(column.reshape(-1, 1))
-        multipliers, *_ = np.linalg.lstsq(np.hstack(columns), (pull - OUTWARD).ravel(), rcond=None)
-        np.testing.assert_allclose(np.hstack(columns) @ multipliers, (pull - OUTWARD).ravel(), atol=1e-7)
+        multipliers, *_ = np.linalg.lstsq(np.hstack(columns), (cable_force - OUTWARD).ravel(), rcond=None)
+        np.testing.assert_allclose(np.hstack(columns) @ multipliers, (cable_force - OUTWARD).ravel(), atol=1e-7)
         assert (multipliers[6:] > -1e-7).all()
     assert met > 20
 
 
 def test_what_cables_cannot_exert_is_left_over_and_does_no_harm():
     line = np.array([[0.3, 0, 0], [-0.3, 0, 0]])
-    pull, left = solve([0, 0, 6], [0.5, 0.6, 0], [[0, 0, 3.0]] * 2, anchors=line)
-    np.testing.assert_allclose(pull, [[0, 0, 2.0], [0, 0, 4.0]], atol=1e-5)
+    cable_force, left = solve([0, 0, 6], [0.5, 0.6, 0], [[0, 0, 3.0]] * 2, anchors=line)
+    np.testing.assert_allclose(cable_force, [[0, 0, 2.0], [0, 0, 4.0]], atol=1e-5)
     assert left == pytest.approx(0.5, abs=1e-5)
 
 
 def test_one_cable_pulls_a_point_as_told():
-    pull, left = solve([1, -2, 9], [0, 0, 0], [[0, 0, 9.0]], anchors=np.zeros((1, 3)))
-    np.testing.assert_allclose(pull, [[1, -2, 9]], atol=1e-6)
+    cable_force, left = solve([1, -2, 9], [0, 0, 0], [[0, 0, 9.0]], anchors=np.zeros((1, 3)))
+    np.testing.assert_allclose(cable_force, [[1, -2, 9]], atol=1e-6)
     assert left < 1e-6
 
 
@@ -135,17 +144,17 @@ def test_a_tilted_payload_is_balanced_and_slots_lie_along_the_pulls(num_drones, 
     system, held = make_system(num_drones, **{"cable.model": model}), []
     hanging = make_hanging(system)
     goal = placed(system, 2.0, roll, lambda goal, rig: held.append(place_balanced(0, goal, rig, hanging)))
-    pull = goal.pull[0] - [[0, 0, w] for w in hanging.weight]
+    cable_force = goal.cable_force[0] - [[0, 0, w] for w in hanging.weight]
     weight = 9.81 * system.payload_mass
     arms = system.anchors @ goal.rotation[0].T
     assert held == [True]
-    np.testing.assert_allclose(pull.sum(axis=0), [0, 0, weight], atol=BALANCED * weight)
-    np.testing.assert_allclose(np.cross(arms, pull).sum(axis=0), 0, atol=BALANCED * weight)
-    assert np.linalg.norm(pull, axis=1).min() > 0.2 * np.linalg.norm(system.formation_force, axis=1).min()
+    np.testing.assert_allclose(cable_force.sum(axis=0), [0, 0, weight], atol=BALANCED * weight)
+    np.testing.assert_allclose(np.cross(arms, cable_force).sum(axis=0), 0, atol=BALANCED * weight)
+    assert np.linalg.norm(cable_force, axis=1).min() > 0.2 * np.linalg.norm(system.formation_force, axis=1).min()
     cables = goal.slots[0] - goal.position[0] - arms
     if model == "massless":
-        size = np.linalg.norm(pull, axis=1, keepdims=True)
-        np.testing.assert_allclose(cables, (system.cable_length[:, None] + size / 1e5) * pull / size, atol=1e-9)
+        size = np.linalg.norm(cable_force, axis=1, keepdims=True)
+        np.testing.assert_allclose(cables, (system.cable_length[:, None] + size / 1e5) * cable_force / size, atol=1e-9)
     else:
         np.testing.assert_allclose(np.linalg.norm(cables, axis=1), system.cable_length, rtol=1e-3)
 
@@ -158,14 +167,14 @@ def test_one_or_two_cables_cannot_hold_a_tilted_box(num_drones):
     assert held == [False]
 
 
-def energy(moved, system, goal, pull, stiffness) -> float:
+def energy(moved, system, goal, cable_force, stiffness) -> float:
     """Return the potential energy [J] of payload, cables and drones on springs, moved (6 + 3 N) from their goal."""
     angle = float(np.linalg.norm(moved[3:6]))
     turn = np.reshape(axis_angle(floats(moved[3:6] / (angle or 1.0)), angle), (3, 3))
     arms, drones = system.anchors @ goal.rotation[0].T, moved[6:].reshape(-1, 3)
     cables = goal.slots[0] + drones - (goal.position[0] + moved[:3] + arms @ turn.T)
     stretch = np.linalg.norm(cables, axis=1) - system.cable_length
-    spring = 0.5 * stiffness @ (drones**2).sum(axis=1) - (pull * drones).sum()
+    spring = 0.5 * stiffness @ (drones**2).sum(axis=1) - (cable_force * drones).sum()
     return float(9.81 * system.payload_mass * moved[2] + 0.5 * 1e3 * (stretch**2).sum() + spring)
 
 
@@ -178,10 +187,10 @@ def test_a_payload_settles_where_its_potential_energy_is_convex():
             stiffness, size, step = np.array([soft, 2 * soft, soft]), 6 + 9, 1e-4
             moves = step * np.eye(size)
             corners = np.array([[
-                sum(p * q * energy(p * moves[i] + q * moves[j], system, goal, goal.pull[0], stiffness)
+                sum(p * q * energy(p * moves[i] + q * moves[j], system, goal, goal.cable_force[0], stiffness)
                     for p in (1, -1) for q in (1, -1))
                 for j in range(size)] for i in range(size)])  # fmt: skip
             least = np.linalg.eigvalsh(corners / (4 * step**2)).min()
-            found.append(settles(0, goal, make_rig(system), hanging, stiffness))
+            found.append(is_stable(0, goal, make_rig(system), hanging, stiffness))
             assert found[-1] == (least > 0), (soft, roll, pitch, least)
     assert 0 < sum(found) < len(found)

@@ -12,9 +12,9 @@ import numpy as np
 from multilift_marl.math3d import mat_to_quat
 from multilift_marl.rendering.cameras import Camera
 from multilift_marl.rendering.colours import tension_colours
-from multilift_marl.rendering.decor import Trail, add_box, add_lines, dashes
-from multilift_marl.sim.looks import DRONE_COLOURS, PAYLOAD_COLOUR
+from multilift_marl.rendering.overlays import Trail, add_box, add_lines, dashes
 from multilift_marl.sim.scene import build_model
+from multilift_marl.sim.visuals import DRONE_COLOURS, PAYLOAD_COLOUR
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -74,7 +74,7 @@ class Stage:
             self._trail.clear()
             self.camera.start(env)
         self._episode, self._time = episode, time
-        path = vec.task.route(env)
+        path = vec.task.target_path(env)
         self._pose(env)
         self.camera.aim(env, path)
         view = self.camera.view

@@ -8,8 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import Vehicle
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import Vehicle
 
 _GEOM = mujoco.mjtGeom
 VISUAL_GROUP = 2

@@ -9,7 +9,6 @@ import numpy as np
 from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.system import System
 from multilift_marl.math3d import (
     add,
     cross,
@@ -27,18 +26,19 @@ from multilift_marl.math3d import (
     sub,
     vec,
 )
+from multilift_marl.rig.system import System
+from multilift_marl.sim.hover import hook_position
 from multilift_marl.sim.inertia import Inertias, mobility, point_motion
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.scene import Layout
 from multilift_marl.sim.snatch import snatch_peak
-from multilift_marl.sim.standing import hook_place
 
 MAX_SPEED = 100.0  # [m/s] beyond this a simulation has diverged
 MAX_RATE = 500.0  # [rad/s]
 MAX_STRETCH = 0.2  # [-] of a cable's length
 
 
-class Places(NamedTuple):
+class StateLayout(NamedTuple):
     """Where things are, for reading and writing states."""
 
     timestep: float
@@ -62,9 +62,11 @@ class Places(NamedTuple):
     payload_nv: int
 
 
-def make_places(system: System, layout: Layout, parameters: Parameters, inertias: Inertias, batch: Batch) -> Places:
+def make_state_layout(
+    system: System, layout: Layout, parameters: Parameters, inertias: Inertias, batch: Batch
+) -> StateLayout:
     """Return the places of `system` with live `parameters` in the rows of a batch."""
-    return Places(
+    return StateLayout(
         timestep=system.timestep,
         anchors=np.ascontiguousarray(system.anchors),
         hooks=np.ascontiguousarray(system.hooks),
@@ -88,7 +90,7 @@ def field_offset(batch: Batch, name: str) -> int:
 
 
 @kernel
-def read_rows(rows, lo, hi, tension, state, record, diverged, c):
+def read_state(rows, lo, hi, tension, state, stats, diverged, c):
     """Read the physical state out of `batch.state` and mark environments that have diverged.
 
     A diverged environment keeps its last sound state.
@@ -111,7 +113,7 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
         for n in range(tension.shape[1]):
             if tension[e - lo, n] > 0.0 and state.cable_tension[e, n] == 0.0:
                 peak = _find_peak(e, n, line, tension[e - lo, n], state, c)
-                record.tension_peak[e] = max(record.tension_peak[e], peak)
+                stats.tension_peak[e] = max(stats.tension_peak[e], peak)
                 state.cable_broken[e, n] = state.cable_broken[e, n] or peak > c.breaking_load[n]
             for j in range(3):
                 state.drone_position[e, n, j] = line[at + j]
@@ -120,13 +122,12 @@ def read_rows(rows, lo, hi, tension, state, record, diverged, c):
             putmat(state.drone_rotation[e, n], quat_to_mat(line[at + 3], line[at + 4], line[at + 5], line[at + 6]))
             at += 7
             v += 6
-            pull = tension[e - lo, n]
-            state.cable_tension[e, n] = pull
-            slack = slack or pull <= 0.0
+            state.cable_tension[e, n] = tension[e - lo, n]
+            slack = slack or tension[e - lo, n] <= 0.0
         read_payload(e, line, state, c)
         if slack:
-            record.slack_time[e] += c.timestep
-    note_tensions(lo, hi, diverged, False, state, record, c)
+            stats.slack_time[e] += c.timestep
+    note_tensions(lo, hi, diverged, False, state, stats, c)
 
 
 @kernel
@@ -182,7 +183,7 @@ def read_payload(e, line, state, c):
 
 
 @kernel
-def note_tensions(lo, hi, chosen, which, state, record, c):
+def note_tensions(lo, hi, chosen, which, state, stats, c):
     """Note in record how large the tensions in state are, and which cables break, where `chosen` (E,) is `which`.
 
     One call for all: handing over a named tuple costs two atomic operations for each of its arrays.
@@ -191,13 +192,13 @@ def note_tensions(lo, hi, chosen, which, state, record, c):
         if chosen[e] != which:
             continue
         for n in range(c.breaking_load.shape[0]):
-            pull = state.cable_tension[e, n]
-            if pull > c.breaking_load[n]:
+            tension = state.cable_tension[e, n]
+            if tension > c.breaking_load[n]:
                 state.cable_broken[e, n] = True
-            record.tension_min[e] = min(record.tension_min[e], pull)
-            record.tension_max[e] = max(record.tension_max[e], pull)
-            record.tension_peak[e] = max(record.tension_peak[e], pull)
-            record.stretch_max[e] = max(record.stretch_max[e], pull / (c.cable_stiffness[e, n] * c.cable_length[e, n]))
+            stats.tension_min[e] = min(stats.tension_min[e], tension)
+            stats.tension_max[e] = max(stats.tension_max[e], tension)
+            stats.tension_peak[e] = max(stats.tension_peak[e], tension)
+            stats.stretch_max[e] = max(stats.stretch_max[e], tension / (c.cable_stiffness[e, n] * c.cable_length[e, n]))
 
 
 @kernel
@@ -222,13 +223,13 @@ def _sound(e, line, tension, c):
 
 
 @kernel
-def write_rows(rows, lo, hi, mask, state, record, c):
+def write_state(rows, lo, hi, mask, state, stats, c):
     """Write the state of the environments in `mask` into `batch.state`; tensions follow from the stretch."""
     for e in range(lo, hi):
         if not mask[e]:
             continue
         line = rows[e - lo]
-        clear_record(e, record)
+        clear_record(e, stats)
         write_payload(e, line, state, c)
         attitude = matrow(state.payload_rotation, e)
         at, v = c.qpos + c.payload_nq, c.qvel + c.payload_nv
@@ -241,10 +242,10 @@ def write_rows(rows, lo, hi, mask, state, record, c):
             at += 7
             v += 6
             anchor = (c.anchors[n, 0], c.anchors[n, 1], c.anchors[n, 2])
-            cable = sub(hook_place(e, n, state, c.hooks), add(row(state.payload_position, e), mul(attitude, anchor)))
-            pull = c.cable_stiffness[e, n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[e, n])
-            state.cable_tension[e, n] = pull
-    note_tensions(lo, hi, mask, True, state, record, c)
+            cable = sub(hook_position(e, n, state, c.hooks), add(row(state.payload_position, e), mul(attitude, anchor)))
+            tension = c.cable_stiffness[e, n] * max(0.0, sqrt(dot(cable, cable)) - c.cable_length[e, n])
+            state.cable_tension[e, n] = tension
+    note_tensions(lo, hi, mask, True, state, stats, c)
 
 
 @kernel
@@ -260,8 +261,8 @@ def write_payload(e, line, state, c):
 
 
 @kernel
-def clear_record(e, record):
+def clear_record(e, stats):
     """Let the record of environment e start anew."""
-    record.energy[e], record.slack_time[e] = 0.0, 0.0
-    record.tension_min[e], record.tension_max[e], record.tension_peak[e] = 1e9, 0.0, 0.0
-    record.stretch_max[e] = 0.0
+    stats.energy[e], stats.slack_time[e] = 0.0, 0.0
+    stats.tension_min[e], stats.tension_max[e], stats.tension_peak[e] = 1e9, 0.0, 0.0
+    stats.stretch_max[e] = 0.0

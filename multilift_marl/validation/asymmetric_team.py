@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
-from multilift_marl.config.schema import Config
 from multilift_marl.control.formation import Goal, Reference, make_rig, place_formation, start_reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import control
@@ -57,7 +57,7 @@ class Team:
         state.payload_rotation[0], state.drone_rotation[0] = self.rotation[0], self.rotation[1:]
         state.payload_velocity[0], state.drone_velocity[0] = self.velocity[0], self.velocity[1:]
         state.payload_body_rates[0], state.drone_body_rates[0] = self.rates[0], self.rates[1:]
-        world.plant.wind[0], world.plant.payload_force[0] = self.wind, self.force
+        world.hidden_loads.wind[0], world.hidden_loads.payload_force[0] = self.wind, self.force
         world.load(np.ones(1, bool))
         return world
 
@@ -114,10 +114,10 @@ def about_z(angle: float) -> np.ndarray:
 def take_off(team: Team) -> tuple[World, Callable[[], None]]:
     """Return the team's simulation at its start, and `pilot` to its target; wind and force are hidden."""
     world = team.world
-    return world, pilot(team.config, world, team.target, team.yaw)
+    return world, controller(team.config, world, team.target, team.yaw)
 
 
-def pilot(config: Config, world: World, target: np.ndarray, yaw: float = 0.0) -> Callable[[], None]:
+def controller(config: Config, world: World, target: np.ndarray, yaw: float = 0.0) -> Callable[[], None]:
     """Return the call that writes the thrusts of one control step of the first environment.
 
     Args:
@@ -136,7 +136,7 @@ def pilot(config: Config, world: World, target: np.ndarray, yaw: float = 0.0) ->
     smoothing = option.reference_frequency, option.reference_speed, 1 / config.sim.control_hz
 
     def steer() -> None:
-        control(0, 1, world.state, reference, goal.pull, world.thrust, gains, *smoothing)
+        control(0, 1, world.state, reference, goal.cable_force, world.thrust, gains, *smoothing)
 
     return steer
 

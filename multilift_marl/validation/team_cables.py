@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from multilift_marl.config.schema import Config
-from multilift_marl.config.system import System
-from multilift_marl.config.vehicles import GRAVITY
+from multilift_marl.config.config import Config
+from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.world import World
+from multilift_marl.validation.asymmetric_team import controller
 from multilift_marl.validation.bodies import make_config
 from multilift_marl.validation.experiment import Curve, Plot, Result, Row, ms, order_row, relative
-from multilift_marl.validation.team import pilot
 
 _CLOSING = 2.0  # [m/s] at which drone and payload part
 _SLACK = 0.1  # [m] left when they start
@@ -137,7 +137,7 @@ def _settle(result: Result, name: str, config: Config, theory: np.ndarray, secon
     state.drone_position[0] -= [0, 0, 0.03]
     state.payload_position[0] += [0, 0, 0.02]
     world.load(np.ones(1, bool))
-    steer, error = pilot(config, world, target), []
+    steer, error = controller(config, world, target), []
     for _ in range(round(seconds / timestep)):
         steer()
         world.step(world.thrust)

@@ -33,7 +33,7 @@ def possible_modes(render_mode: str | None) -> list[str]:
     return [mode for mode in RENDER_MODES if mode != "human" or windows or mode == render_mode]
 
 
-class Pictures:
+class FrameRenderer:
     """Draws environments of `vec`, if `render_mode` asks for it; nothing is opened before the first picture.
 
     Args:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.vehicles import GRAVITY
 from multilift_marl.control.formation import hook_arm, place_formation
 from multilift_marl.math3d import (
     add,
@@ -26,17 +25,18 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables import cable_end
 
-WIDER = 1.8  # [-] at tilted targets, see `place_balanced`
-LEAST = 0.2  # of its given tension, with which every cable is to pull
+TILT_WIDENING = 1.8  # [-] at tilted targets, see `place_balanced`
+MIN_TENSION_RATIO = 0.2  # of its given tension, with which every cable is to pull
 BALANCED = 1e-6  # [N] and [N m] for each N of weight: balance to within rounding
 _DAMPING = 1e-9  # relative; makes moments that no pulls can exert harmless
 _ITERATIONS = 20
 _STILL = (0.0, 0.0, 0.0)
 
 
-class Spread(NamedTuple):
+class WrenchDistribution(NamedTuple):
     """How `spread` finds λ = A F + B M and μ = Bᵀ F + C M, all in the payload's frame."""
 
     a: tuple[float, ...]
@@ -45,7 +45,7 @@ class Spread(NamedTuple):
     c: tuple[float, ...]
 
 
-def make_spread(anchors: np.ndarray) -> Spread:
+def make_wrench_distribution(anchors: np.ndarray) -> WrenchDistribution:
     """Return how wrenches are spread over anchors (N, 3) [m].
 
     Where pulls cannot exert one, what is left is least, moments over a lever counted as forces are.
@@ -56,7 +56,7 @@ def make_spread(anchors: np.ndarray) -> Spread:
     exerted = np.vstack([np.tile(np.eye(3), len(anchors)), arms.transpose(0, 2, 1).reshape(3, -1)])
     inverse = np.linalg.pinv(exerted @ exerted.T, rcond=1e-9, hermitian=True)
     parts = inverse[:3, :3], inverse[:3, 3:] / lever, inverse[3:, 3:] / lever**2
-    return Spread(*(tuple(part.ravel().tolist()) for part in parts))
+    return WrenchDistribution(*(tuple(part.ravel().tolist()) for part in parts))
 
 
 @kernel
@@ -76,7 +76,7 @@ def spread(force, moment, attitude, by):
 
 
 @kernel
-def solve_pulls(force, moment, attitude, anchors, least, pull):
+def solve_cable_forces(force, moment, attitude, anchors, least, cable_force):
     """Replace the pulls (N, 3) by the nearest ones that exert a wrench, every cable pulling; return the imbalance.
 
     Pulls f_i minimise Σ |f_i - n_i|² subject to Σ f_i = F, Σ r_i × f_i = M and u_i · f_i ≥ t_i, with n_i the given
@@ -97,7 +97,7 @@ def solve_pulls(force, moment, attitude, anchors, least, pull):
     linear, angular = _STILL, _STILL
     imbalance, exact = np.inf, 1e-13 * max(_largest(force), 1.0)
     for _ in range(_ITERATIONS):
-        lacking, twisting, a, b, c = _balance(force, moment, attitude, anchors, least, pull, linear, angular)
+        lacking, twisting, a, b, c = _balance(force, moment, attitude, anchors, least, cable_force, linear, angular)
         left = max(_largest(lacking), _largest(twisting))
         stalled = abs(left - imbalance) < 0.01 * imbalance
         imbalance = left
@@ -110,10 +110,10 @@ def solve_pulls(force, moment, attitude, anchors, least, pull):
         change = mul(_inverse(schur, _DAMPING * (c[0] + c[4] + c[8])), sub(twisting, mul(through, lacking)))
         linear = add(linear, mul(inverse, sub(lacking, mul(b, change))))
         angular = add(angular, change)
-    for i in range(pull.shape[0]):
-        given = (pull[i, 0], pull[i, 1], pull[i, 2])
+    for i in range(cable_force.shape[0]):
+        given = (cable_force[i, 0], cable_force[i, 1], cable_force[i, 2])
         arm = mul(attitude, (anchors[i, 0], anchors[i, 1], anchors[i, 2]))
-        put(pull[i], _pull(given, arm, least, linear, angular)[0])
+        put(cable_force[i], _pull(given, arm, least, linear, angular)[0])
     return imbalance
 
 
@@ -130,11 +130,11 @@ def _pull(given, arm, least, linear, angular):
 
 
 @kernel
-def _balance(force, moment, attitude, anchors, least, pull, linear, angular):
+def _balance(force, moment, attitude, anchors, least, cable_force, linear, angular):
     """Return what is left of force and moment, and the blocks a, b, c of their derivative by λ and μ."""
     a = b = c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    for i in range(pull.shape[0]):
-        given = (pull[i, 0], pull[i, 1], pull[i, 2])
+    for i in range(cable_force.shape[0]):
+        given = (cable_force[i, 0], cable_force[i, 1], cable_force[i, 2])
         arm = mul(attitude, (anchors[i, 0], anchors[i, 1], anchors[i, 2]))
         own, bound = _pull(given, arm, least, linear, angular)
         force, moment = sub(force, own), sub(moment, cross(arm, own))
@@ -184,9 +184,9 @@ def _inverse(m, damping):
 
 
 @kernel
-def reach(n, pull, hanging):
+def drone_offset(n, cable_force, hanging):
     """Return where the drone is, from its anchor, that pulls the payload by `pull` [N] through cable n at rest [m]."""
-    middle = add(pull, (0.0, 0.0, 0.5 * hanging.weight[n]))
+    middle = add(cable_force, (0.0, 0.0, 0.5 * hanging.weight[n]))
     size = norm(middle)
     return cable_end(
         scale(1.0 / size, middle), size, hanging.length[n], hanging.stiffness[n], hanging.segments[n], hanging.weight[n]
@@ -201,10 +201,10 @@ def place_slots(e, goal, rig, hanging):
     """
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     for n in range(rig.anchors.shape[0]):
-        pull = vec(goal.pull, e, n)
-        anchor, held = add(position, mul(target, row(rig.anchors, n))), add(pull, (0.0, 0.0, hanging.weight[n]))
-        hook = add(anchor, reach(n, pull, hanging))
-        put(goal.pull[e, n], held)
+        cable_force = vec(goal.cable_force, e, n)
+        anchor, held = add(position, mul(target, row(rig.anchors, n))), add(cable_force, (0.0, 0.0, hanging.weight[n]))
+        hook = add(anchor, drone_offset(n, cable_force, hanging))
+        put(goal.cable_force[e, n], held)
         put(goal.slots[e, n], sub(hook, hook_arm(n, held, goal.drone_yaw[e], rig)))
 
 
@@ -221,17 +221,17 @@ def place_balanced(e, goal, rig, hanging):
     if target[8] > 1.0 - 1e-12 or not np.any(rig.anchors != 0.0):
         return True
     for n in range(rig.anchors.shape[0]):
-        pull = vec(goal.pull, e, n)
-        wide = 1.0 + WIDER * (1.0 - target[8])
-        put(goal.pull[e, n], (wide * pull[0], wide * pull[1], pull[2] - hanging.weight[n]))
+        cable_force = vec(goal.cable_force, e, n)
+        wide = 1.0 + TILT_WIDENING * (1.0 - target[8])
+        put(goal.cable_force[e, n], (wide * cable_force[0], wide * cable_force[1], cable_force[2] - hanging.weight[n]))
     weight = hanging.payload_mass * GRAVITY
-    left = solve_pulls((0.0, 0.0, weight), _STILL, target, rig.anchors, LEAST, goal.pull[e])
+    left = solve_cable_forces((0.0, 0.0, weight), _STILL, target, rig.anchors, MIN_TENSION_RATIO, goal.cable_force[e])
     place_slots(e, goal, rig, hanging)
     return left <= BALANCED * weight
 
 
 @kernel
-def settles(e, goal, rig, hanging, stiffness):
+def is_stable(e, goal, rig, hanging, stiffness):
     """Return whether the payload, pushed a little, would come back to a tilted goal, the drones held by springs.
 
     The potential energy of payload, cables and springs is to be convex there. Between its spring and the payload a
@@ -246,7 +246,7 @@ def settles(e, goal, rig, hanging, stiffness):
     a = b = c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for n in range(rig.anchors.shape[0]):
         r = mul(target, row(rig.anchors, n))
-        f = sub(vec(goal.pull, e, n), (0.0, 0.0, hanging.weight[n]))
+        f = sub(vec(goal.cable_force, e, n), (0.0, 0.0, hanging.weight[n]))
         size = norm(f)
         u, soft = scale(1.0 / size, f), 1.0 / stiffness[n]
         across = 1.0 / (hanging.length[n] / size + soft)

@@ -9,8 +9,8 @@ from conftest import make, zeros
 
 from multilift_marl.rendering import Stage
 from multilift_marl.rendering.colours import DOUBLE, RESTING, SLACK, from_oklab, tension_colours, to_oklab
-from multilift_marl.rendering.decor import dashes
-from multilift_marl.sim.looks import DRONE_COLOURS
+from multilift_marl.rendering.overlays import dashes
+from multilift_marl.sim.visuals import DRONE_COLOURS
 from multilift_marl.tasks.base import Box
 from multilift_marl.tasks.paths import own_time
 
@@ -137,8 +137,8 @@ def test_the_path_of_a_track_is_dashed_through_its_targets():
         if step % 30 == 0:
             assert np.linalg.norm(lines - vec.task.goal.position[0], axis=1).min() < 0.25
         vec.step(zeros(vec))
-    route = vec.task.route(0)
-    assert np.linalg.norm(lines[:, None] - route[None], axis=2).min(axis=1).max() < 0.1
+    target_path = vec.task.target_path(0)
+    assert np.linalg.norm(lines[:, None] - target_path[None], axis=2).min(axis=1).max() < 0.1
 
 
 @pytest.mark.parametrize("path, closes", [("circle", True), ("figure8", True), ("lemniscate", True), ("random", False)])
@@ -146,12 +146,12 @@ def test_a_path_that_repeats_is_drawn_once(path, closes):
     options = {"task_options.path": path, "task_options.acceleration": 2.0, "task_options.rate": 0.8}
     vec = make("track", num_envs=1, **options)
     vec.reset(seed=0)
-    route = vec.task.route(0)
+    target_path = vec.task.target_path(0)
     if closes:  # more than a round is flown
         assert vec.task.path.rate[0] * own_time(vec.config.env.episode_seconds) > 2.2 * np.pi
-    assert (np.linalg.norm(route[-1] - route[0]) < 1e-6 * np.ptp(route, axis=0).max()) == closes
+    assert (np.linalg.norm(target_path[-1] - target_path[0]) < 1e-6 * np.ptp(target_path, axis=0).max()) == closes
     if path == "circle":
-        assert np.linalg.norm(np.diff(route, axis=0), axis=1).sum() == pytest.approx(10 * np.pi, rel=1e-3)
+        assert np.linalg.norm(np.diff(target_path, axis=0), axis=1).sum() == pytest.approx(10 * np.pi, rel=1e-3)
 
 
 def test_dashes_are_as_long_as_their_gaps():
@@ -204,8 +204,8 @@ def test_the_camera_above_a_track_sees_all_of_its_path():
     vec = make("track", num_envs=1, **{"task_options.path": "circle"})
     vec.reset(seed=1)
     stage = shown(vec, camera="top")
-    camera, route = stage.scene.camera[0], vec.task.route(0)
-    away = route - camera.pos
+    camera, target_path = stage.scene.camera[0], vec.task.target_path(0)
+    away = target_path - camera.pos
     depth = away @ camera.forward
     up = (away @ camera.up) / depth / (camera.frustum_top / camera.frustum_near)
     right = (away @ np.cross(camera.forward, camera.up)) / depth / (camera.frustum_top / camera.frustum_near) / (16 / 9)

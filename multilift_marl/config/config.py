@@ -1,0 +1,30 @@
+"""The whole configuration: every parameter once. YAML files and overrides only change values."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
+
+from multilift_marl.config.files import pin_files
+from multilift_marl.config.schema import EvalConfig, SystemConfig, TrainConfig
+from multilift_marl.config.values import Between, Float
+from multilift_marl.rig.resolve import resolve_system
+from multilift_marl.rig.system import System
+
+
+class Config(SystemConfig):
+    """What is simulated, and what a task and its training make of it."""
+
+    reward: dict[str, Annotated[Float, Between(-1e6, 1e6)]] = Field(
+        {}, description="weights of the task's reward terms"
+    )
+    task_options: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field({}, description="options of the task")
+    train: TrainConfig = TrainConfig()
+    eval: EvalConfig = EvalConfig()
+
+    @cached_property
+    def system(self) -> System:
+        """The physical system that this configuration describes; a ConfigError if it cannot be or cannot fly."""
+        return resolve_system(self)

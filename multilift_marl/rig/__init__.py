@@ -1,0 +1,1 @@
+"""The rig in numbers: vehicles, payload, cables and formation, from a configuration."""
