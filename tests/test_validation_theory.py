@@ -7,7 +7,7 @@ import pytest
 
 from multilift_marl.config.load import load_config
 from multilift_marl.sim.air import AIR_DENSITY
-from multilift_marl.validation import symmetry, teams, trajectory
+from multilift_marl.validation import symmetry, team_cables, trajectory
 from multilift_marl.validation.asymmetric_team import make_team
 from multilift_marl.validation.bodies import make_config
 from multilift_marl.validation.cables import second_order
@@ -37,7 +37,7 @@ def test_bounce_solves_its_equation():
     while k * x + c * v > 0:
         middle = x + 0.5 * h * v, v - 0.5 * h * (k * x + c * v) / mass
         x, v = x + h * middle[1], v - h * (k * middle[0] + c * middle[1]) / mass
-    assert teams.bounce(system, 2.0) == pytest.approx(v, rel=1e-4)
+    assert team_cables.bounce(system, 2.0) == pytest.approx(v, rel=1e-4)
 
 
 def test_load_path_is_smooth_and_consistent(system):
