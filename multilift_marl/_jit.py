@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+import hashlib
+import linecache
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypeVar, TypeVarTuple, cast
 
-from numba import config, njit, typeof
+from numba import config, int64, njit, typeof
 
-from multilift_marl._kernel_cache import make_cache
+from multilift_marl._kernel_cache import make_cache, sources_digest
 
 _UNCOMPILED: bool = config.DISABLE_JIT  # type: ignore[attr-defined]
 F = TypeVar("F", bound=Callable[..., Any])
@@ -20,10 +22,45 @@ def kernel(function: F) -> F:
 
     Arithmetic is exact IEEE, so results do not depend on how many environments are computed together.
     """
-    dispatcher: Any = njit(nogil=True, error_model="numpy")(function)
+    return _compile(function)
+
+
+def inlined(function: F) -> F:
+    """Do as `kernel`, and merge the function into those that call it.
+
+    A call that is not merged counts references to every array that it is given, those of named tuples too.
+    """
+    return _compile(function, inline="always")
+
+
+def _compile(function: F, **options: Any) -> F:
+    dispatcher: Any = njit(nogil=True, error_model="numpy", **options)(function)
     if not _UNCOMPILED:  # else it is the function itself
         dispatcher._cache = make_cache(function)
     return cast(F, dispatcher)
+
+
+def compose(name: str, source: str, functions: Mapping[str, Any]) -> Callable[..., Any]:
+    """Compile the function `name` that `source` defines and that calls `functions` by their names.
+
+    Numba resolves functions by name when it compiles, so a loop over the entries of a table is written out.
+
+    Args:
+        name: of the function.
+        source: its definition.
+        functions: what it calls, by the names in `source`: kernels, or constants.
+    """
+    file = f"<{name} {hashlib.sha256(source.encode()).hexdigest()[:12]}>"
+    scope: dict[str, Any] = dict(functions)
+    exec(compile(source, file, "exec"), scope)
+    linecache.cache[file] = len(source), None, source.splitlines(keepends=True), file  # for tracebacks
+    function = scope[name]
+    function.__module__ = __name__
+    modules = sorted({getattr(each, "__module__", "") for each in functions.values()})
+    digests = [sources_digest(module) for module in modules if module.startswith("multilift_marl.")]
+    named = [f"{key} {getattr(each, '__module__', '')}.{each.__qualname__}" for key, each in sorted(functions.items())]
+    function._sources = "\0".join([source, *digests, *named])  # read by the cache
+    return _compile(function)
 
 
 def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Callable[[], None]:
@@ -32,9 +69,30 @@ def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Ca
     That look-up costs more than many kernels do: a named tuple of ten arrays takes about 2 µs. The arrays must stay the
     same objects in memory; what is in them may change.
     """
-    if _UNCOMPILED:
-        return functools.partial(function, *arguments)  # type: ignore[return-value]
-    types = tuple(typeof(argument) for argument in arguments)
-    compiled: Any = function  # Numba's dispatcher
-    compiled.compile(types)
-    return functools.partial(compiled.overloads[types].entry_point, *arguments)
+    call = partial(function, *arguments)
+    if not _UNCOMPILED:
+        types = tuple(typeof(argument) for argument in arguments)
+        compiled: Any = function  # Numba's dispatcher
+        compiled.compile(types)
+        call = partial(compiled.overloads[types].entry_point, *arguments)
+    call.__name__ = function.__name__  # type: ignore[attr-defined]
+    return call  # type: ignore[return-value]
+
+
+def kernel_name(call: Callable[[], None]) -> str:
+    """Return the name of the kernel of a call that `bind` returned, in words."""
+    return str(getattr(call, "__name__", "")).replace("_", " ")
+
+
+def prebind(function: Callable[..., object], *arguments: Any) -> Callable[[int, int], None]:
+    """Do as `bind` for a kernel whose first two arguments, the environments `lo` to `hi`, are still to be given."""
+    if not _UNCOMPILED:
+        types = (int64, int64, *(typeof(argument) for argument in arguments))
+        compiled: Any = function
+        compiled.compile(types)
+        function = compiled.overloads[types].entry_point
+
+    def call(lo: int, hi: int) -> None:
+        function(lo, hi, *arguments)
+
+    return call

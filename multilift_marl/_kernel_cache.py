@@ -179,7 +179,8 @@ class KernelCache(NumbaCache):
     def _path(self, key: Any) -> Path:
         """Return the file of a signature: kernel, types, processor and Python in its name."""
         code = self._function.__code__
-        parts = (repr(key), repr(_fields(key[0])), sys.version, foreign_digest(self._function))
+        written = getattr(self._function, "_sources", "")  # see `_jit.compose`
+        parts = (repr(key), repr(_fields(key[0])), sys.version, foreign_digest(self._function), written)
         digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
         name = "".join(c if c.isalnum() else "_" for c in self._function.__qualname__)[-40:]
         return self._folder / f"{name}-{code.co_firstlineno}-{digest}.kernel"

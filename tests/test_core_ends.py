@@ -155,7 +155,7 @@ def test_each_failure_has_its_cause(happen, cause):
     vec.reset(seed=0)
     level(vec)
     happen(vec.world.state)
-    vec.task.check(0, 1, 0.0)
+    vec.task.stages["measure"](0, 1)
     assert vec.failure_causes[vec.task.cause[0]] == cause
 
 

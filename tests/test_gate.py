@@ -34,13 +34,13 @@ def run(vec, seconds: float):
 @pytest.mark.parametrize("gates", [1, 2])
 def test_the_target_flies_straight_through_every_gap(gates):
     vec = reset(gates=gates, gap_width=4.0, gap_height=10.0)
-    middles = vec.task.gap_y.copy()
+    middles = vec.task.own.gap_y.copy()
     path, causes = run(vec, 12.0)
     assert not causes
     np.testing.assert_allclose(path[0], np.tile([-2, 0, 1.3], (4, 1)), atol=1e-9)
     np.testing.assert_allclose(path[-1], np.tile([2, 0, 1.3], (4, 1)), atol=1e-9)
     for e in range(4):
-        for x, y in zip(vec.task.gates.x, middles[e], strict=True):
+        for x, y in zip(vec.task.settings.x, middles[e], strict=True):
             inside = np.abs(path[:, e, 0] - x) < 0.2
             assert inside.sum() > 5
             np.testing.assert_allclose(path[inside, e, 1], y, atol=1e-9)
@@ -67,7 +67,7 @@ def test_a_wide_gap_lets_the_formation_pass_and_succeed():
         _, _, terminated, _, info = vec.step(zeros(vec))
         assert not terminated.any()
     assert info["success"].all()
-    assert (1 < vec.task.peak_tension).all() and (vec.task.peak_tension < 1.5).all()
+    assert (1 < vec.task.own.peak_tension).all() and (vec.task.own.peak_tension < 1.5).all()
 
 
 @pytest.mark.parametrize(
@@ -87,11 +87,11 @@ def test_success_asks_for_rest_in_the_target_attitude(field, value, option):
         state.payload_rotation[0] = task.goal.rotation[0] = np.eye(3)
         if given is not None:
             getattr(state, field)[0] = given
-        task.planner(0, 1)()
+        task.stages["plan"](0, 1)
         task.time[0], task.goal.position[0] = 14.0, state.payload_position[0]
         task.goal.rotation[0] = np.eye(3)
-        task.check(0, 1, 0.0)
-        score = task.reward(0, 1, vec._action, vec._action)
+        task.stages["measure"](0, 1)
+        score = partial(task.stages["reward"], 0, 1)
         for _ in range(51):
             score()
         assert task.succeeded()[0] == (given is None or bool(options))
@@ -102,29 +102,29 @@ def test_success_asks_for_rest_in_the_target_attitude(field, value, option):
     [((0.0, 0.0, 2.0), False), ((0.0, 0.44, 2.0), True), ((0.2, 0.44, 2.0), False), ((0.0, 0.0, 2.99), True)],
 )
 def test_a_drone_touches_beside_and_above_the_gap_alone(drone, touches):
-    from multilift_marl.tasks.gate import _least_room
+    from multilift_marl.tasks.gate import least_room
 
     vec = reset(num_envs=1)
     state, task = vec.world.state, vec.task
-    task.gap_y[0] = 0.0
+    task.own.gap_y[0] = 0.0
     state.payload_position[0], state.payload_rotation[0] = [drone[0], 0, 1.3], np.eye(3)
     state.drone_position[0] = [[x, 0.0, 2.0] for x in (0.8, -0.8, 1.2, -1.2)]
     state.drone_rotation[0] = np.eye(3)
     state.drone_position[0, 0] = drone
     state.payload_position[0, 0] = 1.0  # the load is past the wall
     state.drone_position[0, 1:, 0] = [0.8, 1.0, 1.2]
-    room = _least_room(0, state, task.gates, task.bodies)
+    room = least_room(0, task.view)
     assert (room < 0) == touches
 
 
 def test_a_cable_touches_too():
     from multilift_marl.tasks.gate import _cable_room
 
-    gates = reset(num_envs=1).task.gates
-    gates.y[0] = 0.0
-    assert _cable_room(0, 0, (-0.5, 0.0, 1.3), (0.5, 0.9, 2.0), gates) > 0  # crosses at y = 0.45
-    assert _cable_room(0, 0, (-0.5, 0.2, 1.3), (0.5, 0.9, 2.0), gates) < 0
-    assert _cable_room(0, 0, (0.3, 2.0, 1.3), (0.5, 2.0, 2.0), gates) == 1
+    view = reset(num_envs=1).task.view
+    view.own.gap_y[0] = 0.0
+    assert _cable_room(0, 0, (-0.5, 0.0, 1.3), (0.5, 0.9, 2.0), view) > 0  # crosses at y = 0.45
+    assert _cable_room(0, 0, (-0.5, 0.2, 1.3), (0.5, 0.9, 2.0), view) < 0
+    assert _cable_room(0, 0, (0.3, 2.0, 1.3), (0.5, 2.0, 2.0), view) == 1
 
 
 def test_drones_are_told_the_gap_and_their_room():
@@ -135,12 +135,12 @@ def test_drones_are_told_the_gap_and_their_room():
     for e in range(4):
         for n in range(4):
             c, s = task.goal.slot_frame[e, n]
-            away = state.drone_position[e, n] - [0.0, task.gap_y[e, 0], 1.3]
+            away = state.drone_position[e, n] - [0.0, task.own.gap_y[e, 0], 1.3]
             expected = [c * away[0] + s * away[1], c * away[1] - s * away[0]]
             np.testing.assert_allclose(observation[e, n, at : at + 2], expected, atol=1e-5)
-    half = task.bodies.drone[0]
+    half = task.settings.drone[0]
     reach = np.abs(state.drone_rotation.reshape(4, 4, 3, 3)[:, :, 1]) @ half
-    room = 0.5 - np.abs(state.drone_position[..., 1] - task.gap_y) - reach
+    room = 0.5 - np.abs(state.drone_position[..., 1] - task.own.gap_y) - reach
     np.testing.assert_allclose(observation[..., names.index("clearance_0")], room.clip(-0.5, 0.5), atol=1e-5)
     assert (room.min(axis=1) < -0.1).all()
 

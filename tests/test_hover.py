@@ -33,19 +33,19 @@ def test_hover_starts_are_as_documented():
 
 def hover_terms(displace) -> dict[str, float]:
     """Return the reward terms of a team at rest at its target after displace(state)."""
-    vec, still = make("hover", num_envs=1), np.zeros((1, 4, 4))
+    vec = make("hover", num_envs=1)
     vec.reset(seed=0)
     level(vec)
     displace(vec.world.state)
-    vec.task.check(0, 1, 0.0)
-    vec.task.reward(0, 1, still, still)()
+    vec.task.stages["measure"](0, 1)
+    vec.task.stages["reward"](0, 1)
     return dict(zip(vec.reward_terms, vec.task.terms[0], strict=True))
 
 
 def test_hover_pays_every_positive_weight_in_full_at_rest_at_the_goal():
     weights = make("hover", num_envs=1).task.REWARD
     paid = hover_terms(lambda state: None)
-    assert paid == pytest.approx({name: max(weight, 0.0) for name, weight in weights.items()})
+    assert paid == pytest.approx({name: max(term.weight, 0.0) for name, term in weights.items()})
 
 
 @pytest.mark.parametrize("distance, share", [(0.25, 0.5), (0.75, 0.1)])
@@ -112,7 +112,7 @@ def test_observations_do_not_depend_on_place_and_heading():
     for step in range(30):
         vec.step(0.5 * bold_actions(vec, step, hold=7))
     task, state, reference = vec.task, vec.world.state, vec.reference
-    before, hidden = vec._observation.copy(), vec._state.copy()
+    before, hidden = vec.task.observation.copy(), vec.task.critic.copy()
     turn, shift = np.reshape(rot_z(1.1), (3, 3)), np.array([5.0, -3.0, 0.0])
     for array in (task.goal.position, state.payload_position, state.drone_position, reference.position):
         array[:] = array @ turn.T + shift
@@ -124,7 +124,8 @@ def test_observations_do_not_depend_on_place_and_heading():
     for array in (task.goal.rotation, state.payload_rotation, state.drone_rotation):
         array[:] = turn @ array
     place_formation(0, task.goal, task.rig)
-    task.check(0, 1, 0.0)
-    task.observe(0, 1, vec._action, vec._observation, vec._state)
-    np.testing.assert_allclose(vec._observation, before, atol=2e-6)
-    np.testing.assert_allclose(vec._state, hidden, atol=2e-6)
+    task.stages["measure"](0, 1)
+    task.stages["observe state"](0, 1)
+    task.stages["observe"](0, 1)
+    np.testing.assert_allclose(vec.task.observation, before, atol=2e-6)
+    np.testing.assert_allclose(vec.task.critic, hidden, atol=2e-6)

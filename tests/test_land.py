@@ -24,8 +24,8 @@ def after(seconds: float, num_envs: int = 1, **overrides):
 
 def judge(vec) -> str:
     """Return the cause of failure of the first environment at the end of a step in its present state."""
-    for call in vec.task.after_step(0, 1, vec._action, vec._previous, vec._observation, vec._state):
-        call()
+    for stage in ("check", "reward"):
+        vec.task.stages[stage](0, 1)
     return vec.failure_causes[vec.task.cause[0]]
 
 
@@ -34,7 +34,7 @@ def touch_down(velocity, aside=(0.0, 0.0), height=0.004):
     vec = make("land", num_envs=1)
     vec.reset(seed=0)
     state, task = vec.world.state, vec.task
-    moved = task.course[0, :2] + aside, state.payload_position[0, 2] - 0.075 - height
+    moved = task.own.course[0, :2] + aside, state.payload_position[0, 2] - 0.075 - height
     for array in (state.payload_position[0], state.drone_position[0].T):
         array[0], array[1], array[2] = array[0] + moved[0][0], array[1] + moved[0][1], array[2] - moved[1]
     state.payload_velocity[0] = velocity
@@ -49,7 +49,7 @@ def test_land_starts_are_as_documented():
     vec.reset(seed=0)
     state, task, system = vec.world.state, vec.task, vec.world.system
     np.testing.assert_allclose(state.payload_position, np.broadcast_to([0, 0, 1.5], (2000, 3)))
-    assert np.abs(task.course[:, :2]).max() <= 1 and np.ptp(task.course[:, :2]) > 1.99
+    assert np.abs(task.own.course[:, :2]).max() <= 1 and np.ptp(task.own.course[:, :2]) > 1.99
     assert np.degrees(np.abs(task.goal.yaw).max()) <= 45 and np.degrees(np.ptp(task.goal.yaw)) > 89
     assert (state.payload_velocity == 0).all() and task.errors.angle.max() < 1e-7
     expected = system.resting_tension * (vec.world.hidden_loads.payload_mass / system.payload_mass)[:, None]
@@ -75,7 +75,7 @@ def test_a_payload_comes_down_softly_on_its_pad_or_fails(velocity, aside, height
     vec = touch_down(velocity, aside, height)
     vec.task.goal.position[0] = vec.world.state.payload_position[0]
     assert judge(vec) == cause
-    assert vec.task.touch[0] == touch
+    assert vec.task.own.touch[0] == touch
 
 
 def test_a_payload_that_has_bounced_after_a_hard_touch_down_has_still_failed():
@@ -88,13 +88,13 @@ def test_a_payload_that_has_bounced_after_a_hard_touch_down_has_still_failed():
 
 def test_the_speed_a_control_step_before_the_touch_counts_too():
     vec = touch_down([0, 0, -0.1])
-    vec.task.speed[0] = 0.31
+    vec.task.own.speed[0] = 0.31
     assert judge(vec) == "ground"
 
 
 def test_drones_may_never_touch_the_ground():
     vec = after(LOWER[0])
-    assert vec.task.touch[0] == LANDED and judge(vec) == "none"
+    assert vec.task.own.touch[0] == LANDED and judge(vec) == "none"
     vec.world.state.drone_position[0, 2, 2] = 0.03
     assert judge(vec) == "ground"
 
@@ -104,7 +104,7 @@ def test_drones_may_never_touch_the_ground():
 
 def test_the_team_lets_go_without_moving_the_payload():
     vec = after(RELEASE[0] + 0.2, 8, **CALM)
-    assert (vec.task.touch == LANDED).all()
+    assert (vec.task.own.touch == LANDED).all()
     before = vec.world.state.payload_position.copy()
     for _ in range(round(5.0 / 0.02)):
         vec.step(zeros(vec))

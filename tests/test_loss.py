@@ -1,5 +1,7 @@
 """Task loss: who is lost and when, what that does, and what the others are told."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from conftest import GRAVITY, make, refusal, zeros
@@ -21,21 +23,21 @@ def fly_past_the_loss(config: str = "loss", seconds: float = 5.0, **keywords):
 def test_the_drawn_drone_is_lost_at_the_drawn_time():
     vec = make("loss", num_envs=64)
     vec.reset(seed=0)
-    assert vec.task.when.min() >= 2 and vec.task.when.max() <= 4 and np.ptp(vec.task.when) > 1.5
-    assert set(vec.task.who) == {0, 1, 2, 3}
+    assert vec.task.own.when.min() >= 2 and vec.task.own.when.max() <= 4 and np.ptp(vec.task.own.when) > 1.5
+    assert set(vec.task.own.who) == {0, 1, 2, 3}
     for step in range(1, 211):
         vec.step(zeros(vec))
-        gone = vec.task.watch.lost.any(axis=1)
-        assert (gone == (vec.task.when <= 0.02 * step + 1e-9)).all()
-    assert (vec.task.watch.lost == vec.world.hidden_loads.motors_off).all()
-    assert (vec.task.watch.lost.argmax(axis=1) == vec.task.who).all() and gone.all()
+        gone = vec.task.mask.lost.any(axis=1)
+        assert (gone == (vec.task.own.when <= 0.02 * step + 1e-9)).all()
+    assert (vec.task.mask.lost == vec.world.hidden_loads.motors_off).all()
+    assert (vec.task.mask.lost.argmax(axis=1) == vec.task.own.who).all() and gone.all()
 
 
 @pytest.mark.parametrize("num_drones", [4, 6])
 def test_motors_stop_and_the_drone_hangs_on_its_cable(num_drones):
     vec, _ = fly_past_the_loss(num_drones=num_drones, seconds=9.0)
     state, world = vec.world.state, vec.world
-    for e, n in enumerate(vec.task.who):
+    for e, n in enumerate(vec.task.own.who):
         assert world.state.rotor_speed[e, n].max() < 1e-6
         assert state.drone_position[e, n, 2] < state.payload_position[e, 2]
         assert state.cable_tension[e, n] == pytest.approx(world.system.vehicle.mass * GRAVITY, rel=0.3)
@@ -46,13 +48,11 @@ def test_motors_stop_and_the_drone_hangs_on_its_cable(num_drones):
 def test_with_a_snapped_cable_the_drone_is_gone():
     vec, _ = fly_past_the_loss("loss_snap")
     state = vec.world.state
-    for e, n in enumerate(vec.task.who):
+    for e, n in enumerate(vec.task.own.who):
         assert state.cable_broken[e].tolist() == [i == n for i in range(4)]
         assert state.cable_tension[e, n] == 0 and state.drone_position[e, n, 2] < 0.5
     vec.reset()
-    assert (
-        not state.cable_broken.any() and not vec.world.hidden_loads.motors_off.any() and not vec.task.watch.lost.any()
-    )
+    assert not state.cable_broken.any() and not vec.world.hidden_loads.motors_off.any() and not vec.task.mask.lost.any()
     vec.step(zeros(vec))
     assert (state.cable_tension > 0).all()
 
@@ -63,7 +63,7 @@ def test_the_action_of_a_lost_drone_is_ignored():
     for step in range(25):
         action = zeros(vec)
         vec.step(action)
-        for e, n in enumerate(other.task.who):
+        for e, n in enumerate(other.task.own.who):
             action[e, n] = np.random.default_rng(step).uniform(-1, 1, 4)
         other.step(action)
     assert (vec.world.state.payload_position == other.world.state.payload_position).all()
@@ -73,9 +73,9 @@ def test_drones_are_told_who_is_lost():
     vec, observation = fly_past_the_loss()
     names, azimuth = vec.observation_names, vec.task.rig.azimuth
     lost, team = (observation[..., names.index(f"{name}_0")] for name in ("lost", "team_lost"))
-    assert (lost == vec.task.watch.lost).all() and (team == 1).all()
+    assert (lost == vec.task.mask.lost).all() and (team == 1).all()
     at = names.index("lost_direction_0")
-    for e, n in enumerate(vec.task.who):
+    for e, n in enumerate(vec.task.own.who):
         expected = np.stack([np.cos(azimuth[n] - azimuth), np.sin(azimuth[n] - azimuth)], axis=1)
         np.testing.assert_allclose(observation[e, :, at : at + 2], expected, atol=1e-6)
     observation, _ = vec.reset()
@@ -92,12 +92,12 @@ def judge_held(degrees=0.0, speed=0.0, body_rate=0.0, tension=1.0, **options):
     state.payload_rotation[0], task.goal.rotation[0] = turned, np.eye(3)
     state.payload_velocity[0], state.payload_body_rates[0] = [speed, 0, 0], [0, body_rate, 0]
     state.cable_tension[0] = tension * vec.world.system.resting_tension
-    task.check(0, 1, 0.0)
-    task.planner(0, 1)()
-    score = task.reward(0, 1, vec._action, vec._action)
+    task.stages["measure"](0, 1)
+    task.stages["plan"](0, 1)
+    score = partial(task.stages["reward"], 0, 1)
     for _ in range(101):
         score()
-    task.watch.lost[0, 0] = True
+    task.mask.lost[0, 0] = True
     return bool(task.succeeded()[0])
 
 
@@ -120,15 +120,15 @@ def test_success_asks_for(held, option):
 def test_the_snatch_of_the_lost_drone_itself_does_not_count():
     vec, _ = fly_past_the_loss()
     resting = vec.world.system.resting_tension
-    vec.world.state.cable_tension[np.arange(4), vec.task.who] = 1e6
-    before = vec.task.peak_tension.copy()
-    vec.task.planner(0, 4)()
-    assert (vec.task.peak_tension == before).all() and (before > 2).all()
+    vec.world.state.cable_tension[np.arange(4), vec.task.own.who] = 1e6
+    before = vec.task.own.peak_tension.copy()
+    vec.task.stages["plan"](0, 4)
+    assert (vec.task.own.peak_tension == before).all() and (before > 2).all()
     vec.world.state.cable_tension[:, :] = 500 * resting
-    vec.task.planner(0, 4)()
-    np.testing.assert_allclose(vec.task.peak_tension, 500)
+    vec.task.stages["plan"](0, 4)
+    np.testing.assert_allclose(vec.task.own.peak_tension, 500)
     vec.reset()
-    assert not vec.task.peak_tension.any()
+    assert not vec.task.own.peak_tension.any()
 
 
 def test_one_drone_cannot_lose_itself():

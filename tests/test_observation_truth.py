@@ -152,7 +152,7 @@ def eased(m: Moment, begin: float, end: float) -> float:
 def gate(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
     """See docs/gate.md: one wall at x = 0, its gap 1 m wide; the drone's box must pass between the edges."""
     task, state = m.vec.task, m.state
-    middle = np.stack([np.zeros(len(task.gap_y)), task.gap_y[:, 0], np.zeros(len(task.gap_y))], axis=1)
+    middle = np.stack([np.zeros(len(task.own.gap_y)), task.own.gap_y[:, 0], np.zeros(len(task.own.gap_y))], axis=1)
     away = (state["drone_position"] - middle[:, None]) * [1, 1, 0]
     half = np.abs(state["drone_rotation"][..., 1, :]) @ task.limits.drone_half[0]  # how far the box reaches along y
     room = 0.5 - np.abs(away[..., 1]) - half
@@ -176,7 +176,7 @@ def loss(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
     """See docs/loss.md: drones give way for 0.9 s; from 1 s on they move to where they hold the payload."""
     lost, who = m.lost.any(axis=1), m.lost.argmax(axis=1)
     between = m.azimuth[who][:, None] - m.azimuth
-    since = (m.seconds - m.vec.task.when)[:, None, None]
+    since = (m.seconds - m.vec.task.own.when)[:, None, None]
     down = np.stack([0 * between + 0.2, 0 * between, -0.2 - 0.5 * np.cos(between)], axis=-1)
     share = np.clip((since - 1) / 3, 0, 1)
     config, system = m.vec.config.control, m.vec.world.system

@@ -148,7 +148,7 @@ def test_a_path_that_repeats_is_drawn_once(path, closes):
     vec.reset(seed=0)
     target_path = vec.task.target_path(0)
     if closes:  # more than a round is flown
-        assert vec.task.path.rate[0] * own_time(vec.config.env.episode_seconds) > 2.2 * np.pi
+        assert vec.task.own.path.rate[0] * own_time(vec.config.env.episode_seconds) > 2.2 * np.pi
     assert (np.linalg.norm(target_path[-1] - target_path[0]) < 1e-6 * np.ptp(target_path, axis=0).max()) == closes
     if path == "circle":
         assert np.linalg.norm(np.diff(target_path, axis=0), axis=1).sum() == pytest.approx(10 * np.pi, rel=1e-3)
@@ -182,7 +182,7 @@ def test_the_walls_of_gates_are_scenery():
         drawn = [geom for geom in extra(shown(vec, env)) if geom.type == mujoco.mjtGeom.mjGEOM_BOX]
         assert len(boxes) == len(drawn) == 6
         openings = {box.position[0] for box in boxes}
-        assert openings == set(vec.task.gates.x)
+        assert openings == set(vec.task.settings.x)
 
 
 def test_chase_looks_along_the_flight_and_stays_when_the_team_does():

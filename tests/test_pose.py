@@ -32,7 +32,7 @@ def flown(vec, steps, script="formation"):
 def test_targets_are_drawn_from_the_documented_ranges():
     vec = make("pose", num_envs=1000)
     vec.reset(seed=0)
-    pose = vec.task.plan.pose
+    pose = vec.task.own.plan.pose
     assert pose.shape == (1000, 4, 6)
     assert np.abs(pose[..., :2]).max() <= 1 and pose[..., 2].min() >= 1 and pose[..., 2].max() <= 2
     tilt = np.degrees(pose[:, 1:, 4:])
@@ -41,7 +41,7 @@ def test_targets_are_drawn_from_the_documented_ranges():
     np.testing.assert_allclose(tilt.std(), 45 / np.sqrt(3), rtol=0.03)
     easy = make("pose_easy", num_envs=200)
     easy.reset(seed=0)
-    assert 19 < np.degrees(np.abs(easy.task.plan.pose[..., 4:])).max() <= 20
+    assert 19 < np.degrees(np.abs(easy.task.own.plan.pose[..., 4:])).max() <= 20
 
 
 def test_the_attitude_has_the_heading_and_tilt_that_were_drawn():
@@ -59,10 +59,10 @@ def test_a_new_target_comes_every_four_seconds_and_is_not_seen_before():
     for step, _ in flown(vec, 450):
         target = vec.task.goal.position.copy()
         stage = step // 200  # the steps up to and at 4.00 s belong to the first
-        np.testing.assert_allclose(target, vec.task.plan.pose[:, 1 + stage, :3], atol=1e-12)
-        seen.append(vec._observation.copy())
+        np.testing.assert_allclose(target, vec.task.own.plan.pose[:, 1 + stage, :3], atol=1e-12)
+        seen.append(vec.task.observation.copy())
     other.reset(seed=0)
-    other.task.plan.pose[:, 2:, :5] += 0.1
+    other.task.own.plan.pose[:, 2:, :5] += 0.1
     for step in range(200):
         other.step(zeros(other))
         assert same(other._observation, seen[step])
@@ -74,11 +74,11 @@ def test_the_payload_settles_at_every_target():
     vec = ml.make_vec("pose_falcon3", num_envs=300, num_threads=1)
     vec.reset(seed=5)
     task, gains = vec.task, make_gains(vec.config.control, vec.world.system)
-    np.testing.assert_allclose(task._bounds.stiffness, 0.5 * gains.mass * gains.k_p)
+    np.testing.assert_allclose(task.settings.bounds.stiffness, 0.5 * gains.mass * gains.k_p)
     for stage in (1, 2, 3):
         for e in range(300):
-            set_goal_from_plan(e, stage, task.plan, task.goal, task.rig, task.nominal_hanging)
-            assert is_stable(e, task.goal, task.rig, task.nominal_hanging, task._bounds.stiffness)
+            set_goal_from_plan(e, stage, task.own.plan, task.goal, task.rig, task.nominal_hanging)
+            assert is_stable(e, task.goal, task.rig, task.nominal_hanging, task.settings.bounds.stiffness)
     assert not all(is_stable(e, task.goal, task.rig, task.nominal_hanging, np.full(3, 0.5)) for e in range(300))
 
 
@@ -109,15 +109,15 @@ def test_the_best_script_solves_nine_of_ten_easy_episodes():
 
 
 def test_pose_pays_every_positive_weight_in_full_at_rest_at_the_goal():
-    vec, still = make("pose", num_envs=1), np.zeros((1, 4, 4))
+    vec = make("pose", num_envs=1)
     vec.reset(seed=0)
     state, goal = vec.world.state, vec.task.goal
     state.payload_position[:], state.payload_rotation[:] = goal.position, goal.rotation
     state.payload_velocity[:], state.payload_body_rates[:] = 0, 0
-    vec.task.check(0, 1, 0.0)
-    vec.task.reward(0, 1, still, still)()
+    vec.task.stages["measure"](0, 1)
+    vec.task.stages["reward"](0, 1)
     paid = dict(zip(vec.reward_terms, vec.task.terms[0], strict=True))
-    assert paid == pytest.approx({name: max(weight, 0.0) for name, weight in vec.task.REWARD.items()})
+    assert paid == pytest.approx({name: max(term.weight, 0.0) for name, term in vec.task.REWARD.items()})
 
 
 def test_returns_rank_motors_off_holding_the_start_and_the_scripts():
@@ -164,18 +164,18 @@ def test_observations_tell_where_the_way_is_and_how_much_time_is_left():
     for name, (x, y, z) in (("position", (planned.position - goal.position).T), ("velocity", planned.velocity.T)):
         x, y, z = x[:, None], y[:, None], np.broadcast_to(z[:, None], c.shape)
         at, expected = names.index(f"way_{name}_0"), np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
-        np.testing.assert_allclose(vec._observation[..., at : at + 3], expected, atol=1e-5)
+        np.testing.assert_allclose(vec.task.observation[..., at : at + 3], expected, atol=1e-5)
     assert names[-1] == "time_left_0"
-    np.testing.assert_allclose(vec._observation[..., -1], 1 - (230 - 200) / 200, atol=1e-6)
-    np.testing.assert_allclose(vec.state()[:, -1], vec._observation[:, 0, -1])
+    np.testing.assert_allclose(vec.task.observation[..., -1], 1 - (230 - 200) / 200, atol=1e-6)
+    np.testing.assert_allclose(vec.state()[:, -1], vec.task.observation[:, 0, -1])
 
 
 @pytest.mark.parametrize("num_drones", [1, 2])
 def test_teams_that_cannot_hold_a_tilt_get_level_targets(num_drones):
     vec = make("pose", num_envs=16, num_drones=num_drones)
     vec.reset(seed=0)
-    assert (vec.task.plan.pose[..., 4:] == 0).all()
-    assert np.abs(vec.task.plan.pose[..., 3]).max() > pi / 2
+    assert (vec.task.own.plan.pose[..., 4:] == 0).all()
+    assert np.abs(vec.task.own.plan.pose[..., 3]).max() > pi / 2
 
 
 def test_a_point_payload_counts_as_turned_as_its_way_is():

@@ -106,8 +106,8 @@ def test_nothing_of_the_parameters_is_shown_to_the_drones(task, cables):
     observation, _ = vec.reset(seed=1)
     for array in vec.world.parameters:
         array[:] = 2.0 * array + 0.1
-    vec.task.observe(0, 4, vec._action, vec._observation, vec._state)
-    assert same(observation, vec._observation)
+    vec.task.stages["observe"](0, 4)
+    assert same(observation, vec.task.observation)
 
 
 def test_every_task_flies_with_everything_drawn_and_alike_alone(task, cables):

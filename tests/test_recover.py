@@ -49,11 +49,11 @@ def test_crazymarl_starts_are_its_samplers():
 def test_tilt_and_cable_angle_count_after_the_grace_alone():
     vec = make("recover", num_envs=2)
     vec.reset(seed=0)
-    assert (vec.task.watch.ignored == ignore(TILT, CABLE)).all()
+    assert (vec.task.mask.ignored == ignore(TILT, CABLE)).all()
     for step in range(101):
-        assert (vec.task.watch.ignored != 0).all() == (step <= 100 and vec.task.time[0] <= 2.0)
+        assert (vec.task.mask.ignored != 0).all() == (step <= 100 and vec.task.time[0] <= 2.0)
         vec.step(zeros(vec))
-    assert (vec.task.watch.ignored == 0).all()
+    assert (vec.task.mask.ignored == 0).all()
 
 
 def test_success_is_within_a_centimetre_at_the_end():

@@ -69,7 +69,7 @@ def test_drones_are_told_their_planned_offset():
     vec = make("loss_6", num_envs=8, num_drones=6, **{"task_options.loss_time": (0.5, 0.5)})
     told = vec.observation_names.index("planned_offset_0")
     team, (observation, _) = make_scripted("formation_redistributed", vec), vec.reset(seed=1)
-    who = vec.task.who.copy()
+    who = vec.task.own.who.copy()
     _, found = solve("loss_6")
     for step in range(1, 240):
         observation = vec.step(team.act(observation))[0]
@@ -92,7 +92,7 @@ def test_giving_way_halves_the_snatch(name):
         team, (observation, _) = make_scripted(script, vec), vec.reset(seed=0)
         for _ in range(280):  # the last loss is at 4 s, its snatch 0.6 s later
             observation = vec.step(team.act(observation))[0]
-        peaks[script] = np.median(vec.task.peak_tension)
+        peaks[script] = np.median(vec.task.own.peak_tension)
     assert peaks["formation_redistributed"] < 0.6 * peaks["formation_integral"]
     assert peaks["formation_redistributed"] < vec.task.options.success_tension < peaks["formation_integral"]
 

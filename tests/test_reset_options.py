@@ -111,7 +111,7 @@ def test_a_cable_may_be_given_broken_where_that_is_no_failure():
     vec = make(num_drones=2)
     message = refused(vec, {"state": {"cable_broken": [True, False]}})
     assert "cable_broken" in message
-    vec.task.watch.lost[:, 0] = True
+    vec.task.mask.lost[:, 0] = True
     vec.reset(options={"state": {"cable_broken": [True, False]}})
     assert vec.world.state.cable_broken.tolist() == [[True, False]] * 4
     vec.step(zeros(vec))

@@ -188,7 +188,7 @@ def test_ground_is_touched_where_the_body_is(shape, tilt, azimuth):
     for height, touches in ((0.004, True), (0.006, False)):
         state.payload_rotation[0], state.payload_position[0] = rotation, [0, 0, below + height]
         vec.task.goal.position[0] = state.payload_position[0]
-        vec.task.check(0, 1, 0.0)
+        vec.task.stages["measure"](0, 1)
         assert (CAUSES[vec.task.cause[0]] == "ground") == touches
 
 

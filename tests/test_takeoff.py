@@ -83,12 +83,12 @@ def test_cables_are_slack_until_the_drones_close_them_and_taut_when_they_pull():
     assert (after(TIGHTEN[0], 8).world.stats.tension_max == 0).all()
     vec = after(PULL[0] + 0.6 * PULL[1], 8)
     assert (vec.world.state.cable_tension > 0.2 * vec.world.system.resting_tension).all()
-    assert (vec.task.stage == FLYING).all()
+    assert (vec.task.own.stage == FLYING).all()
 
 
 def test_the_team_of_a_known_payload_lifts_it_with_no_jerk_at_its_cables():
     vec = after(ARRIVED + 1.0, 4, **CALM)
-    assert (vec.task.stage == LIFTED).all()
+    assert (vec.task.own.stage == LIFTED).all()
     assert vec.task.errors.distance.max() < 0.01
     assert (vec.world.stats.tension_max < 1.3 * vec.world.system.resting_tension.max()).all()
 
@@ -108,15 +108,15 @@ def test_the_pull_suits_lighter_and_heavier_payloads(factor):
 
 
 def cause(vec) -> str:
-    vec.task.check(0, 1, 0.0)
+    vec.task.stages["measure"](0, 1)
     return vec.failure_causes[vec.task.cause[0]]
 
 
 def test_drones_may_touch_the_ground_until_they_fly():
     vec = after(0.2)
-    assert vec.task.stage[0] == STANDING and cause(vec) == "none"
+    assert vec.task.own.stage[0] == STANDING and cause(vec) == "none"
     vec = after(TIGHTEN[0])
-    assert vec.task.stage[0] == FLYING and cause(vec) == "none"
+    assert vec.task.own.stage[0] == FLYING and cause(vec) == "none"
     vec.world.state.drone_position[0, 1, 2] = 0.03
     assert cause(vec) == "ground"
 
@@ -125,7 +125,7 @@ def test_the_payload_may_touch_the_ground_until_it_is_lifted():
     vec = after(PULL[0])
     assert cause(vec) == "none"
     vec = after(LIFT[0] + 0.8 * LIFT[1])
-    assert vec.task.stage[0] == LIFTED and cause(vec) == "none"
+    assert vec.task.own.stage[0] == LIFTED and cause(vec) == "none"
     sunk = vec.world.state.payload_position[0, 2] - 0.078
     vec.world.state.payload_position[0, 2] -= sunk
     vec.world.state.drone_position[0, :, 2] -= sunk

@@ -65,7 +65,7 @@ def test_paths_keep_and_reach_their_limits(kind, speed, acceleration):
     task = vec.task
     rows = [[] for _ in range(4)]
     for e in range(4):
-        rows[e] = [motion(e, x, task.path)[1:3] for x in t]
+        rows[e] = [motion(e, x, task.own.path, task.settings.table)[1:3] for x in t]
     speeds, pushes = (np.linalg.norm([[row[k] for row in each] for each in rows], axis=2) for k in (0, 1))
     assert speeds.max() <= speed * 1.01 and pushes.max() <= acceleration * 1.02
     reached = np.maximum(speeds.max(axis=1) / speed, pushes.max(axis=1) / acceleration)
@@ -74,15 +74,15 @@ def test_paths_keep_and_reach_their_limits(kind, speed, acceleration):
 
 def test_figure_eight_is_the_published_one():
     task = track("figure8", **{"task_options.speed": 2.0, "task_options.acceleration": 4.0}).task
-    assert task.path.size[0] == pytest.approx(1.0625 * 2**2 / 4)
-    assert task.path.rate[0] == pytest.approx(0.6655 * 4 / 2)
-    assert task.path.size[0] * task.path.rate[0] * sqrt(2) == pytest.approx(2.0, rel=1e-3)
+    assert task.own.path.size[0] == pytest.approx(1.0625 * 2**2 / 4)
+    assert task.own.path.rate[0] == pytest.approx(0.6655 * 4 / 2)
+    assert task.own.path.size[0] * task.own.path.rate[0] * sqrt(2) == pytest.approx(2.0, rel=1e-3)
 
 
 def test_each_episode_draws_from_ranges_and_forms():
     ranges = {"speed": [1.0, 2.0], "acceleration": [2.0, 4.0], "rate": [0.1, 0.4], "radius": [3.0, 5.0]}
     vec = track(["figure8", "circle"], num_envs=64, **{f"task_options.{key}": value for key, value in ranges.items()})
-    path = vec.task.path
+    path = vec.task.own.path
     eights, circles = path.kind == PATHS.index("figure8"), path.kind == PATHS.index("circle")
     assert (eights | circles).all() and 16 < eights.sum() < 48
     v, a = path.size * path.rate * sqrt(2), path.size * path.rate**2 / (1.0625 * 0.6655**2)
@@ -99,7 +99,7 @@ def test_a_path_forgets_the_form_of_the_last_episode():
         for _ in range(150):
             vec.step(zeros(vec))
         vec.reset()
-        eights = vec.task.path.kind == PATHS.index("figure8")
+        eights = vec.task.own.path.kind == PATHS.index("figure8")
         assert (vec.task.goal.drone_yaw_rate[eights] == 0).all()
         if eights.any() and not eights.all():
             return
@@ -166,7 +166,7 @@ def test_drones_are_told_where_the_target_will_be():
 def test_success_is_never_to_be_far():
     vec = track(num_envs=2, **{"env.episode_seconds": 1.0})
     vec.step(zeros(vec))
-    vec.task.worst[1] = 0.51
+    vec.task.own.worst[1] = 0.51
     for _ in range(vec.max_steps - 1):
         info = vec.step(zeros(vec))[4]
     assert info["success"].tolist() == [True, False]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import combinations
 from math import cos, pi
 
@@ -18,7 +19,7 @@ def test_the_way_moves_as_its_velocities_say_and_ends_at_the_target():
     vec = make("pose", num_envs=4)
     vec.reset(seed=0)
     task, dt = vec.task, vec.task.control_dt
-    advance_plan, planned, kept = task.planner(0, 4), task.planned, []
+    advance_plan, planned, kept = partial(task.stages["plan"], 0, 4), task.planned, []
     for _ in range(1000):
         advance_plan()
         kept.append([array.copy() for array in (
@@ -57,7 +58,7 @@ def test_pulls_of_the_way_give_the_payload_the_motion_of_the_way(num_drones):
     vec = make("pose", num_envs=4, num_drones=num_drones)
     vec.reset(seed=0)
     task, system = vec.task, vec.world.system
-    advance_plan, planned = task.planner(0, 4), task.planned
+    advance_plan, planned = partial(task.stages["plan"], 0, 4), task.planned
     for _ in range(350):
         before = planned.angular_velocity.copy(), planned.rotation.copy()
         advance_plan()
@@ -81,7 +82,11 @@ def test_drones_and_cables_stay_apart_and_no_drone_leans_far_on_the_way(name):
     vec = ml.make_vec(name, num_envs=64, num_threads=1)
     vec.reset(seed=0)
     task, system, weight = vec.task, vec.world.system, 9.81 * vec.world.system.vehicles[0].mass
-    advance_plan, planned, pairs = task.planner(0, 64), task.planned, list(combinations(range(vec.num_drones), 2))
+    advance_plan, planned, pairs = (
+        partial(task.stages["plan"], 0, 64),
+        task.planned,
+        list(combinations(range(vec.num_drones), 2)),
+    )
     drones, cables, upright = 9.0, 9.0, 1.0
     for step in range(3000):
         advance_plan()
@@ -105,7 +110,7 @@ def test_drones_and_cables_stay_apart_and_no_drone_leans_far_on_the_way(name):
 def test_ways_that_would_swing_a_drone_about_take_another_course():
     vec = ml.make_vec("pose_falcon3", num_envs=512, num_threads=1)
     vec.reset(seed=0)
-    task, plan = vec.task, vec.task.plan
+    task, plan = vec.task, vec.task.own.plan
     usual = plan.course[..., 1:] == CANDIDATES[0][1:]
     turned = np.diff(plan.pose[..., 3], axis=1)
     assert 0.9 < usual.all(axis=-1).mean() < 0.99
@@ -118,7 +123,7 @@ def test_ways_that_would_swing_a_drone_about_take_another_course():
         task.time[:], plan.stage[:] = 0.0, 0
         for e in range(512):
             hold_plan_pose(e, 0, plan, task.planned, task.rig, task.nominal_hanging)
-        advance_plan, most = task.planner(0, 512), np.zeros((512, 3))
+        advance_plan, most = partial(task.stages["plan"], 0, 512), np.zeros((512, 3))
         for step in range(3000):
             advance_plan()
             size = np.linalg.norm(task.planned.acceleration[:, None] + task.planned.slot_acceleration, axis=-1).max(
@@ -142,10 +147,10 @@ def test_ways_that_would_swing_a_drone_about_take_another_course():
 def test_drones_and_cables_stay_apart_on_every_course():
     vec = ml.make_vec("pose", num_envs=1000, num_threads=1)
     vec.reset(seed=0)
-    task, system, plan = vec.task, vec.world.system, vec.task.plan
+    task, system, plan = vec.task, vec.world.system, vec.task.own.plan
     ways = np.argwhere((plan.course[..., 1:] != CANDIDATES[0][1:]).any(axis=-1))
     assert len(ways) > 60
-    advance_plan, planned, limits = task.planner(0, 1000), task.planned, task.limits
+    advance_plan, planned, limits = partial(task.stages["plan"], 0, 1000), task.planned, task.limits
     for step in range(3000):
         advance_plan()
         if step % 25:

@@ -18,8 +18,8 @@ from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.errors import CheckpointError
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks import find_task
-from multilift_marl.tasks.base import INTEGRAL_LIMIT
 from multilift_marl.tasks.observations import FRAMES, list_components, observation_names
+from multilift_marl.tasks.view import INTEGRAL_LIMIT
 
 
 def make_contract(policy: LearnedPolicy) -> dict[str, Any]:

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from multilift_marl.config.files import pin_files
-from multilift_marl.config.schema import EvalConfig, SystemConfig, TrainConfig
-from multilift_marl.config.values import Between, Float
+from multilift_marl.config.schema import EvalConfig, RewardTerm, SystemConfig, TrainConfig
 from multilift_marl.rig.resolve import resolve_system
 from multilift_marl.rig.system import System
 
@@ -17,9 +16,7 @@ from multilift_marl.rig.system import System
 class Config(SystemConfig):
     """What is simulated, and what a task and its training make of it."""
 
-    reward: dict[str, Annotated[Float, Between(-1e6, 1e6)]] = Field(
-        {}, description="weights of the task's reward terms"
-    )
+    reward: dict[str, RewardTerm] = Field({}, description="weight of a reward term of the task, or weight and margin")
     task_options: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field({}, description="options of the task")
     train: TrainConfig = TrainConfig()
     eval: EvalConfig = EvalConfig()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import pi
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, create_model
+from pydantic import AfterValidator, Field, create_model, model_validator
 
 from multilift_marl.config.files import pin_files, pin_vehicles
 from multilift_marl.config.values import (
@@ -327,6 +327,20 @@ class EvalConfig(Section):
 
     every: Int = Field(25, ge=1, description="iterations between evaluations")
     episodes: Int = Field(128, ge=1, le=1_000_000, description="episodes of each")
+
+
+class RewardTerm(Section):
+    """A reward term's own numbers; a bare number is its weight."""
+
+    weight: Annotated[Float, Between(-1e6, 1e6)] | None = Field(None, description="[-] None: the task's own")
+    margin: tuple[Annotated[Float, Between(1e-6, 1e6)], ...] | None = Field(
+        None, description="errors at which it is half its value, in the term's units; None: the task's own"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_number(cls, value: Any) -> Any:
+        return value if isinstance(value, dict | RewardTerm) else {"weight": value}
 
 
 if TYPE_CHECKING:

@@ -1,29 +1,29 @@
-"""The batched environment that every door leads to: E environments of N drones, stepped together."""
+"""The batched environment that all APIs build on: E environments of N drones, stepped together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
 
-from multilift_marl._jit import bind
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
-from multilift_marl.control.actions import Call
 from multilift_marl.control.controller import Controller
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
+from multilift_marl.envs.pipeline import Pipeline, Teams, describe_stages
 from multilift_marl.errors import ConfigError
 from multilift_marl.rig.resolve import whole_ratio
 from multilift_marl.sim.saved import check_saved, fingerprint
-from multilift_marl.sim.world import Shard, World
+from multilift_marl.sim.world import World
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.failures import CAUSES, DIVERGED
-from multilift_marl.tasks.observations import observation_names, remember, state_size
+from multilift_marl.tasks.observations import observation_names
+from multilift_marl.tasks.sensing import Sensing
 
 TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
-_SAVED = ("_action", "_observation", "_stacked", "_state", "seeds", "episodes", "steps", "_ended")  # arrays of its own
+_SAVED = ("_stacked", "seeds", "episodes", "steps", "_ended")  # arrays of its own
 
 
 class MultiliftVec:
@@ -54,7 +54,7 @@ class MultiliftVec:
     def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
         if first_env < 0:
             raise ConfigError(f"first_env must not be negative, but is {first_env}")
-        task = find_task(config.task)
+        kind = find_task(config.task)
         self.config, self.purpose, self.first_env = config, purpose, first_env
         self.num_envs, self.num_drones = e, n = config.env.num_envs, config.system.num_drones
         self.control_ticks = whole_ratio(config.sim.control_hz, config.env.policy_hz, "env.policy_hz", "sim.control_hz")
@@ -64,24 +64,26 @@ class MultiliftVec:
         self.world = World(config.system, e, config.env.num_threads)
         self.controller = Controller(config, self.world)
         self.reference = self.controller.reference
-        self.task = task(config, self.world, self.reference)
         self.action_names = self.controller.action_names
-        self.action_size = len(self.action_names)
-        self.observation_names = observation_names(self.action_size, task.EXTRA, config.env.history)
+        self.action_size = a = len(self.action_names)
+        self.observation_names = observation_names(a, kind.EXTRA, config.env.history)
         self.observation_size = len(self.observation_names)
-        self.state_size = state_size(n, self.action_size) + task.EXTRA_STATE
-        self.reward_terms, self.failure_causes = tuple(task.REWARD), CAUSES
-        self._action = np.zeros((e, n, self.action_size))
-        self._previous = np.zeros_like(self._action)
-        self._observation = np.zeros((e, n, self.observation_size // config.env.history), np.float32)
-        self._stacked = self._observation if config.env.history == 1 else np.tile(self._observation, config.env.history)
-        self._state = np.zeros((e, self.state_size), np.float32)
-        self._starts = Episodes(
-            config, self.world, self.task, (self.action_size, self._observation.shape[2], self.state_size)
-        )
+        shape = e, n, a, self.observation_size // config.env.history
+        self._sensing = Sensing(config.randomization, shape, config.system.payload_shape != "point")
+        self.task = kind(config, self.world, self.reference, self._sensing)
+        self.state_size = self.task.critic.shape[1]
+        self.reward_terms, self.failure_causes = tuple(kind.REWARD), CAUSES
+        observation = self.task.observation
+        self._stacked = observation if config.env.history == 1 else np.tile(observation, config.env.history)
+        self._starts = Episodes(config, self.world, self.task, self._sensing)
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
-        self._bind()
+        self._checked = False  # whether all components were seen to be written
+        teams = Teams(self.world, self.controller, self.task, self._sensing, self._stacked)
+        self._pipelines = {shard.lo: Pipeline(teams, shard, self.control_ticks) for shard in self.world.shards}
+        self._first_sense = self._sensing.bind_sense(self.task.view, 0.0) if self._sensing.has_noise else None
+        delays = self._sensing.delays_observation
+        self._first_delay = self._sensing.bind_delay(observation) if delays else None
 
     def reset(
         self, seed: int | None = None, mask: np.ndarray | None = None, options: dict[str, Any] | None = None
@@ -137,7 +139,7 @@ class MultiliftVec:
         """
         begin = self._ended & restart & (self.episodes >= 0)
         self._set_action(action, self._ended & ~begin)
-        self.world.run(self._advance)
+        self.world.run(lambda shard: self._pipelines[shard.lo].run())
         self.world.check_warnings()
         self.steps += 1
         if begin.any():  # these have flown on, which nobody sees
@@ -171,14 +173,30 @@ class MultiliftVec:
 
     def state(self) -> np.ndarray:
         """Return the global state (E, S) float32, which holds what is hidden from the drones."""
-        return self._state.copy()
+        return self.task.critic.copy()
+
+    def describe(self, steps: int = 100) -> str:
+        """Return the stages of a policy step in order, and how long each takes; these environments do not change.
+
+        Args:
+            steps: policy steps that a copy of the first shard's environments makes, with the last actions.
+        """
+        twin = copy(self)
+        shard = twin.world.shards[0]
+        pipeline = twin._pipelines[shard.lo]
+        seconds = np.zeros(len(pipeline.stages))
+        if (twin.episodes < 0).any():
+            twin.reset()
+        for _ in range(steps):
+            pipeline.run_timed(seconds)
+        return describe_stages(pipeline.stages, seconds / steps)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of everything that later steps depend on, by dotted name, environment first."""
         saved = {f"world.{key}": array for key, array in self.world.state_dict().items()}
         saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
         saved |= self.controller.state_dict()
-        saved |= {f"sensing.{key}": array.copy() for key, array in self._starts.sensing.arrays().items()}
+        saved |= {f"sensing.{key}": array.copy() for key, array in self._sensing.arrays().items()}
         saved |= {name: getattr(self, name).copy() for name in _SAVED}
         saved["task_name"] = fingerprint(self.task.name, self.num_envs)
         return saved
@@ -219,47 +237,30 @@ class MultiliftVec:
             key = (self.purpose, self.first_env + e, int(self.episodes[e]))
             self._starts.draw(e, int(self.seeds[e]), key, fixed, i)
         self._starts.load(mask)
-        self._action[mask] = self._previous[mask] = 0.0
+        self.task.action[mask] = self.task.previous[mask] = 0.0
         self.steps[mask], self._ended[mask] = 0, False
         for e in chosen:
             self.controller.start(e)
-            self.task.observe(e, e + 1, self._action, self._observation, self._state)
-            self._stacked[e] = np.tile(self._observation[e], self.config.env.history)
+            self._observe(e)
+            if not self._checked:
+                self.task.check_written(e)
+                self._checked = True
+            self._stacked[e] = np.tile(self.task.observation[e], self.config.env.history)
 
-    def _bind(self) -> None:
-        """Bind what is called in every step to its arrays, for each shard."""
-        self._calls: dict[int, tuple[Sequence[Call], Sequence[Call], Sequence[Call]]] = {}
-        through = self._starts.sensing
-        flown = through.applied if through.delays_action else self._action
-        for shard in self.world.shards:
-            span = (shard.lo, shard.hi)
-            set_action, control_step = self.controller.bind(*span, flown, self.task.planned, self.task.planner(*span))
-            after = self.task.after_step(*span, self._action, self._previous, self._observation, self._state)
-            if self._stacked is not self._observation:
-                after.append(bind(remember, *span, self._observation, self._stacked))
-            before: tuple[Call, ...] = (set_action,)
-            if through.delays_action:
-                send, arguments = through.send(*span, self._action)
-                before = (bind(send, *arguments), set_action)
-            self._calls[shard.lo] = (before, control_step, after)
-
-    def _advance(self, shard: Shard) -> None:
-        """One policy step of one shard, on its own thread."""
-        before, control_step, after = self._calls[shard.lo]
-        for call in before:
-            call()
-        for _ in range(self.control_ticks):
-            for call in control_step:
-                call()
-            self.world.advance(shard, self.world.system.control_interval)
-        for call in after:
-            call()
+    def _observe(self, e: int) -> None:
+        """Write the first observation and global state of an episode."""
+        if self._first_sense is not None:
+            self._first_sense(e, e + 1)
+        self.task.stages["observe state"](e, e + 1)
+        self.task.stages["observe"](e, e + 1)
+        if self._first_delay is not None:
+            self._first_delay(e, e + 1)
 
     def _set_action(self, action: np.ndarray, ended: np.ndarray) -> None:
         action = np.asarray(action)
-        if action.shape != self._action.shape:
+        if action.shape != self.task.action.shape:
             raise ValueError(
-                f"action has shape {action.shape}, expected {self._action.shape} (environments, drones, numbers)"
+                f"action has shape {action.shape}, expected {self.task.action.shape} (environments, drones, numbers)"
             )
         if action.dtype.kind != "f":
             raise ValueError(f"action has dtype {action.dtype}, expected floating point numbers in [-1, 1]")
@@ -273,8 +274,8 @@ class MultiliftVec:
                 f"action of drone_{n} in environment {e} is not finite ({self.action_names[k]}={action[e, n, k]}); "
                 "look for NaN in the policy"
             )
-        self._previous[:] = self._action
-        np.clip(action, -1.0, 1.0, out=self._action, casting="same_kind")
+        self.task.previous[:] = self.task.action
+        np.clip(action, -1.0, 1.0, out=self.task.action, casting="same_kind")
 
     def _info(self, terminated: np.ndarray, truncated: np.ndarray) -> dict[str, Any]:
         return {

@@ -27,23 +27,17 @@ class Episodes:
 
     Args:
         config: of the environments.
-        world, task: theirs.
-        sizes: A, D, S.
+        world, task, sensing: theirs.
 
     Attributes:
-        imperfections: of sensors and links; the task observes through them where there are any.
         drawn: hidden parameters of the episodes in progress, by name, environment first; read-only.
     """
 
-    def __init__(self, config: Config, world: World, task: Task, sizes: tuple[int, int, int]):
-        self._world, self._task, ranges = world, task, config.randomization
-        shape, attitude = (world.num_envs, world.num_drones, *sizes[:2]), world.system.payload_shape != "point"
-        self.sensing = Sensing(ranges, shape, sizes[2], attitude)
-        if self.sensing.enabled:
-            task.use_sensing(self.sensing)
-        self._draw = Draw(world, ranges, self.sensing.drawn())
+    def __init__(self, config: Config, world: World, task: Task, sensing: Sensing):
+        self._world, self._task, self._sensing, ranges = world, task, sensing, config.randomization
+        self._draw = Draw(world, ranges, self._sensing.drawn())
         self._longest = {"action_delay": ranges.action_delay[1], "observation_delay": ranges.observation_delay[1]}
-        self._tell()
+        self._update_drawn()
 
     def read(self, options: Mapping[str, Any] | None, mask: np.ndarray) -> dict[str, Rows]:
         """Return what `options` fix, with a row for each environment in `mask`; see `read_options`."""
@@ -74,8 +68,8 @@ class Episodes:
         """
         if self._world.system.air.turbulence:
             self._world.seed_turbulence(e, np.random.SeedSequence(seed, spawn_key=(*key, TURBULENCE)))
-        if self.sensing.enabled:
-            self.sensing.start(e, np.random.SeedSequence(seed, spawn_key=(*key, SENSORS)))
+        if self._sensing.enabled:
+            self._sensing.start(e, np.random.SeedSequence(seed, spawn_key=(*key, SENSORS)))
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
         self._draw.draw(e, rng, seed, (*key, PARAMETERS))
         for name, rows in fixed["randomization"].items():
@@ -112,16 +106,16 @@ class Episodes:
         world.load(mask)
         if broken.any():
             world.break_cables(broken)
-        self._tell()
+        self._update_drawn()
 
     def load_state_dict(self, saved: Rows) -> None:
-        """Restore the imperfections from copies of their arrays, and the draw from what the world has restored."""
-        for name, array in self.sensing.arrays().items():
+        """Restore sensing from copies of its arrays, and the draw from what the world has restored."""
+        for name, array in self._sensing.arrays().items():
             array[:] = saved[name]
         self._draw.restore(self._world.parameters)
-        self._tell()
+        self._update_drawn()
 
-    def _tell(self) -> None:
+    def _update_drawn(self) -> None:
         self.drawn = {name: array.copy() for name, array in self._draw.values.items()}
         for array in self.drawn.values():
             array.flags.writeable = False

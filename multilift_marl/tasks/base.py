@@ -2,34 +2,43 @@
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from math import radians
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from multilift_marl._jit import bind, kernel
+from multilift_marl._jit import compose, inlined, prebind
 from multilift_marl.config.config import Config
+from multilift_marl.config.schema import RewardTerm
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Section
 from multilift_marl.control.formation import Goal, Reference, make_rig, place_formation
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
-from multilift_marl.tasks.failures import FailureMask, find_failures, make_limits
-from multilift_marl.tasks.observations import Component, observation_names, observe_team
-from multilift_marl.tasks.rewards import Errors, update_errors
+from multilift_marl.tasks.failures import FailureMask, find_cause, make_limits
+from multilift_marl.tasks.observations import (
+    Component,
+    check_written,
+    compose_observation,
+    compose_state,
+    list_components,
+    list_state,
+    state_size,
+)
+from multilift_marl.tasks.rewards import RestBounds, Term, compose_reward, is_at_rest
 from multilift_marl.tasks.sensing import Sensing
 from multilift_marl.tasks.starts import make_hanging, true_hanging
+from multilift_marl.tasks.view import Errors, View, reduce_view, update_errors
 
-Look = tuple[Callable[..., None], tuple[Any, ...]]  # a kernel and its arguments
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
-INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals
+Call = Callable[[int, int], None]  # of environments lo to hi
 
 
 class Box(NamedTuple):
-    """A box to look at."""
+    """A box to draw."""
 
     size: tuple[float, float, float]
     """Half its edges [m]."""
@@ -39,51 +48,63 @@ class Box(NamedTuple):
     """Colour and opacity, 0 to 1."""
 
 
-@kernel
-def check_team(lo, hi, state, goal, planned, is_planned, errors, dt, limits, watch, cause, min_separation):
-    """Measure the errors of environments lo to hi, integrate them over `dt` [s], look for failures."""
-    update_errors(lo, hi, state, goal, planned, is_planned, errors, dt, INTEGRAL_LIMIT)
-    find_failures(lo, hi, state, errors, limits, watch, cause, min_separation)
+@inlined
+def is_within_bounds(e, v):
+    """Return whether the payload is within `bounds` of the task's settings."""
+    return is_at_rest(e, v, v.settings.bounds)
+
+
+class Kernels(NamedTuple):
+    """What a task adds to the steps of its environments: inlined kernels of (environment, View), None for nothing."""
+
+    is_good: Callable[..., Any] = is_within_bounds
+    """Whether the payload is within the success region; `good_time` counts how long."""
+    plan: Callable[..., Any] | None = None
+    """At every control step, `time` advanced: writes goal and its velocities for that moment. A goal may leap, see
+    `Task.place_goal`: references are smoothed to slots that leap, and move along with those that move."""
+    check: Callable[..., Any] | None = None
+    """After every policy step, before failures are looked for."""
+    update: Callable[..., Any] | None = None
+    """After the reward."""
+    look: Callable[..., Any] | None = None
+    """Before the global state and the observations are written: computes what several components need."""
+
+
+class Settings(NamedTuple):
+    """Constants of a task that asks for nothing but a payload at rest."""
+
+    bounds: RestBounds
 
 
 class Task:
     """A cooperative transport task for E environments of N drones.
 
-    A subclass says how an episode starts (`start`), what the team is paid and when it does well (`scorer`), and what
-    counts as success at the end (`succeeded`). Goal, errors, failures and observations are kept here; time limit,
-    seeding, divergence and clipping of actions belong to the core.
+    A subclass says how an episode starts (`start`), what the team is paid (`REWARD`) and when it does well
+    (`KERNELS.is_good`, `succeeded`). Goal, errors, failures and observations are kept here; time limit, seeding,
+    divergence and clipping of actions belong to the core.
 
     Class attributes:
         name: registry name.
         Options: its `task_options`, typed.
-        REWARD: default weight of every reward term; `reward.<term>` overrides.
+        REWARD: the reward terms; `reward.<term>.weight` and `reward.<term>.margin` override their numbers.
+        KERNELS: what it does in a step.
         EXTRA: what its observations have beside the common components.
-        EXTRA_STATE: how many numbers it adds to the global state.
+        EXTRA_STATE: what it adds to the global state.
         MIN_DRONES: with fewer it makes no sense.
-        KEPT: names of further arrays, environment first, that outlive a step.
 
     Args:
         config: of the environments; `task_options`, `reward`, `env` and `sim` count.
-        world: what is flown.
-        reference: what the drones are told to follow.
+        world: the simulated teams.
+        reference: what the drones follow.
+        sensing: what they observe through.
 
     Attributes:
-        world, reference: as given.
+        config, world, reference: as given.
         options: `task_options`, checked; a subclass that annotates it with its own `Options` has it typed.
-        weights: of the reward terms (T,), in the order of `REWARD`.
-        dt, control_dt: policy and control step [s].
-        rig: the nominal formation in the payload frame.
-        limits: lengths of the failures.
-        goal, errors: Goal, Errors; live arrays.
-        way: Goal that the drones fly about: `goal` itself, unless a task leads the team there.
-        cause: failure cause (E,), an index into `failures.CAUSES`.
-        terms: weighted reward terms (E, T) in the order of `REWARD`.
-        good_time: time since the payload was last outside the success region (E,) [s].
-        min_separation: smallest distance between drones in the episode (E,) [m].
-        watch: failures that do not count for now.
-        time: since the start, for tasks with a plan (E,) [s].
+        view: View, what its kernels read and write; the following are fields of it: goal, planned, errors, mask, rig,
+            limits, time, cause, terms, good_time, min_separation, action, previous, dt, control_dt, own, settings.
+        weights, margins: of the reward terms (T,), (T, M), in the order of `REWARD`.
         rmse_after: time from which errors count for `payload_rmse_m` [s].
-        seen: the state as the drones are told it, for observers; live arrays.
         hanging: numbers of a hanging team; in `start`, the true ones of the environment, else nominal.
         nominal_hanging: always nominal, for goals.
 
@@ -94,33 +115,68 @@ class Task:
     name: ClassVar[str]
     Options: ClassVar[type[Section]] = Section
     options: Section
-    REWARD: ClassVar[dict[str, float]] = {}
+    REWARD: ClassVar[dict[str, Term]] = {}
+    KERNELS: ClassVar[Kernels] = Kernels()
     EXTRA: ClassVar[tuple[Component, ...]] = ()
-    EXTRA_STATE: ClassVar[int] = 0
+    EXTRA_STATE: ClassVar[tuple[Component, ...]] = ()
     MIN_DRONES: ClassVar[int] = 1
-    SAVED: ClassVar[tuple[str, ...]] = ()
+    own: Any
+    settings: Any
 
-    def __init__(self, config: Config, world: World, reference: Reference):
+    def __init__(self, config: Config, world: World, reference: Reference, sensing: Sensing):
         e, n, system = world.num_envs, world.num_drones, world.system
-        self.world, self.reference, self.seen = world, reference, world.state
-        self._sensing: Sensing | None = None
         if n < self.MIN_DRONES:
             raise ConfigError(f"task {self.name} needs more drones; raise env.num_drones to {self.MIN_DRONES} or more")
+        self.config, self.world, self.reference, self._sensing = config, world, reference, sensing
         self.options = validate(self.Options, config.task_options, "task_options")
-        self.weights = self._weights(config.reward)
+        self.weights, self.margins = resolve_reward(self.REWARD, config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
         self.planned = self.goal
-        self.rig = make_rig(system)
-        self.limits, self.nominal_hanging = make_limits(system), make_hanging(system)
-        self.hanging = self.nominal_hanging
-        tension = system.resting_tension
-        self._nominal = np.append(np.stack([system.cable_length, tension], axis=1), [[system.payload_mass, 0]], axis=0)
-        self.cause, self.good_time = np.zeros(e, np.int64), np.zeros(e)
-        self.min_separation, self.time = np.zeros(e), np.zeros(e)
-        self.watch = FailureMask.zeros(e, n)
-        self.rmse_after = 0.0
+        self.rig, self.limits, self.mask = make_rig(system), make_limits(system), FailureMask.zeros(e, n)
+        self.nominal_hanging = self.hanging = make_hanging(system)
+        size = sensing.action_size
+        self.action, self.previous = np.zeros((2, e, n, size))
+        self.observation = np.full((e, n, sensing.observation_size), np.nan, np.float32)  # see `check_written`
+        self.critic = np.full((e, state_size(n, size, self.EXTRA_STATE)), np.nan, np.float32)
+        self.cause, self.time, self.good_time, self.min_separation = np.zeros(e, np.int64), *np.zeros((3, e))
         self.terms = np.zeros((e, len(self.REWARD)))
+        self.rmse_after = 0.0
+        self.own, self.settings = (), ()
+        self.prepare()
+        self.view = View(
+            state=world.state,
+            seen=sensing.state if sensing.has_noise else world.state,
+            loads=world.hidden_loads,
+            goal=self.goal,
+            planned=self.planned,
+            has_plan=self.planned is not self.goal,
+            errors=self.errors,
+            seen_errors=sensing.errors if sensing.has_noise else self.errors,
+            reference=reference,
+            rig=self.rig,
+            nominal=self.nominal_hanging,
+            resting_tension=system.resting_tension,
+            limits=self.limits,
+            mask=self.mask,
+            action=self.action,
+            previous=self.previous,
+            time=self.time,
+            cause=self.cause,
+            good_time=self.good_time,
+            min_separation=self.min_separation,
+            terms=self.terms,
+            dt=self.dt,
+            control_dt=self.control_dt,
+            own=self.own,
+            settings=self.settings,
+        )
+        self._views: dict[Callable[..., Any], View] = {}
+        self.stages = self._compose()
+
+    def prepare(self) -> None:
+        """Check the options, set `settings`, and `own` where the task has arrays of its own."""
+        self.settings = Settings(RestBounds.of(self.options))
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw a start of one environment: write its goal and `world.state`; a start that is a failure is drawn again.
@@ -132,31 +188,21 @@ class Task:
         """
         raise NotImplementedError
 
-    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
-        """Return what, after each policy step, writes `terms` and updates `good_time` of environments lo to hi.
-
-        Args:
-            lo, hi: the environments.
-            action, previous: this action and the last one (E, N, A), live arrays.
-        """
-        raise NotImplementedError
+    def view_for(self, kernel: Callable[..., Any]) -> View:
+        """Return what a kernel, called by `start`, reads and writes of `view`; see `reduce_view`."""
+        if kernel not in self._views:
+            self._views[kernel] = reduce_view(self.view, kernel)
+        return self._views[kernel]
 
     def succeeded(self) -> np.ndarray:
-        """Return which environments (E,) would be successes if they ended now."""
-        raise NotImplementedError
-
-    def planner(self, lo: int, hi: int) -> Callable[[], None] | None:
-        """Return what moves the goals of environments lo to hi on by one control step; None if they stay.
-
-        It adds `control_dt` to `time` and writes goal and its velocities for that moment. A goal may leap, see
-        `place_goal`: references are smoothed to slots that leap, and ride along with those that move.
-        """
-        return None
+        """Return which environments (E,) would be successes if they ended now: good for the last seconds."""
+        seconds: float = getattr(self.options, "success_seconds", 0.0)
+        return self.good_time >= seconds - 1e-9
 
     def place_goal(self, env: int, position: ArrayLike, rotation: ArrayLike | None = None) -> None:
         """Put the target of one environment elsewhere, the formation with it, at a start or in flight.
 
-        Compiled planners write `goal.position` and `goal.rotation` and call `formation.place_formation`.
+        Compiled plans write `goal.position` and `goal.rotation` and call `formation.place_formation`.
 
         Args:
             env: the environment.
@@ -172,20 +218,13 @@ class Task:
         """Return whether errors at `time` [s] of an episode of `length` [s] belong to those that are reported."""
         return time > length - FINAL_SECONDS + 1e-9
 
-    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None] | None:
-        """Return what writes `EXTRA` and `EXTRA_STATE`, the last numbers of each row, of environments lo to hi.
+    def target_path(self, env: int) -> np.ndarray:
+        """Return points (P, 3) [m] of the path that the target takes in this episode, to draw it; none if it stays."""
+        return np.zeros((0, 3))
 
-        Args:
-            lo, hi: the environments.
-            observation: (E, N, D) float32, live array.
-            critic: global state (E, S) float32, live array.
-        """
-        return None
-
-    def use_sensing(self, sensing: Sensing) -> None:
-        """Let the drones observe through these from now on."""
-        self._sensing = sensing
-        self.seen = sensing.state if sensing.has_noise else self.world.state
+    def scenery(self, env: int) -> list[Box]:
+        """Return what stands around in environment `env`, to draw it; what may be touched is `failures`' business."""
+        return []
 
     def draw_start(self, env: int, rng: np.random.Generator, parameters: Parameters) -> bool:
         """Draw a start of environment `env`, whose team has true `parameters`; return whether it is sound.
@@ -197,100 +236,115 @@ class Task:
         self.hanging = self.nominal_hanging
         return self.begin(env)
 
-    def target_path(self, env: int) -> np.ndarray:
-        """Return points (P, 3) [m] of the way that the target takes in this episode, to draw it; none if it stays."""
-        return np.zeros((0, 3))
-
-    def scenery(self, env: int) -> list[Box]:
-        """Return what stands around in environment `env`, to draw it; what may be touched is `failures`' business."""
-        return []
-
     def begin(self, env: int) -> bool:
         """Reset the measurements of one environment to its drawn start; return whether that start is sound."""
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
         self.good_time[env], self.min_separation[env], self.terms[env], self.time[env] = 0.0, 1e9, 0.0, 0.0
-        self.check(env, env + 1, 0.0)
+        self.stages["measure"](env, env + 1)
         return bool(self.cause[env] == 0)
 
-    def check(self, lo: int, hi: int, dt: float) -> None:
-        """Measure errors of environments lo to hi, integrate them over `dt` [s], and look for failures."""
-        check_team(*self._checked(lo, hi, dt))
-
-    def observe(self, lo: int, hi: int, action: np.ndarray, observation: np.ndarray, critic: np.ndarray) -> None:
-        """Write observations (E, N, D) and global states (E, S) of environments lo to hi."""
-        looks, delays = self._observe_kernels(lo, hi, 0.0, action, observation, critic)
-        for function, arguments in looks:
-            function(*arguments)
-        if extra := self.observe_extra(lo, hi, observation, critic):
-            extra()
-        for function, arguments in delays:
-            function(*arguments)
-
-    def after_step(
-        self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray, observation: np.ndarray, critic: np.ndarray
-    ) -> list[Callable[[], None]]:
-        """Return what is called in turn for environments lo to hi after each policy step: check, score, observe.
-
-        Args:
-            lo, hi: the environments.
-            action, previous: this action and the last one (E, N, A), live arrays.
-            observation, critic: observations (E, N, D) and global states (E, S), written.
-        """
-        extra = self.observe_extra(lo, hi, observation, critic)
-        looks, delays = self._observe_kernels(lo, hi, self.dt, action, observation, critic)
-        return [
-            bind(check_team, *self._checked(lo, hi, self.dt)),
-            self.reward(lo, hi, action, previous),
-            *(bind(function, *arguments) for function, arguments in looks),
-            *([extra] if extra else []),
-            *(bind(function, *arguments) for function, arguments in delays),
-        ]
-
-    def _observe_kernels(
-        self, lo: int, hi: int, dt: float, action: np.ndarray, observation: np.ndarray, critic: np.ndarray
-    ) -> tuple[list[Look], list[Look]]:
-        """Return the kernels that observe, before and after the task's own, with their arguments."""
-        loads, goal, reference = self.world.hidden_loads, self.goal, self.reference
-        rig, nominal = self.rig, self._nominal
-        common, span, sensing = (action, rig, nominal, observation), (lo, hi), self._sensing
-        state, errors = self.world.state, self.errors
-        looks: list[Look] = [(observe_team, (*span, state, loads, goal, reference, errors, *common, critic))]
-        if sensing is None:
-            return looks, []
-        if sensing.has_noise:
-            led = self.planned, self.planned is not goal
-            state, errors = sensing.state, sensing.errors
-            looks += [
-                sensing.sense(*span, self.world.state),
-                (update_errors, (*span, state, goal, *led, errors, dt, INTEGRAL_LIMIT)),
-                (observe_team, (*span, state, loads, goal, reference, errors, *common, sensing.unused)),
-            ]
-        own = len(observation_names(0))
-        delays = [sensing.delay(*span, observation, (own, own + action.shape[2]))] if sensing.delays_observation else []
-        return looks, delays
-
-    def _checked(self, lo: int, hi: int, dt: float) -> tuple[Any, ...]:
-        state, goal, planned, errors = self.world.state, self.goal, self.planned, self.errors
-        found = (self.limits, self.watch, self.cause, self.min_separation)
-        return lo, hi, state, goal, planned, planned is not goal, errors, dt, *found
+    def check_written(self, env: int) -> None:
+        """Refuse, by a ConfigError, components of observation or global state that are not written in a first step."""
+        size = self.action.shape[2]
+        check_written(self.observation[env], list_components(size, self.EXTRA), "observation")
+        check_written(self.critic[env], list_state(self.world.num_drones, size, self.EXTRA_STATE), "global state")
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""
-        kept = ("cause", "good_time", "min_separation", "time", *self.SAVED)
-        saved = {name: operator.attrgetter(name)(self).copy() for name in kept}
-        for group in ("goal", "errors", "watch", *(() if self.planned is self.goal else ("planned",))):
-            saved |= {f"{group}.{name}": array.copy() for name, array in getattr(self, group)._asdict().items()}
-        return saved
+        return {name: array.copy() for name, array in self._arrays().items()}
 
-    def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
+    def load_state_dict(self, saved: Mapping[str, np.ndarray]) -> None:
         """Restore what `state_dict` returned."""
-        for key, array in saved.items():
-            owner, _, name = key.rpartition(".")
-            getattr(getattr(self, owner) if owner else self, name)[:] = array
+        for name, array in self._arrays().items():
+            array[:] = saved[name]
 
-    def _weights(self, values: dict[str, float]) -> np.ndarray:
-        for term in values:
-            if term not in self.REWARD:
-                hint = nearest(term, self.REWARD, lambda near: f"reward.{near}")
-                raise ConfigError(f"unknown key 'reward.{term}' of task {self.name}{hint}")
-        return np.array(list((self.REWARD | values).values()), float)
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays that outlive a step, by dotted name."""
+        names = ("cause", "good_time", "min_separation", "time", "action", "observation", "critic")
+        arrays = {name: getattr(self, name) for name in names}
+        groups = {"goal": self.goal, "errors": self.errors, "mask": self.mask}
+        groups |= {"planned": self.planned} if self.planned is not self.goal else {}
+        groups |= {"own": self.own} if self.own else {}
+        for group, record in groups.items():
+            arrays |= {f"{group}.{name}": array for name, array in _flatten(record)}
+        return arrays
+
+    def _compose(self) -> dict[str, Call]:
+        """Return the stages of a step that are the task's, each a call of (lo, hi)."""
+        v, kernels, n, size = self.view, self.KERNELS, self.world.num_drones, self.action.shape[2]
+        check = compose_check(kernels.check)
+        stages = {
+            "measure": self._bind(check, v, 0.0),
+            "check": self._bind(check, v, self.dt),
+            "reward": self._bind(
+                compose_reward(self.REWARD, kernels.is_good, kernels.update), v, self.weights, self.margins
+            ),
+            "observe": self._bind(compose_observation(self.EXTRA, size), v, self.observation),
+        }
+        true = v._replace(seen=v.state, seen_errors=v.errors)
+        stages["observe state"] = self._bind(compose_state(self.EXTRA_STATE, kernels.look, n, size), true, self.critic)
+        if kernels.plan is not None:
+            stages["plan"] = self._bind(compose_plan(kernels.plan), v)
+        return stages
+
+    @staticmethod
+    def _bind(kernel: Callable[..., Any], view: View, *arguments: Any) -> Call:
+        return prebind(kernel, reduce_view(view, kernel), *arguments)
+
+
+def compose_check(check: Callable[..., Any] | None) -> Callable[..., Any]:
+    """Return the kernel of (lo, hi, View, dt) that measures errors, integrates them over `dt` [s], finds failures.
+
+    Args:
+        check: inlined kernel of (e, View), called first; None for none.
+    """
+    source = """def check(lo, hi, v, dt):
+    for e in range(lo, hi):
+        before(e, v)
+        update_errors(e, v.state, v.errors, v, dt)
+        v.cause[e] = find_cause(e, v)
+"""
+    functions = {"update_errors": update_errors, "find_cause": find_cause} | ({"before": check} if check else {})
+    return compose("check", source if check else source.replace("        before(e, v)\n", ""), functions)
+
+
+def compose_plan(plan: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the kernel of (lo, hi, View) that advances time by a control step, then calls `plan` of (e, View)."""
+    source = """def advance_plan(lo, hi, v):
+    for e in range(lo, hi):
+        v.time[e] += v.control_dt
+        plan(e, v)
+"""
+    return compose("advance_plan", source, {"plan": plan})
+
+
+def resolve_reward(terms: Mapping[str, Term], values: Mapping[str, RewardTerm]) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (T,) and margins (T, M) of reward terms, angles in radians, with configured `values` in place.
+
+    Raises:
+        ConfigError: an unknown term, or another number of margins than it has.
+    """
+    for name, given in values.items():
+        if name not in terms:
+            hint = nearest(name, terms, lambda near: f"reward.{near}")
+            raise ConfigError(f"unknown key 'reward.{name}'{hint}")
+        count = len(terms[name].margins)
+        if given.margin is not None and len(given.margin) != count:
+            raise ConfigError(f"reward.{name}.margin lists {len(given.margin)} numbers, but the term has {count}")
+    weights = np.array([term.weight for term in terms.values()], float)
+    margins = np.ones((len(terms), max((len(term.margins) for term in terms.values()), default=0)))
+    for i, (name, term) in enumerate(terms.items()):
+        given = values.get(name, RewardTerm())
+        weights[i] = term.weight if given.weight is None else given.weight
+        chosen = term.margins if given.margin is None else given.margin
+        margins[i, : len(chosen)] = [radians(margin) if term.unit == "deg" else margin for margin in chosen]
+    return weights, margins
+
+
+def _flatten(record: Any, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Return the arrays of a named tuple, those of named tuples within it too, by dotted name."""
+    for name, value in record._asdict().items():
+        if isinstance(value, tuple):
+            yield from _flatten(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value

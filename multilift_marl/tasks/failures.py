@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import inlined
 from multilift_marl.math3d import (
     add,
     column,
@@ -26,7 +26,6 @@ from multilift_marl.math3d import (
 from multilift_marl.rig.resolve import MIN_SEPARATION
 from multilift_marl.rig.system import System
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.sim.hover import hook_position
 
 CAUSES = (
     "none",
@@ -42,7 +41,7 @@ CAUSES = (
     "diverged",  # the simulation has failed, not the team
 )
 GROUND, COLLISION, CROSSING, CABLE, BELOW, TILT, BROKEN, WALL, RANGE, DIVERGED = range(1, len(CAUSES))
-LOAD_GROUND = 0  # the payload's contact with the ground, to be forgiven apart from the drones'
+LOAD_GROUND = 0  # the payload's contact with the ground, to be ignored apart from the drones'
 
 MAX_DISTANCE = 3.0  # [m]
 _CABLE_DISTANCE = 0.1  # [m] for the span of a falcon
@@ -55,13 +54,13 @@ class FailureMask(NamedTuple):
     """What does not count as a failure for now; all zero unless a task says otherwise."""
 
     ignored: np.ndarray
-    """(E,) int64, a bit for every cause, see `forgive`."""
+    """(E,) int64, a bit for every cause, see `ignore`."""
     lost: np.ndarray
     """(E, N) bool, drones that count no more."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> FailureMask:
-        """Return a watch that forgives nothing."""
+        """Return a mask that ignores nothing."""
         return cls(np.zeros(num_envs, np.int64), np.zeros((num_envs, num_drones), bool))
 
 
@@ -107,41 +106,41 @@ def make_limits(system: System) -> Limits:
     )
 
 
-@kernel
-def find_failures(lo, hi, state, errors, limits, watch, cause, min_separation):
-    """Write the first failure cause (0: none) of environments lo to hi; update the least separation (E,) [m]."""
-    for e in range(lo, hi):
-        cause[e] = _cause(e, state, errors, limits, watch, min_separation)
-
-
 def ignore(*causes: int) -> int:
-    """Return the value of `Watch.forgiven` that lets pass `causes`."""
+    """Return the value of `FailureMask.ignored` that lets `causes` pass."""
     return sum(1 << cause for cause in causes)
 
 
-@kernel
+@inlined
 def _counts(cause, ignored):
     """Return whether a cause is a failure."""
     return (ignored >> cause) & 1 == 0
 
 
-@kernel
-def _cause(e, state, errors, limits, watch, min_separation):
-    ignored = watch.ignored[e]
+@inlined
+def find_cause(e, v):
+    """Return the first failure cause of environment e (0: none); update its least separation [m].
+
+    Args:
+        e: the environment.
+        v: View.
+    """
+    state, limits, mask = v.state, v.limits, v.mask
+    ignored = mask.ignored[e]
     payload, attitude = row(state.payload_position, e), matrow(state.payload_rotation, e)
     up = column(attitude, 2)
-    count = state.drone_position.shape[1]
-    if not errors.distance[e] <= MAX_DISTANCE:
+    if not v.errors.distance[e] <= MAX_DISTANCE:
         return RANGE
     if payload_height(payload, attitude, limits) < TOUCH and _counts(LOAD_GROUND, ignored):
         return GROUND
-    for n in range(count):
-        if watch.lost[e, n]:
+    for n in range(state.drone_position.shape[1]):
+        if mask.lost[e, n]:
             continue
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
-        anchor = add(payload, mul(attitude, (limits.anchors[n, 0], limits.anchors[n, 1], limits.anchors[n, 2])))
-        end = hook_position(e, n, state, limits.hooks)
+        anchor = add(payload, mul(attitude, row(limits.anchors, n)))
+        end = add(drone, mul(frame, row(limits.hooks, n)))
         cable = unit(sub(end, anchor))
+        # each drone alone: ground, its cable, its tilt, its height
         if drone[2] - _extent(frame, limits.drone_half[n]) < TOUCH and _counts(GROUND, ignored):
             return GROUND
         if state.cable_broken[e, n] and _counts(BROKEN, ignored):
@@ -153,34 +152,35 @@ def _cause(e, state, errors, limits, watch, min_separation):
         if dot(cable, column(frame, 2)) < 0.0 or dot(cable, up) < _MIN_CABLE_PAYLOAD:
             if _counts(CABLE, ignored):
                 return CABLE
+        # against those before it: drones, then cables
         for m in range(n):
-            if watch.lost[e, m]:
+            if mask.lost[e, m]:
                 continue
-            apart = norm(sub(drone, vec(state.drone_position, e, m)))
-            min_separation[e] = min(min_separation[e], apart)
-            if apart < limits.separation[n, m] and _counts(COLLISION, ignored):
+            separation = norm(sub(drone, vec(state.drone_position, e, m)))
+            v.min_separation[e] = min(v.min_separation[e], separation)
+            if separation < limits.separation[n, m] and _counts(COLLISION, ignored):
                 return COLLISION
-            foot = add(payload, mul(attitude, (limits.anchors[m, 0], limits.anchors[m, 1], limits.anchors[m, 2])))
-            other = hook_position(e, m, state, limits.hooks)
+            foot = add(payload, mul(attitude, row(limits.anchors, m)))
+            other = add(vec(state.drone_position, e, m), mul(mat(state.drone_rotation, e, m), row(limits.hooks, m)))
             if segment_distance(anchor, end, foot, other) < limits.cables[n, m] and _counts(CROSSING, ignored):
                 return CROSSING
     return 0
 
 
-@kernel
+@inlined
 def payload_height(payload, attitude, limits):
     """Return the height of the lowest point of a payload [m] at `payload` [m] with `attitude`, 9 numbers."""
     half, center = limits.payload_half, add(payload, mul(attitude, limits.payload_center))
     return center[2] - (_round_extent(attitude, half) if limits.payload_round else _extent(attitude, half))
 
 
-@kernel
+@inlined
 def _round_extent(attitude, half):
     """Return how far an upright cylinder reaches below its centre [m]."""
     return sqrt(max(1.0 - attitude[8] * attitude[8], 0.0)) * half[0] + abs(attitude[8]) * half[2]
 
 
-@kernel
+@inlined
 def _extent(attitude, half):
     """Return how far a box reaches below its centre [m]."""
     return abs(attitude[6]) * half[0] + abs(attitude[7]) * half[1] + abs(attitude[8]) * half[2]

@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import pi, radians
+from math import pi
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import bind, kernel
-from multilift_marl.config.config import Config
+from multilift_marl._jit import inlined, kernel
 from multilift_marl.config.values import Float, Int, Section
-from multilift_marl.control.formation import Reference, place_formation
-from multilift_marl.math3d import add, ease, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, triple, turn, vec
+from multilift_marl.control.formation import place_formation
+from multilift_marl.math3d import add, ease, mat, matrow, mul, put, putmat, rot_z, row, sub, triple, vec
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.sim.hover import hook_position
-from multilift_marl.sim.world import World
-from multilift_marl.tasks.base import Box, Task
+from multilift_marl.tasks.base import Box, Kernels, Task
 from multilift_marl.tasks.failures import WALL
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.paths import STEP, differences, set_goal
-from multilift_marl.tasks.rewards import RestBounds, action_rate, is_at_rest, tolerance, update_peak_tension
+from multilift_marl.tasks.rewards import (
+    RestBounds,
+    Term,
+    action_rate,
+    attitude,
+    body_rate,
+    distance,
+    is_at_rest,
+    tolerance,
+    update_peak_tension,
+    velocity,
+)
 from multilift_marl.tasks.starts import hang_team, in_ball
 
 THICKNESS = 0.1  # [m] of the walls
 PASSED = 0.8  # [m] that a payload is past a wall when its last drone is, too
+SPARE = 0.05  # [m] of clearance that the reward asks for
 _WALL = (0.62, 0.52, 0.45, 1.0)  # colour
 
 
@@ -50,192 +58,120 @@ class GateOptions(Section):
     )
 
 
-class Gates(NamedTuple):
-    """The walls of each environment and the way through their gaps."""
+class GateArrays(NamedTuple):
+    """What an episode holds beside its goal."""
+
+    gap_y: np.ndarray
+    """(E, G) of the gaps' middles [m]."""
+    peak_tension: np.ndarray
+    """(E,) largest tension in the episode over that at rest [-]."""
+
+
+class GateSettings(NamedTuple):
+    """The walls, the target's motion, and what must not touch a wall."""
 
     x: np.ndarray
     """(G,) of the walls [m]."""
-    y: np.ndarray
-    """(E, G) of the gaps' middles [m]."""
     half_width: float
     """Of the gaps [m]."""
     gap_height: float
     """[m]."""
-    start: float
+    begin: float
     """When the target sets off [s]."""
     duration: float
-    """How long it flies [s]."""
+    """How long it moves [s]."""
+    arrival: float
+    """When it arrives [s]."""
     level: float
     """Its height [m]."""
-
-
-class Bodies(NamedTuple):
-    """What must not touch a wall."""
-
+    radius: float
+    """Of the ball about x = -2 m in which the team starts [m]."""
     drone: np.ndarray
     """(N, 3) half edges of the drones [m]."""
     payload: np.ndarray
-    """(3,) half edges [m]."""
-    centre: tuple[float, float, float]
+    """(3,) half edges of the payload [m]."""
+    center: tuple[float, float, float]
     """Geometric centre of the payload from its centre of mass, in its frame [m]."""
-    anchors: np.ndarray
-    """(N, 3) [m]."""
-    hooks: np.ndarray
-    """(N, 3) [m]."""
+    bounds: RestBounds
 
 
-class Gate(Task):
-    """Fly through gaps; see docs/gate.md."""
-
-    name: ClassVar[str] = "gate"
-    Options: ClassVar[type[Section]] = GateOptions
-    options: GateOptions
-    REWARD: ClassVar[dict[str, float]] = {
-        "position": 0.4,
-        "precision": 0.2,
-        "clearance": 0.8,
-        "velocity": 0.2,
-        "attitude": 0.2,
-        "stillness": 0.1,
-        "action_rate": -0.05,
-    }
-    EXTRA: ClassVar[tuple[Component, ...]] = (
-        Component("target_velocity", 2, "slot", "m/s", "horizontal velocity of the target"),
-        Component("gap", 2, "slot", "m", "own position minus the middle of the next gap, from above"),
-        Component("clearance", 1, "-", "m", "own room to the next wall's edges, within ± 0.5"),
-    )
-    EXTRA_STATE: ClassVar[int] = 6
-    SAVED: ClassVar[tuple[str, ...]] = ("gap_y", "peak_tension")
-
-    def __init__(self, config: Config, world: World, reference: Reference):
-        super().__init__(config, world, reference)
-        option, system = self.options, world.system
-        x = np.array([0.0] if option.gates == 1 else [-0.75, 0.75])
-        self.gap_y, self.peak_tension = np.zeros((world.num_envs, len(x))), np.zeros(world.num_envs)
-        self.gates = Gates(
-            x, self.gap_y, option.gap_width / 2, option.gap_height, option.set_off,
-            option.arrival - option.set_off, option.height,
-        )  # fmt: skip
-        self.bodies = Bodies(
-            np.array([drone_half_size(vehicle) for vehicle in system.vehicles]), system.payload_size / 2,
-            triple(system.payload_center), np.ascontiguousarray(system.anchors),
-            np.ascontiguousarray(system.hooks),
-        )  # fmt: skip
-
-    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
-        """Draw the gaps and where the team starts; see `Task.start`."""
-        option = self.options
-        self.peak_tension[env] = 0.0
-        self.gap_y[env] = rng.uniform(-option.gap_offset, option.gap_offset, option.gates)
-        _start(env, rng, self.world.state, self.goal, self.rig, self.hanging, mass, self.gates, option.start_radius)
-
-    def planner(self, lo: int, hi: int) -> Callable[[], None]:
-        """Move the goals through the gaps; see `Task.planner`."""
-        tensions = (self.world.state, self.watch, self.world.system.resting_tension, self.peak_tension)
-        return bind(_plan, lo, hi, self.time, self.control_dt, self.gates, self.goal, self.rig, tensions)
-
-    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
-        """Tell where the next gap is; see `Task.observer`."""
-        state = self.world.state
-        return bind(
-            _write_observation, lo, hi, state, self.seen, self.goal, self.gates, self.bodies, observation, critic
-        )
-
-    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
-        """Pay for closeness to the moving target and for room; a touched wall is a failure. See `Task.scorer`."""
-        option = self.options
-        bounds = RestBounds(
-            option.success_distance, radians(option.success_angle), option.success_speed, option.success_body_rate
-        )
-        return bind(
-            _score, lo, hi, self.time, self.world.state, self.goal, self.errors, self.gates, self.bodies, action,
-            previous, self.weights, bounds, option.arrival, self.dt, self.terms, self.good_time, self.cause,
-        )  # fmt: skip
-
-    def succeeded(self) -> np.ndarray:
-        """At rest at the goal throughout the last moments, and never too large a tension."""
-        rested = self.good_time >= self.options.success_seconds - 1e-9
-        return rested & (self.peak_tension <= self.options.success_tension)
-
-    def target_path(self, env: int) -> np.ndarray:
-        """Return points of the way through the gaps; see `Task.route`."""
-        return np.array([_place(env, t, self.gates) for t in np.linspace(0, self.options.arrival, 61)])
-
-    def scenery(self, env: int) -> list[Box]:
-        """Return the walls; see `Task.scenery`."""
-        half, gap, top = 2.5, self.gates.half_width, self.gates.gap_height
-        boxes = []
-        for x, y in zip(self.gates.x, self.gap_y[env], strict=True):
-            for side in (-1, 1):
-                boxes.append(Box((THICKNESS / 2, half / 2, top / 2), (x, y + side * (gap + half / 2), top / 2), _WALL))
-            boxes.append(Box((THICKNESS / 2, half + gap, 0.25), (x, y, top + 0.25), _WALL))
-        return boxes
-
-
-@kernel
-def _place(e, t, gates):
+@inlined
+def target_position(e, t, v):
     """Return where the target of environment e is at a time: straight through every gap, from x = -2 to 2 m."""
-    x = -2.0 + 4.0 * ease(t, gates.start, gates.duration)[0]
+    gates, gap_y = v.settings, v.own.gap_y
+    x = -2.0 + 4.0 * ease(t, gates.begin, gates.duration)[0]
     y, before, last = 0.0, -2.0, 0.0
     for g in range(gates.x.shape[0]):
-        y += (gates.y[e, g] - last) * ease(x, before, gates.x[g] - 0.25 - before)[0]
-        before, last = gates.x[g] + 0.25, gates.y[e, g]
+        y += (gap_y[e, g] - last) * ease(x, before, gates.x[g] - 0.25 - before)[0]
+        before, last = gates.x[g] + 0.25, gap_y[e, g]
     y -= last * ease(x, before, 2.0 - before)[0]
     return (x, y, gates.level)
 
 
-@kernel
-def _aim(e, t, gates, goal, rig):
-    a, b, c = _place(e, t - 2.0 * STEP, gates), _place(e, t - STEP, gates), _place(e, t, gates)
-    set_goal(e, differences(a, b, c, _place(e, t + STEP, gates), _place(e, t + 2.0 * STEP, gates)), goal)
-    place_formation(e, goal, rig)
+@inlined
+def move_target(e, t, v):
+    """Write the goal of environment e at a time."""
+    a, b, c = target_position(e, t - 2.0 * STEP, v), target_position(e, t - STEP, v), target_position(e, t, v)
+    d, f = target_position(e, t + STEP, v), target_position(e, t + 2.0 * STEP, v)
+    set_goal(e, differences(a, b, c, d, f), v.goal)
+    place_formation(e, v.goal, v.rig)
 
 
 @kernel
-def _start(e, rng, state, goal, rig, hanging, mass, gates, radius):
-    putmat(goal.rotation[e], rot_z(0.5 * pi))  # the long side of the formation across the way
-    _aim(e, 0.0, gates, goal, rig)
-    moved = in_ball(rng, radius)
-    payload = add(row(goal.position, e), moved)
-    hang_team(e, state, goal, rig, hanging, mass, payload, matrow(goal.rotation, e), (0.0, 0.0, 0.0), moved)
+def trace(e, seconds, v, points):
+    """Write positions of the target at points.shape[0] moments from 0 to `seconds`."""
+    for i in range(points.shape[0]):
+        put(points[i], target_position(e, seconds * i / (points.shape[0] - 1), v))
 
 
 @kernel
-def _plan(lo, hi, time, dt, gates, goal, rig, tensions):
-    state, watch, resting, peak = tensions
-    for e in range(lo, hi):
-        update_peak_tension(e, state, watch, resting, peak)
-        time[e] += dt
-        _aim(e, time[e], gates, goal, rig)
+def start_before_gate(e, rng, v, hanging):
+    """Write goal and team at the start, the long side of the formation across the path."""
+    goal = v.goal
+    putmat(goal.rotation[e], rot_z(0.5 * pi))
+    move_target(e, 0.0, v)
+    moved = in_ball(rng, v.settings.radius)
+    pose = add(row(goal.position, e), moved), matrow(goal.rotation, e)
+    hang_team(e, v, goal, hanging, pose, (0.0, 0.0, 0.0), moved)
 
 
-@kernel
-def _next(e, x, gates):
-    """Return the gate that a payload at x has before it, the last one after all."""
+@inlined
+def advance_target(e, v):
+    """Move the goal on; note the largest tension."""
+    update_peak_tension(e, v, v.own.peak_tension)
+    move_target(e, v.time[e], v)
+
+
+@inlined
+def next_gate(e, v):
+    """Return the gate that the payload has before it, the last one after all."""
+    gates, x = v.settings, v.state.payload_position[e, 0]
     for g in range(gates.x.shape[0]):
         if x < gates.x[g] + PASSED:
             return g
     return gates.x.shape[0] - 1
 
 
-@kernel
+@inlined
 def _reach(frame, half, axis):
     """Return how far a box of `half` edges reaches along a world axis [m]."""
     return abs(frame[3 * axis]) * half[0] + abs(frame[3 * axis + 1]) * half[1] + abs(frame[3 * axis + 2]) * half[2]
 
 
-@kernel
-def _room(e, g, centre, frame, half, gates):
+@inlined
+def _room(e, g, center, frame, half, v):
     """Return the room [m] of a box to the edges of gap g if it is in the wall, else 1."""
-    if abs(centre[0] - gates.x[g]) > 0.5 * THICKNESS + _reach(frame, half, 0):
+    gates = v.settings
+    if abs(center[0] - gates.x[g]) > 0.5 * THICKNESS + _reach(frame, half, 0):
         return 1.0
-    side = gates.half_width - abs(centre[1] - gates.y[e, g]) - _reach(frame, half, 1)
-    return min(side, gates.gap_height - centre[2] - _reach(frame, half, 2))
+    side = gates.half_width - abs(center[1] - v.own.gap_y[e, g]) - _reach(frame, half, 1)
+    return min(side, gates.gap_height - center[2] - _reach(frame, half, 2))
 
 
-@kernel
-def _cable_room(e, g, low, high, gates):
+@inlined
+def _cable_room(e, g, low, high, v):
     """Return the same of a straight cable."""
+    gates = v.settings
     begin, end = gates.x[g] - 0.5 * THICKNESS, gates.x[g] + 0.5 * THICKNESS
     if max(low[0], high[0]) < begin or min(low[0], high[0]) > end:
         return 1.0
@@ -243,70 +179,160 @@ def _cable_room(e, g, low, high, gates):
     for side in (begin, end):
         share = 0.0 if abs(span) < 1e-9 else min(max((side - low[0]) / span, 0.0), 1.0)
         y, z = low[1] + share * (high[1] - low[1]), low[2] + share * (high[2] - low[2])
-        room = min(room, gates.half_width - abs(y - gates.y[e, g]), gates.gap_height - z)
+        room = min(room, gates.half_width - abs(y - v.own.gap_y[e, g]), gates.gap_height - z)
     return room
 
 
-@kernel
-def _least_room(e, state, gates, bodies):
+@inlined
+def least_room(e, v):
     """Return the least room of the team of environment e in any wall [m]; below 0 it touches."""
+    state, bodies, rig = v.state, v.settings, v.rig
     room, attitude = 1.0, matrow(state.payload_rotation, e)
     payload = row(state.payload_position, e)
-    for g in range(gates.x.shape[0]):
-        room = min(room, _room(e, g, add(payload, mul(attitude, bodies.centre)), attitude, bodies.payload, gates))
-        for n in range(bodies.anchors.shape[0]):
-            drone = vec(state.drone_position, e, n)
-            room = min(room, _room(e, g, drone, mat(state.drone_rotation, e, n), bodies.drone[n], gates))
-            anchor = add(payload, mul(attitude, row(bodies.anchors, n)))
-            room = min(room, _cable_room(e, g, anchor, hook_position(e, n, state, bodies.hooks), gates))
+    for g in range(bodies.x.shape[0]):
+        room = min(room, _room(e, g, add(payload, mul(attitude, bodies.center)), attitude, bodies.payload, v))
+        for n in range(rig.anchors.shape[0]):
+            drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
+            room = min(room, _room(e, g, drone, frame, bodies.drone[n], v))
+            anchor = add(payload, mul(attitude, row(rig.anchors, n)))
+            room = min(room, _cable_room(e, g, anchor, add(drone, mul(frame, row(rig.drones.hooks, n))), v))
     return room
 
 
-@kernel
-def _clearance(e, n, g, state, gates, bodies):
+@inlined
+def _clearance(e, n, g, state, v):
     """Return the room [m] that a drone would have in gap g if it flew straight on; below 0 it would hit the wall."""
-    across = abs(state.drone_position[e, n, 1] - gates.y[e, g])
-    return gates.half_width - across - _reach(mat(state.drone_rotation, e, n), bodies.drone[n], 1)
+    across = abs(state.drone_position[e, n, 1] - v.own.gap_y[e, g])
+    return v.settings.half_width - across - _reach(mat(state.drone_rotation, e, n), v.settings.drone[n], 1)
 
 
-@kernel
-def _write_observation(lo, hi, state, seen, goal, gates, bodies, observation, critic):
-    for e in range(lo, hi):
-        g = _next(e, state.payload_position[e, 0], gates)
-        middle = (gates.x[g], gates.y[e, g], gates.level)
-        told = critic[e, critic.shape[1] - 6 :]
-        put(told[0:3], row(goal.velocity, e))
-        put(told[3:6], sub(row(state.payload_position, e), middle))
-        for n in range(observation.shape[1]):
-            c, s = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
-            own = observation[e, n, observation.shape[2] - 5 :]
-            own[0], own[1] = turn(c, s, row(goal.velocity, e))[:2]
-            own[2], own[3] = turn(c, s, sub(vec(seen.drone_position, e, n), middle))[:2]
-            own[4] = min(max(_clearance(e, n, g, seen, gates, bodies), -0.5), 0.5)
+@inlined
+def passage(e, v, margin):
+    """Drones with room to pass the next gap; 1 once all are through."""
+    g = next_gate(e, v)
+    before = v.state.payload_position[e, 0] < v.settings.x[g] + PASSED
+    passing, count = 0.0, v.action.shape[1]
+    for n in range(count):
+        lacking = max(SPARE - _clearance(e, n, g, v.state, v), 0.0) if before else 0.0
+        passing += tolerance(lacking, margin) / count
+    return passing
 
 
-@kernel
-def _score(
-    lo, hi, time, state, goal, errors, gates, bodies, action, previous, weights, bounds, arrival, dt, terms, good_time,
-    cause,
-):  # fmt: skip
-    for e in range(lo, hi):
-        distance = errors.distance[e]
-        slip = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
-        g = _next(e, state.payload_position[e, 0], gates)
-        before = state.payload_position[e, 0] < gates.x[g] + PASSED
-        passing, count = 0.0, action.shape[1]
-        for n in range(count):
-            lacking = max(0.05 - _clearance(e, n, g, state, gates, bodies), 0.0) if before else 0.0
-            passing += tolerance(lacking, 0.25) / count
-        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
-        terms[e, 1] = weights[1] * tolerance(distance, 0.05)
-        terms[e, 2] = weights[2] * passing
-        terms[e, 3] = weights[3] * tolerance(slip, 0.2)
-        terms[e, 4] = weights[4] * tolerance(errors.angle[e], radians(6.0))
-        terms[e, 5] = weights[5] * tolerance(norm(row(state.payload_body_rates, e)), 0.3)
-        terms[e, 6] = weights[6] * action_rate(e, action, previous)
-        good = time[e] >= arrival and is_at_rest(e, state, errors, bounds)
-        good_time[e] = good_time[e] + dt if good else 0.0
-        if cause[e] == 0 and _least_room(e, state, gates, bodies) < 0.0:
-            cause[e] = WALL
+@inlined
+def has_arrived(e, v):
+    """Payload at rest at the goal, after the target's arrival."""
+    return v.time[e] >= v.settings.arrival and is_at_rest(e, v, v.settings.bounds)
+
+
+@inlined
+def find_touch(e, v):
+    """Count a touched wall as a failure."""
+    if v.cause[e] == 0 and least_room(e, v) < 0.0:
+        v.cause[e] = WALL
+
+
+@inlined
+def target_velocity(e, n, v):
+    """Velocity of the target."""
+    return row(v.goal.velocity, e)
+
+
+@inlined
+def gap_middle(e, v):
+    """Middle of the next gap."""
+    g = next_gate(e, v)
+    return (v.settings.x[g], v.own.gap_y[e, g], v.settings.level)
+
+
+@inlined
+def gap_offset(e, n, v):
+    """Own position minus the middle of the next gap."""
+    return sub(vec(v.seen.drone_position, e, n), gap_middle(e, v))
+
+
+@inlined
+def clearance(e, n, v):
+    """Own room to the next wall's edges, within ± 0.5 m."""
+    return min(max(_clearance(e, n, next_gate(e, v), v.seen, v), -0.5), 0.5)
+
+
+@inlined
+def payload_gap_offset(e, n, v):
+    """Payload's position minus the middle of the next gap."""
+    return sub(row(v.state.payload_position, e), gap_middle(e, v))
+
+
+class Gate(Task):
+    """Carry the payload through gaps; see docs/gate.md."""
+
+    name: ClassVar[str] = "gate"
+    Options: ClassVar[type[Section]] = GateOptions
+    options: GateOptions
+    own: GateArrays
+    settings: GateSettings
+    REWARD: ClassVar[dict[str, Term]] = {
+        "position": Term(0.4, distance, 0.25, "m"),
+        "precision": Term(0.2, distance, 0.05, "m"),
+        "clearance": Term(0.8, passage, 0.25, "m"),
+        "velocity": Term(0.2, velocity, 0.2, "m/s"),
+        "attitude": Term(0.2, attitude, 6.0, "deg"),
+        "stillness": Term(0.1, body_rate, 0.3, "rad/s"),
+        "action_rate": Term(-0.05, action_rate),
+    }
+    KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, update=find_touch)
+    EXTRA: ClassVar[tuple[Component, ...]] = (
+        Component("target_velocity", 2, "slot", "m/s", "horizontal velocity of the target", target_velocity, True),
+        Component("gap", 2, "slot", "m", "own position minus the middle of the next gap, from above", gap_offset, True),
+        Component("clearance", 1, "-", "m", "own room to the next wall's edges, within ± 0.5", clearance),
+    )
+    EXTRA_STATE: ClassVar[tuple[Component, ...]] = (
+        Component("target_velocity", 3, "world", "m/s", "velocity of the target", target_velocity),
+        Component("gap", 3, "world", "m", "payload position minus the middle of the next gap", payload_gap_offset),
+    )
+
+    def prepare(self) -> None:
+        """See `Task.prepare`."""
+        option, system, e = self.options, self.world.system, self.world.num_envs
+        x = np.array([0.0] if option.gates == 1 else [-0.75, 0.75])
+        self.own = GateArrays(np.zeros((e, len(x))), np.zeros(e))
+        self.settings = GateSettings(
+            x=x,
+            half_width=option.gap_width / 2,
+            gap_height=option.gap_height,
+            begin=option.set_off,
+            duration=option.arrival - option.set_off,
+            arrival=option.arrival,
+            level=option.height,
+            radius=option.start_radius,
+            drone=np.array([drone_half_size(vehicle) for vehicle in system.vehicles]),
+            payload=system.payload_size / 2,
+            center=triple(system.payload_center),
+            bounds=RestBounds.of(option),
+        )
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw the gaps and where the team starts; see `Task.start`."""
+        option = self.options
+        self.own.peak_tension[env] = 0.0
+        self.own.gap_y[env] = rng.uniform(-option.gap_offset, option.gap_offset, option.gates)
+        start_before_gate(env, rng, self.view_for(start_before_gate), self.hanging)
+
+    def succeeded(self) -> np.ndarray:
+        """At rest at the goal throughout the last moments, and never too large a tension."""
+        return super().succeeded() & (self.own.peak_tension <= self.options.success_tension)
+
+    def target_path(self, env: int) -> np.ndarray:
+        """Return points of the path through the gaps; see `Task.target_path`."""
+        points = np.zeros((61, 3))
+        trace(env, self.options.arrival, self.view_for(trace), points)
+        return points
+
+    def scenery(self, env: int) -> list[Box]:
+        """Return the walls; see `Task.scenery`."""
+        half, gap, top = 2.5, self.settings.half_width, self.settings.gap_height
+        boxes = []
+        for x, y in zip(self.settings.x, self.own.gap_y[env], strict=True):
+            for side in (-1, 1):
+                boxes.append(Box((THICKNESS / 2, half / 2, top / 2), (x, y + side * (gap + half / 2), top / 2), _WALL))
+            boxes.append(Box((THICKNESS / 2, half + gap, 0.25), (x, y, top + 0.25), _WALL))
+        return boxes

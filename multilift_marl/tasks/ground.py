@@ -7,15 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import inlined, kernel
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.rig.resolve import MIN_SEPARATION
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.tasks import rewards
 from multilift_marl.tasks.rewards import tolerance
 
+FAR = 0.5  # [m] from its target, at which a payload's pose earns half
 _SLACK_REACH = 0.9  # of its cable: the farthest that a drone stands from its anchor
 
 
@@ -46,7 +48,7 @@ def make_ground(system: System) -> Ground:
     )
 
 
-def standing_distance(system: System, spread: float) -> np.ndarray:
+def resting_distance(system: System, spread: float) -> np.ndarray:
     """Return how far level (N,) [m] drones stand from the payload: at their slots' distance, or clear of it.
 
     Args:
@@ -72,11 +74,18 @@ def standing_distance(system: System, spread: float) -> np.ndarray:
 
 
 @kernel
-def stand_team(e, rng, state, goal, rig, ground, distance, spread):
+def place_on_ground(e, rng, v, ground, distance, spread):
     """Write a team at rest on the ground, its payload at the target of environment e.
 
-    The drones stand at level distances (N,) [m] from it, each moved by a vector uniform in a disc of radius `spread`.
+    Args:
+        e: the environment.
+        rng: generator of the episode.
+        v: View; its state is written.
+        ground: Ground.
+        distance: level distances (N,) of the drones from the payload [m].
+        spread: radius of the disc in which each drone is moved from there, uniformly [m].
     """
+    state, goal, rig = v.state, v.goal, v.rig
     put(state.payload_position[e], row(goal.position, e))
     putmat(state.payload_rotation[e], matrow(goal.rotation, e))
     state.payload_velocity[e] = state.payload_body_rates[e] = 0.0
@@ -99,46 +108,82 @@ def set_resting_goal(e, goal, position):
 
 
 @kernel
-def move_goal(e, goal, way, eased):
-    """Move the target of environment e along `way` [m] as `eased`, see `math3d.ease`; several ways add up."""
-    put(goal.position[e], add(row(goal.position, e), scale(eased[0], way)))
-    put(goal.velocity[e], add(row(goal.velocity, e), scale(eased[1], way)))
-    put(goal.acceleration[e], add(row(goal.acceleration, e), scale(eased[2], way)))
-    put(goal.jerk[e], add(row(goal.jerk, e), scale(eased[3], way)))
+def move_goal(e, goal, path, eased):
+    """Move the target of environment e along `path` (3,) [m] as `eased`, see `math3d.ease`; several paths add up."""
+    put(goal.position[e], add(row(goal.position, e), scale(eased[0], path)))
+    put(goal.velocity[e], add(row(goal.velocity, e), scale(eased[1], path)))
+    put(goal.acceleration[e], add(row(goal.acceleration, e), scale(eased[2], path)))
+    put(goal.jerk[e], add(row(goal.jerk, e), scale(eased[3], path)))
 
 
-@kernel
+@inlined
 def cable_chord(e, n, goal, rig):
-    """Return the way from where anchor n is at the target pose of environment e to the slot of its drone [m]."""
-    anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
-    at = add(row(goal.position, e), mul(matrow(goal.rotation, e), anchor))
-    return sub(vec(goal.slots, e, n), at)
+    """Return the vector from where anchor n is at the target pose of environment e to the slot of its drone [m]."""
+    anchor = add(row(goal.position, e), mul(matrow(goal.rotation, e), row(rig.anchors, n)))
+    return sub(vec(goal.slots, e, n), anchor)
 
 
-@kernel
-def share_force(e, n, goal, share, rig, cable_weight):
-    """Scale the nominal pull of drone n by `share`; of a slack cable the drone carries half its weight `rope` [N].
+@inlined
+def scale_cable_force(e, n, v, fraction, cable_weight):
+    """Scale the nominal cable force of drone n; of a slack cable the drone carries half its weight (N,) [N].
 
     What the drone's slot does about the target, the load does not: its inertia, which the controller feeds forward
     with all accelerations, is taken off again.
     """
-    cable_force = scale(share, vec(goal.cable_force, e, n))
+    goal, rig = v.goal, v.rig
+    cable_force = scale(fraction, vec(goal.cable_force, e, n))
     idle = scale(-rig.force[n, 2] / GRAVITY, vec(goal.slot_acceleration, e, n))
-    put(goal.cable_force[e, n], add(add(cable_force, idle), (0.0, 0.0, 0.5 * (1.0 - share) * cable_weight)))
+    carried = (0.0, 0.0, 0.5 * (1.0 - fraction) * cable_weight[n])
+    put(goal.cable_force[e, n], add(add(cable_force, idle), carried))
 
 
-@kernel
-def mean_slot_tolerance(e, state, goal, margin):
+@inlined
+def slot_tolerance(e, v, margin):
     """Return how well the drones of environment e keep their slots: the mean `tolerance` of their distances."""
-    total, count = 0.0, goal.slots.shape[1]
+    total, count = 0.0, v.goal.slots.shape[1]
     for n in range(count):
-        total += tolerance(norm(sub(vec(state.drone_position, e, n), vec(goal.slots, e, n))), margin)
+        total += tolerance(norm(sub(vec(v.state.drone_position, e, n), vec(v.goal.slots, e, n))), margin)
     return total / count
 
 
-@kernel
+@inlined
+def carried(e, v):
+    """Return by how much the payload's pose counts: as its weight is carried, and little if it lies elsewhere."""
+    return v.own.pull_fraction[e] * tolerance(v.errors.distance[e], FAR)
+
+
+@inlined
+def position(e, v, margin):
+    """Payload close to its target, while it is carried."""
+    return rewards.distance(e, v, margin) * carried(e, v)
+
+
+@inlined
+def attitude(e, v, margin):
+    """Payload close to its target's attitude, while it is carried."""
+    return rewards.attitude(e, v, margin) * carried(e, v)
+
+
+@inlined
+def steadiness(e, v, speed, rate):
+    """Payload as fast as its target, and turning slowly, while it is carried."""
+    return rewards.steadiness(e, v, speed, rate) * carried(e, v)
+
+
+@inlined
+def readiness(e, v, margin):
+    """Drones in their slots, while the payload is not carried."""
+    return (1.0 - v.own.pull_fraction[e]) * slot_tolerance(e, v, margin)
+
+
+@inlined
+def pull_fraction(e, n, v):
+    """Fraction of the nominal cable force that is fed forward."""
+    return v.own.pull_fraction[e]
+
+
+@inlined
 def cable_rise(e, n, state, rig):
     """Return how far drone n of environment e is above its anchor [m]."""
-    anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
-    turned = mul(matrow(state.payload_rotation, e), anchor)
+    turned = mul(matrow(state.payload_rotation, e), row(rig.anchors, n))
     return state.drone_position[e, n, 2] - state.payload_position[e, 2] - turned[2]

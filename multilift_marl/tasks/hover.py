@@ -1,21 +1,15 @@
-"""Hover: hold the payload at a target pose, whatever its mass and whatever pushes it."""
+"""Hover: hold the payload at a fixed pose despite a payload mass, and a force on it, that the drones do not know."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import radians
 from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import bind, kernel
-from multilift_marl.config.config import Config
 from multilift_marl.config.values import Float, Section
-from multilift_marl.control.formation import Reference
-from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.rewards import action_rate, pose_reward
+from multilift_marl.tasks.rewards import Term, action_rate, attitude, distance, steadiness
 from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
 
 
@@ -34,41 +28,19 @@ class Hover(Task):
     name: ClassVar[str] = "hover"
     Options: ClassVar[type[Section]] = HoverOptions
     options: HoverOptions
-    REWARD: ClassVar[dict[str, float]] = {
-        "position": 0.4,
-        "precision": 0.25,
-        "attitude": 0.15,
-        "level": 0.1,
-        "stillness": 0.1,
-        "action_rate": -0.05,
+    REWARD: ClassVar[dict[str, Term]] = {
+        "position": Term(0.4, distance, 0.25, "m"),
+        "precision": Term(0.25, distance, 0.01, "m"),
+        "attitude": Term(0.15, attitude, 6.0, "deg"),
+        "level": Term(0.1, attitude, 1.0, "deg"),
+        "stillness": Term(0.1, steadiness, (0.2, 0.3), "m/s, rad/s"),
+        "action_rate": Term(-0.05, action_rate),
     }
-
-    def __init__(self, config: Config, world: World, reference: Reference):
-        super().__init__(config, world, reference)
-        self._success_seconds = min(self.options.success_seconds, config.env.episode_seconds)
-        self._ranges = make_ranges(self.options)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, displacement, tilt and velocity; see `Task.start`."""
-        start_near_target(env, rng, self.world.state, self.goal, self.rig, self._ranges, self.hanging, mass)
-
-    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
-        """Pay for closeness, attitude and stillness; see `Task.scorer`."""
-        success = (self.options.success_distance, radians(self.options.success_angle))
-        return bind(
-            _score, lo, hi, self.world.state, self.goal, self.errors, action, previous, self.weights, success, self.dt,
-            self.terms, self.good_time,
-        )  # fmt: skip
+        start_near_target(env, rng, self.view_for(start_near_target), make_ranges(self.options), self.hanging)
 
     def succeeded(self) -> np.ndarray:
         """Within the success region throughout the last seconds."""
-        return self.good_time >= self._success_seconds - 1e-9
-
-
-@kernel
-def _score(lo, hi, state, goal, errors, action, previous, weights, success, dt, terms, good_time):
-    for e in range(lo, hi):
-        pose_reward(e, state, goal, errors, 1.0, weights, terms)
-        terms[e, 5] = weights[5] * action_rate(e, action, previous)
-        good = errors.distance[e] <= success[0] and errors.angle[e] <= success[1]
-        good_time[e] = good_time[e] + dt if good else 0.0
+        return self.good_time >= min(self.options.success_seconds, self.config.env.episode_seconds) - 1e-9

@@ -1,39 +1,44 @@
-"""Landing: put the payload down on a pad, softly, and let the cables go slack."""
+"""Land: the team puts its payload down on a pad and lets the cables go slack."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import cos, hypot, radians, sin
-from typing import Any, ClassVar, NamedTuple
+from math import hypot, radians
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import bind, kernel
-from multilift_marl.config.config import Config
+from multilift_marl._jit import inlined, kernel
 from multilift_marl.config.values import Float, Section
-from multilift_marl.control.formation import Reference, place_formation
-from multilift_marl.math3d import add, ease, matrow, norm, put, putmat, rot_z, row, scale, sub, tmul, turn, vec
+from multilift_marl.control.formation import place_formation
+from multilift_marl.math3d import add, ease, matrow, norm, put, putmat, rot_z, row, scale, sub, tmul, vec
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.sim.world import World
-from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.failures import LOAD_GROUND, TOUCH, ignore, payload_height
 from multilift_marl.tasks.ground import (
+    Ground,
+    attitude,
     cable_chord,
     make_ground,
-    mean_slot_tolerance,
     move_goal,
+    position,
+    pull_fraction,
+    readiness,
+    scale_cable_force,
     set_resting_goal,
-    share_force,
+    steadiness,
 )
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import action_rate, pose_reward, tolerance
+from multilift_marl.tasks.rewards import Term, action_rate, tolerance
 from multilift_marl.tasks.starts import hang_team
 
-APPROACH, DESCEND, SETTLE = (0.1, 2.7), (2.0, 2.8), (4.8, 1.6)  # begin and length of each phase [s]
-RELEASE, LOWER = (6.4, 2.2), (8.6, 1.4)
+APPROACH = (0.1, 2.7)  # begin and length of each phase [s], as of the next ones: level to the pad,
+DESCEND = (2.0, 2.8)  # down,
+SETTLE = (4.8, 1.6)  # slowly onto the ground,
+RELEASE = (6.4, 2.2)  # cable forces fade,
+LOWER = (8.6, 1.4)  # drones come closer
 DOWN = SETTLE[0] + SETTLE[1]  # [s] when the target is on the ground
-NEAR = 0.12  # [m] above the ground where the slow last part of the way begins, for the span of a falcon
+NEAR = 0.12  # [m] above the ground where the slow last part of the descent begins, for the span of a falcon
 SHORTER = 0.15  # of its length: how much nearer to its anchor a drone comes in the end
 AIRBORNE, LANDED, CRASHED = range(3)
 _LANDED_WELL = ignore(LOAD_GROUND)
@@ -54,19 +59,157 @@ class LandOptions(Section):
     success_seconds: Float = Field(1.0, gt=0, description="[s] at rest, slack and clear throughout the last seconds")
 
 
-class LandingLimits(NamedTuple):
-    """What counts as down, in SI units."""
+class LandArrays(NamedTuple):
+    """What an episode holds beside its goal."""
 
+    course: np.ndarray
+    """(E, 3) from the start to the pad [m]."""
+    touch: np.ndarray
+    """(E,) int64, AIRBORNE, LANDED or CRASHED."""
+    speed: np.ndarray
+    """(E,) of the payload a control step ago [m/s]."""
+    pull_fraction: np.ndarray
+    """(E,) of the nominal cable forces that is fed forward [-]."""
+
+
+class LandSettings(NamedTuple):
+    """Constants of the task, and what counts as landed."""
+
+    ground: Ground
     radius: float
+    """Payload within this of the pad's middle [m]."""
     speed: float
+    """Largest at touchdown [m/s]."""
     clearance: float
-    """Between the surfaces [m]."""
+    """Between the surfaces of drones, payload and ground [m]."""
     drone_half: float
     """Largest extent of the largest drone from its centre [m]."""
-    slack: np.ndarray
-    """(N,) tension of a slack cable, at most: a chain's own weight [N]."""
-    tension: np.ndarray
-    """(N,) of the cables at rest, nominal [N]."""
+
+
+@kernel
+def start_above_origin(e, rng, v, hanging, ranges):
+    """Draw the pad; write a team at rest above the origin. Ranges are x and y [m], heading [rad], height [m]."""
+    goal, (xy, yaw, height) = v.goal, ranges
+    put(v.own.course[e], (rng.uniform(-xy, xy), rng.uniform(-xy, xy), v.settings.ground.payload - height))
+    set_resting_goal(e, goal, (0.0, 0.0, height))
+    putmat(goal.rotation[e], rot_z(rng.uniform(-yaw, yaw)))
+    place_formation(e, goal, v.rig)
+    still = (0.0, 0.0, 0.0)
+    hang_team(e, v, goal, hanging, (row(goal.position, e), matrow(goal.rotation, e)), still, still)
+
+
+@inlined
+def advance(e, v):
+    """Move the goal on: to the pad, down, slowly onto it; then cable forces fade and drones come closer."""
+    goal, rig, own, ground, t = v.goal, v.rig, v.own, v.settings.ground, v.time[e]
+    course = row(own.course, e)
+    see_touchdown(e, v)
+    near = min(NEAR * ground.size, -course[2])
+    set_resting_goal(e, goal, (0.0, 0.0, ground.payload - course[2]))
+    move_goal(e, goal, (course[0], course[1], 0.0), ease(t, APPROACH[0], APPROACH[1]))
+    move_goal(e, goal, (0.0, 0.0, course[2] + near), ease(t, DESCEND[0], DESCEND[1]))
+    move_goal(e, goal, (0.0, 0.0, -near), ease(t, SETTLE[0], SETTLE[1]))
+    place_formation(e, goal, rig)
+    own.pull_fraction[e] = 1.0 - ease(t, RELEASE[0], RELEASE[1])[0]
+    lower = ease(t, LOWER[0], LOWER[1])
+    for n in range(rig.slots.shape[0]):
+        chord = cable_chord(e, n, goal, rig)
+        put(goal.slots[e, n], add(vec(goal.slots, e, n), scale(-SHORTER * lower[0], chord)))
+        put(goal.slot_velocity[e, n], scale(-SHORTER * lower[1], chord))
+        put(goal.slot_acceleration[e, n], scale(-SHORTER * lower[2], chord))
+        scale_cable_force(e, n, v, own.pull_fraction[e], ground.cable_weight)
+
+
+@kernel
+def advance_once(e, v):
+    """Do as `advance`, for a start."""
+    advance(e, v)
+
+
+@inlined
+def see_touchdown(e, v):
+    """Classify the payload's first touch of the ground by its speed now or a control step ago.
+
+    The ground is no failure for one that has landed well.
+    """
+    own, settings = v.own, v.settings
+    speed = norm(row(v.state.payload_velocity, e))
+    if own.touch[e] == AIRBORNE and load_height(e, v.state, v.limits) < TOUCH:
+        soft = max(speed, own.speed[e]) <= settings.speed
+        own.touch[e] = LANDED if soft and off_pad(e, v) <= settings.radius else CRASHED
+    own.speed[e] = speed
+    v.mask.ignored[e] = _LANDED_WELL if own.touch[e] == LANDED else 0
+
+
+@inlined
+def load_height(e, state, limits):
+    """Return the height of the lowest point of the payload of environment e [m]."""
+    return payload_height(row(state.payload_position, e), matrow(state.payload_rotation, e), limits)
+
+
+@inlined
+def off_pad(e, v):
+    """Return the level distance of the payload of environment e from the middle of its pad [m]."""
+    payload, course = v.state.payload_position, v.own.course
+    return hypot(payload[e, 0] - course[e, 0], payload[e, 1] - course[e, 1])
+
+
+@inlined
+def _drone_clear(e, n, v):
+    """Return whether drone n of environment e is clear of payload and ground."""
+    drone = vec(v.state.drone_position, e, n)
+    away = tmul(matrow(v.state.payload_rotation, e), sub(drone, row(v.state.payload_position, e)))
+    center, half = v.limits.payload_center, v.limits.payload_half  # a cylinder counts as the box about it
+    x = max(abs(away[0] - center[0]) - half[0], 0.0)
+    y = max(abs(away[1] - center[1]) - half[1], 0.0)
+    z = max(abs(away[2] - center[2]) - half[2], 0.0)
+    return min(norm((x, y, z)), drone[2]) - v.settings.drone_half >= v.settings.clearance
+
+
+@inlined
+def _excess(e, n, v):
+    """Return by how much the tension of cable n is above that of a slack one, a chain's own weight [N]."""
+    return max(v.state.cable_tension[e, n] - v.settings.ground.cable_weight[n], 0.0)
+
+
+@inlined
+def is_put_down(e, v):
+    """Payload at rest on the pad, every cable slack, every drone clear."""
+    good = off_pad(e, v) <= v.settings.radius
+    for n in range(v.action.shape[1]):
+        good = good and _excess(e, n, v) == 0.0 and _drone_clear(e, n, v)
+    return good and norm(row(v.state.payload_velocity, e)) <= _AT_REST and load_height(e, v.state, v.limits) < TOUCH
+
+
+@inlined
+def slackness(e, v, margin):
+    """Cables slack, once the payload is not carried; the margin counts tensions over those at rest."""
+    loose, count = 0.0, v.action.shape[1]
+    for n in range(count):
+        loose += tolerance(_excess(e, n, v) / v.resting_tension[n], margin) / count
+    return (1.0 - v.own.pull_fraction[e]) * loose
+
+
+@inlined
+def time_to_touch(e, n, v):
+    """Time until the target is on the ground."""
+    return DOWN - v.time[e]
+
+
+@inlined
+def target_velocity(e, n, v):
+    """Velocity of the target."""
+    return row(v.goal.velocity, e)
+
+
+def _components(frame: str) -> tuple[Component, ...]:
+    return (
+        Component(
+            "time_to_touch", 1, "-", "s", "until the target is on the ground; negative afterwards", time_to_touch
+        ),
+        Component("pull_share", 1, "-", "-", "share of the nominal cable force that is fed forward", pull_fraction),
+        Component("target_velocity", 3, frame, "m/s", "velocity of the target", target_velocity),
+    )
 
 
 class Land(Task):
@@ -75,182 +218,44 @@ class Land(Task):
     name: ClassVar[str] = "land"
     Options: ClassVar[type[Section]] = LandOptions
     options: LandOptions
-    REWARD: ClassVar[dict[str, float]] = {
-        "position": 0.4,
-        "precision": 0.25,
-        "attitude": 0.15,
-        "level": 0.1,
-        "stillness": 0.1,
-        "ready": 0.5,
-        "slack": 0.5,
-        "action_rate": -0.05,
+    own: LandArrays
+    settings: LandSettings
+    REWARD: ClassVar[dict[str, Term]] = {
+        "position": Term(0.4, position, 0.25, "m"),
+        "precision": Term(0.25, position, 0.01, "m"),
+        "attitude": Term(0.15, attitude, 6.0, "deg"),
+        "level": Term(0.1, attitude, 1.0, "deg"),
+        "stillness": Term(0.1, steadiness, (0.2, 0.3), "m/s, rad/s"),
+        "ready": Term(0.5, readiness, 0.25, "m"),
+        "slack": Term(0.5, slackness, 0.1, "-"),
+        "action_rate": Term(-0.05, action_rate),
     }
-    EXTRA: ClassVar[tuple[Component, ...]] = (
-        Component("time_to_touch", 1, "-", "s", "until the target is on the ground; negative afterwards"),
-        Component("pull_share", 1, "-", "-", "share of the nominal pull that is fed forward"),
-        Component("target_velocity", 3, "slot", "m/s", "velocity of the target"),
-    )
-    EXTRA_STATE: ClassVar[int] = 5
-    SAVED: ClassVar[tuple[str, ...]] = ("course", "touch", "speed", "share")
+    KERNELS: ClassVar[Kernels] = Kernels(is_good=is_put_down, plan=advance, check=see_touchdown)
+    EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
+    EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")
 
-    def __init__(self, config: Config, world: World, reference: Reference):
-        super().__init__(config, world, reference)
-        e, system, option = world.num_envs, world.system, self.options
-        self._ground = make_ground(system)
-        size, cable_weight = self._ground.size, self._ground.cable_weight
+    def prepare(self) -> None:
+        """See `Task.prepare`."""
+        option, system, e = self.options, self.world.system, self.world.num_envs
+        ground = make_ground(system)
         half = max((drone_half_size(vehicle) for vehicle in system.vehicles), key=np.linalg.norm)
-        self._down = LandingLimits(
-            option.pad_radius, option.touch_speed, option.clearance * min(size, 1.0), float(np.linalg.norm(half)),
-            cable_weight, system.resting_tension,
-        )  # fmt: skip
-        self.course, self.touch = np.zeros((e, 3)), np.zeros(e, np.int64)
-        self.speed, self.share = np.zeros(e), np.zeros(e)
+        self.own = LandArrays(np.zeros((e, 3)), np.zeros(e, np.int64), np.zeros(e), np.zeros(e))
+        self.settings = LandSettings(
+            ground=ground,
+            radius=option.pad_radius,
+            speed=option.touch_speed,
+            clearance=option.clearance * min(ground.size, 1.0),
+            drone_half=float(np.linalg.norm(half)),
+        )
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw the pad; the team hangs at rest above the origin. See `Task.start`."""
         option = self.options
-        _start(
-            env, rng, self.world.state, self.goal, self.rig, self.hanging, mass, option.pad_xy, radians(option.pad_yaw),
-            self._ground.payload, option.start_height, self.course,
-        )  # fmt: skip
-        self.touch[env], self.speed[env], self.time[env] = AIRBORNE, 0.0, 0.0
-        _plan(env, env + 1, 0.0, *self._planned())
-
-    def planner(self, lo: int, hi: int) -> Callable[[], None]:
-        """Fly to the pad, descend, settle, release, come lower; see `Task.planner`."""
-        return bind(_plan, lo, hi, self.control_dt, *self._planned())
-
-    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
-        """Tell where in the plan the team is; see `Task.observer`."""
-        return bind(_observe, lo, hi, self.time, self.share, self.goal, observation, critic)
-
-    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
-        """Pay for keeping the plan, as payload first and as slack drones later; see `Task.scorer`."""
-        return bind(
-            _score, lo, hi, self.world.state, self.goal, self.errors, self.course, self.share, self.limits, self._down,
-            action, previous, self.weights, self.dt, self.terms, self.good_time,
-        )  # fmt: skip
-
-    def after_step(
-        self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray, observation: np.ndarray, critic: np.ndarray
-    ) -> list[Callable[[], None]]:
-        """See who touches the ground before failures are looked for; see `Task.after_step`."""
-        touching = (self.course, self.touch, self.speed, self.world.state, self.limits, self._down, self.watch)
-        judge = bind(_touch_down, lo, hi, *touching)
-        return [judge, *super().after_step(lo, hi, action, previous, observation, critic)]
+        ranges = option.pad_xy, radians(option.pad_yaw), option.start_height
+        start_above_origin(env, rng, self.view_for(start_above_origin), self.hanging, ranges)
+        self.own.touch[env], self.own.speed[env], self.time[env] = AIRBORNE, 0.0, 0.0
+        advance_once(env, self.view_for(advance_once))
 
     def succeeded(self) -> np.ndarray:
         """Touched down softly, and at rest, slack and clear throughout the last seconds."""
-        return (self.touch == LANDED) & (self.good_time >= self.options.success_seconds - 1e-9)
-
-    def _planned(self) -> tuple[Any, ...]:
-        return (
-            self.time, self.course, self.touch, self.speed, self.share, self.world.state, self.goal, self.rig,
-            self._ground, self.limits, self._down, self.watch,
-        )  # fmt: skip
-
-
-@kernel
-def _start(e, rng, state, goal, rig, hanging, mass, xy, yaw, low, high, way):
-    put(way[e], (rng.uniform(-xy, xy), rng.uniform(-xy, xy), low - high))
-    set_resting_goal(e, goal, (0.0, 0.0, high))
-    putmat(goal.rotation[e], rot_z(rng.uniform(-yaw, yaw)))
-    place_formation(e, goal, rig)
-    still = (0.0, 0.0, 0.0)
-    hang_team(e, state, goal, rig, hanging, mass, row(goal.position, e), matrow(goal.rotation, e), still, still)
-
-
-@kernel
-def _plan(lo, hi, dt, time, way, touch, speed, share, state, goal, rig, ground, limits, down, watch):
-    """Move the goals of environments lo to hi on by `dt`, and see who touches the ground."""
-    _touch_down(lo, hi, way, touch, speed, state, limits, down, watch)
-    for e in range(lo, hi):
-        time[e] += dt
-        t, near = time[e], min(NEAR * ground.size, -way[e, 2])
-        set_resting_goal(e, goal, (0.0, 0.0, ground.payload - way[e, 2]))
-        move_goal(e, goal, (way[e, 0], way[e, 1], 0.0), ease(t, APPROACH[0], APPROACH[1]))
-        move_goal(e, goal, (0.0, 0.0, way[e, 2] + near), ease(t, DESCEND[0], DESCEND[1]))
-        move_goal(e, goal, (0.0, 0.0, -near), ease(t, SETTLE[0], SETTLE[1]))
-        place_formation(e, goal, rig)
-        share[e] = 1.0 - ease(t, RELEASE[0], RELEASE[1])[0]
-        lower = ease(t, LOWER[0], LOWER[1])
-        for n in range(rig.slots.shape[0]):
-            chord = cable_chord(e, n, goal, rig)
-            put(goal.slots[e, n], add(vec(goal.slots, e, n), scale(-SHORTER * lower[0], chord)))
-            put(goal.slot_velocity[e, n], scale(-SHORTER * lower[1], chord))
-            put(goal.slot_acceleration[e, n], scale(-SHORTER * lower[2], chord))
-            share_force(e, n, goal, share[e], rig, ground.cable_weight[n])
-
-
-@kernel
-def _touch_down(lo, hi, way, touch, speed, state, limits, down, watch):
-    """Judge payloads that touch the ground for the first time, by their speed now or a control step ago.
-
-    The ground is no failure for one that has come down well.
-    """
-    for e in range(lo, hi):
-        velocity = norm(row(state.payload_velocity, e))
-        if touch[e] == AIRBORNE and load_height(e, state, limits) < TOUCH:
-            soft = max(velocity, speed[e]) <= down.speed
-            touch[e] = LANDED if soft and off_pad(e, way, state) <= down.radius else CRASHED
-        speed[e] = velocity
-        watch.ignored[e] = _LANDED_WELL if touch[e] == LANDED else 0
-
-
-@kernel
-def load_height(e, state, limits):
-    """Return the height of the lowest point of the payload of environment e [m]."""
-    return payload_height(row(state.payload_position, e), matrow(state.payload_rotation, e), limits)
-
-
-@kernel
-def off_pad(e, way, state):
-    """Return the level distance of the payload of environment e from the middle of its pad [m]."""
-    return hypot(state.payload_position[e, 0] - way[e, 0], state.payload_position[e, 1] - way[e, 1])
-
-
-@kernel
-def _drone_clear(e, n, state, limits, down):
-    """Return whether drone n of environment e is clear of payload and ground."""
-    drone = vec(state.drone_position, e, n)
-    away = tmul(matrow(state.payload_rotation, e), sub(drone, row(state.payload_position, e)))
-    center, half = limits.payload_center, limits.payload_half  # a cylinder counts as the box about it
-    x = max(abs(away[0] - center[0]) - half[0], 0.0)
-    y = max(abs(away[1] - center[1]) - half[1], 0.0)
-    z = max(abs(away[2] - center[2]) - half[2], 0.0)
-    return min(norm((x, y, z)), drone[2]) - down.drone_half >= down.clearance
-
-
-@kernel
-def _observe(lo, hi, time, share, goal, observation, critic):
-    for e in range(lo, hi):
-        c, s, velocity = cos(goal.yaw[e]), -sin(goal.yaw[e]), row(goal.velocity, e)
-        _write_observation(critic[e, critic.shape[1] - 5 :], time[e], share[e], turn(c, s, velocity))
-        for n in range(observation.shape[1]):
-            cn, sn = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
-            _write_observation(observation[e, n, observation.shape[2] - 5 :], time[e], share[e], turn(cn, sn, velocity))
-
-
-@kernel
-def _write_observation(out, time, share, velocity):
-    out[0], out[1] = DOWN - time, share
-    put(out[2:], velocity)
-
-
-@kernel
-def _score(
-    lo, hi, state, goal, errors, way, share, limits, down, action, previous, weights, dt, terms, good_time
-):  # fmt: skip
-    for e in range(lo, hi):
-        near = tolerance(errors.distance[e], 0.5)  # a payload that lies still elsewhere earns little
-        pose_reward(e, state, goal, errors, share[e] * near, weights, terms)
-        loose, good, count = 0.0, off_pad(e, way, state) <= down.radius, goal.slots.shape[1]
-        for n in range(count):
-            excess = max(state.cable_tension[e, n] - down.slack[n], 0.0)
-            loose += tolerance(excess / down.tension[n], 0.1) / count
-            good = good and excess == 0.0 and _drone_clear(e, n, state, limits, down)
-        terms[e, 5] = weights[5] * (1.0 - share[e]) * mean_slot_tolerance(e, state, goal, 0.25)
-        terms[e, 6] = weights[6] * (1.0 - share[e]) * loose
-        terms[e, 7] = weights[7] * action_rate(e, action, previous)
-        good = good and norm(row(state.payload_velocity, e)) <= _AT_REST and load_height(e, state, limits) < TOUCH
-        good_time[e] = good_time[e] + dt if good else 0.0
+        return (self.own.touch == LANDED) & super().succeeded()

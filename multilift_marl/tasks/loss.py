@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import cos, radians, sin
-from typing import ClassVar
+from math import cos, sin
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import bind, kernel
-from multilift_marl.config.config import Config
+from multilift_marl._jit import inlined
 from multilift_marl.config.values import Float, Section
-from multilift_marl.control.formation import Reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.redistribution import RAMP, WAIT, plan_offset, redistributed_slots
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import norm, put, row, scale
-from multilift_marl.sim.world import World
-from multilift_marl.tasks.base import Task
+from multilift_marl.math3d import scale
+from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import RestBounds, action_rate, is_at_rest, tolerance, update_peak_tension
+from multilift_marl.tasks.rewards import (
+    RestBounds,
+    Term,
+    action_rate,
+    attitude,
+    distance,
+    stillness,
+    update_peak_tension,
+)
 from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
 
 
@@ -41,117 +45,134 @@ class LossOptions(StartOptions):
     )  # fmt: skip
 
 
+class LossArrays(NamedTuple):
+    """Who is lost in an episode, and when."""
+
+    when: np.ndarray
+    """(E,) the motors stop [s]."""
+    who: np.ndarray
+    """(E,) number of the drone, int64."""
+    peak_tension: np.ndarray
+    """(E,) largest tension in the episode over that at rest [-]."""
+
+
+class LossSettings(NamedTuple):
+    """Constants of the task."""
+
+    bounds: RestBounds
+    snap: bool
+    """Whether the lost drone's cable breaks."""
+    offsets: np.ndarray
+    """(N lost, N, 3) by how much slots are to move after a loss, see `redistributed_slots` [m]."""
+
+
+@inlined
+def stop_motors(e, v):
+    """Stop the motors when their time has come."""
+    who = v.own.who[e]
+    if v.time[e] >= v.own.when[e] and not v.mask.lost[e, who]:
+        v.mask.lost[e, who] = True
+        v.loads.motors_off[e, who] = True
+        if v.settings.snap:
+            v.state.cable_broken[e, who] = True
+    update_peak_tension(e, v, v.own.peak_tension)
+
+
+@inlined
+def lost(e, n, v):
+    """1 if the own motors have stopped."""
+    return 1.0 if v.mask.lost[e, n] else 0.0
+
+
+@inlined
+def team_lost(e, n, v):
+    """1 if those of any drone have."""
+    return 1.0 if v.mask.lost[e, v.own.who[e]] else 0.0
+
+
+@inlined
+def lost_direction(e, n, v):
+    """Cosine and sine of the lost drone's azimuth from the own one; 0 before."""
+    angle, any_lost = v.rig.azimuth[v.own.who[e]] - v.rig.azimuth[n], team_lost(e, n, v)
+    return any_lost * cos(angle), any_lost * sin(angle)
+
+
+@inlined
+def planned_offset(e, n, v):
+    """By how much the own slot is to move after a loss, in its frame."""
+    who, seconds = v.own.who[e], v.time[e] - v.own.when[e]
+    cosine = cos(v.rig.azimuth[who] - v.rig.azimuth[n])
+    offset = plan_offset(seconds, v.settings.offsets[who, n], cosine, not v.settings.snap)
+    return scale(team_lost(e, n, v), offset)
+
+
+@inlined
+def lost_azimuth(e, n, v):
+    """Cosine and sine of the lost drone's azimuth; 0 before."""
+    azimuth, any_lost = v.rig.azimuth[v.own.who[e]], team_lost(e, n, v)
+    return any_lost * cos(azimuth), any_lost * sin(azimuth)
+
+
+@inlined
+def progress(e, n, v):
+    """Time since the loss over that of the planned motion, at most 1."""
+    return team_lost(e, n, v) * min((v.time[e] - v.own.when[e]) / (WAIT + RAMP), 1.0)
+
+
 class Loss(Task):
     """Hold the payload with one drone less; see docs/loss.md."""
 
     name: ClassVar[str] = "loss"
     Options: ClassVar[type[Section]] = LossOptions
     options: LossOptions
-    REWARD: ClassVar[dict[str, float]] = {
-        "position": 0.45,
-        "precision": 0.25,
-        "attitude": 0.15,
-        "stillness": 0.15,
-        "action_rate": -0.05,
+    own: LossArrays
+    REWARD: ClassVar[dict[str, Term]] = {
+        "position": Term(0.45, distance, 0.25, "m"),
+        "precision": Term(0.25, distance, 0.03, "m"),
+        "attitude": Term(0.15, attitude, 20.0, "deg"),
+        "stillness": Term(0.15, stillness, (0.2, 0.3), "m/s, rad/s"),
+        "action_rate": Term(-0.05, action_rate),
     }
+    KERNELS: ClassVar[Kernels] = Kernels(plan=stop_motors)
     EXTRA: ClassVar[tuple[Component, ...]] = (
-        Component("lost", 1, "-", "-", "1 if the own motors have stopped"),
-        Component("team_lost", 1, "-", "-", "1 if those of any drone have"),
-        Component("lost_direction", 2, "slot", "-", "cosine and sine of its azimuth from the own one; 0 before"),
-        Component("planned_offset", 3, "slot", "m", "by how much the own slot is to move after a loss, by a plan"),
+        Component("lost", 1, "-", "-", "1 if the own motors have stopped", lost),
+        Component("team_lost", 1, "-", "-", "1 if those of any drone have", team_lost),
+        Component(
+            "lost_direction", 2, "slot", "-", "cosine and sine of its azimuth from the own one; 0 before",
+            lost_direction,
+        ),
+        Component(
+            "planned_offset", 3, "slot", "m", "by how much the own slot is to move after a loss, by a plan",
+            planned_offset, False,
+        ),
+    )  # fmt: skip
+    EXTRA_STATE: ClassVar[tuple[Component, ...]] = (
+        Component("team_lost", 1, "-", "-", "1 if a drone's motors have stopped", team_lost),
+        Component("lost_azimuth", 2, "-", "-", "cosine and sine of its azimuth; 0 before", lost_azimuth),
+        Component("progress", 1, "-", "-", "of the planned motion", progress),
     )
-    EXTRA_STATE: ClassVar[int] = 4
     MIN_DRONES: ClassVar[int] = 2
-    SAVED: ClassVar[tuple[str, ...]] = ("when", "who", "peak_tension")
 
-    def __init__(self, config: Config, world: World, reference: Reference):
-        super().__init__(config, world, reference)
-        early, late = self.options.loss_time
+    def prepare(self) -> None:
+        """See `Task.prepare`."""
+        option, world, control = self.options, self.world, self.config.control
+        early, late = option.loss_time
         if not 0 <= early <= late:
-            raise ConfigError(f"task_options.loss_time={self.options.loss_time} must list the earlier one first")
-        self._ranges = make_ranges(self.options)
-        self.when, self.who = np.zeros(world.num_envs), np.zeros(world.num_envs, np.int64)
-        world.breakable = world.breakable or self.options.snap
-        self.peak_tension = np.zeros(world.num_envs)
-        self._held = redistributed_slots(
-            world.system, make_gains(config.control, world.system), not self.options.snap, config.control.max_offset
-        )
+            raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
+        world.breakable = world.breakable or option.snap
+        e, gains = world.num_envs, make_gains(control, world.system)
+        offsets = redistributed_slots(world.system, gains, not option.snap, control.max_offset)
+        self.own = LossArrays(np.zeros(e), np.zeros(e, np.int64), np.zeros(e))
+        self.settings = LossSettings(RestBounds.of(option), option.snap, offsets)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, start, drone and time; see `Task.start`."""
-        start_near_target(env, rng, self.world.state, self.goal, self.rig, self._ranges, self.hanging, mass)
-        self.who[env], self.when[env] = rng.integers(self.world.num_drones), rng.uniform(*self.options.loss_time)
-        self.watch.lost[env], self.peak_tension[env] = False, 0.0
-
-    def planner(self, lo: int, hi: int) -> Callable[[], None]:
-        """Stop the motors when their time has come; see `Task.planner`."""
-        state, hidden_loads = self.world.state, self.world.hidden_loads
-        tensions = (self.world.system.resting_tension, self.peak_tension)
-        return bind(
-            _lose, lo, hi, self.time, self.control_dt, self.when, self.who, self.options.snap, state, hidden_loads,
-            self.watch, tensions,
-        )  # fmt: skip
-
-    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
-        """Tell who is lost; see `Task.observer`."""
-        told = (self.time, self.when, self.who, self._held)
-        return bind(_write_observation, lo, hi, told, not self.options.snap, self.watch, self.rig, observation, critic)
-
-    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
-        """Pay for closeness, attitude and stillness; see `Task.scorer`."""
-        option = self.options
-        bounds = RestBounds(
-            option.success_distance, radians(option.success_angle), option.success_speed, option.success_body_rate
-        )
-        return bind(
-            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights, bounds, self.dt,
-            self.terms, self.good_time,
-        )  # fmt: skip
+        start_near_target(env, rng, self.view_for(start_near_target), make_ranges(self.options), self.hanging)
+        self.own.who[env] = rng.integers(self.world.num_drones)
+        self.own.when[env] = rng.uniform(*self.options.loss_time)
+        self.mask.lost[env], self.own.peak_tension[env] = False, 0.0
 
     def succeeded(self) -> np.ndarray:
         """At rest throughout the last seconds, with a drone less, and never too large a tension."""
-        rested = (self.good_time >= self.options.success_seconds - 1e-9) & self.watch.lost.any(axis=1)
-        return rested & (self.peak_tension <= self.options.success_tension)
-
-
-@kernel
-def _lose(lo, hi, time, dt, when, who, snap, state, hidden_loads, watch, tensions):
-    resting, peak = tensions
-    for e in range(lo, hi):
-        time[e] += dt
-        if time[e] >= when[e] and not watch.lost[e, who[e]]:
-            watch.lost[e, who[e]] = True
-            hidden_loads.motors_off[e, who[e]] = True
-            if snap:
-                state.cable_broken[e, who[e]] = True
-        update_peak_tension(e, state, watch, resting, peak)
-
-
-@kernel
-def _write_observation(lo, hi, told, hangs, watch, rig, observation, critic):
-    time, when, who, held = told
-    for e in range(lo, hi):
-        lost, seconds = who[e], time[e] - when[e]
-        any_lost, azimuth = 1.0 if watch.lost[e, lost] else 0.0, rig.azimuth[lost]
-        out = critic[e, critic.shape[1] - 4 :]
-        out[0], out[1], out[2] = any_lost, any_lost * cos(azimuth), any_lost * sin(azimuth)
-        out[3] = any_lost * min(seconds / (WAIT + RAMP), 1.0)
-        for n in range(observation.shape[1]):
-            own = observation[e, n, observation.shape[2] - 7 :]
-            own[0], own[1] = 1.0 if watch.lost[e, n] else 0.0, any_lost
-            own[2] = any_lost * cos(azimuth - rig.azimuth[n])
-            own[3] = any_lost * sin(azimuth - rig.azimuth[n])
-            put(own[4:], scale(any_lost, plan_offset(seconds, held[lost, n], cos(azimuth - rig.azimuth[n]), hangs)))
-
-
-@kernel
-def _score(lo, hi, state, errors, action, previous, weights, bounds, dt, terms, good_time):
-    for e in range(lo, hi):
-        distance, angle = errors.distance[e], errors.angle[e]
-        speed, spin = norm(row(state.payload_velocity, e)), norm(row(state.payload_body_rates, e))
-        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
-        terms[e, 1] = weights[1] * tolerance(distance, 0.03)
-        terms[e, 2] = weights[2] * tolerance(angle, radians(20.0))
-        terms[e, 3] = weights[3] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
-        terms[e, 4] = weights[4] * action_rate(e, action, previous)
-        good_time[e] = good_time[e] + dt if is_at_rest(e, state, errors, bounds) else 0.0
+        rested = super().succeeded() & self.mask.lost.any(axis=1)
+        return rested & (self.own.peak_tension <= self.options.success_tension)

@@ -1,4 +1,4 @@
-"""What each drone observes, and the global state for a critic, common to all tasks.
+"""What each drone observes, and the global state for a critic: tables of components, each with what computes it.
 
 Vectors are given in the drone's slot frame (x outward from the target payload pose through the drone's slot, z up):
 in it the same situation looks the same to every drone, and an action of the `reference` interface points the same way.
@@ -6,52 +6,257 @@ in it the same situation looks the same to every drone, and an action of the `re
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from math import cos, sin
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from multilift_marl._jit import kernel
+import numpy as np
+
+from multilift_marl._jit import compose, inlined, kernel
+from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, column, heading, mat, matrow, mul, row, scale, sub, turn, vec
 
-
-class Component(NamedTuple):
-    """One named part of an observation."""
-
-    name: str
-    size: int
-    frame: str
-    unit: str
-    meaning: str
-
-
-OBSERVATION = (
-    Component("slot_error", 3, "slot", "m", "own position minus own slot about the target pose"),
-    Component("velocity", 3, "slot", "m/s", "own velocity"),
-    Component("thrust_axis", 3, "slot", "-", "own body z axis"),
-    Component("heading", 2, "target", "-", "cosine and sine of own heading relative to the target's"),
-    Component("body_rates", 3, "body", "rad/s", "own angular velocity"),
-    Component("tracking_error", 3, "slot", "m", "own position minus own smoothed reference"),
-    Component("reference_velocity", 3, "slot", "m/s", "velocity of own smoothed reference"),
-    Component(
-        "anchor_error", 3, "slot", "m", "own cable's attachment on the payload minus its place at the target pose"
-    ),
-    Component("cable", 3, "slot", "-", "from own attachment to own hook, over the cable's natural length"),
-    Component("payload_error", 3, "slot", "m", "payload position minus target"),
-    Component("payload_velocity", 3, "slot", "m/s", "payload velocity"),
-    Component("payload_rotation_error", 3, "slot", "rad", "rotation vector from target to payload attitude"),
-    Component("payload_angular_velocity", 3, "slot", "rad/s", "angular velocity of the payload"),
-    Component("payload_error_integral", 3, "slot", "m s", "clipped integral of payload_error"),
-    Component("rotation_error_integral", 3, "slot", "rad s", "clipped integral of payload_rotation_error"),
-    Component("slot_direction", 2, "target", "-", "cosine and sine of the own slot's azimuth"),
-    Component("previous_action", 4, "-", "-", "own last action"),  # as many as the action interface has
-)
 FRAMES = {
     "world": "z up",
     "target": "the world, turned about z to the heading atan2(-R01, R11) of the payload's target attitude R",
     "slot": "x horizontal, outward from the target payload position through the drone's slot, y to the left, z up",
     "body": "of the drone itself: x forward, y left, z along the thrust",
 }
-_STATE_SHARED = 26  # numbers of the global state that belong to no drone; see observe_team
-_STATE_DRONE = 18  # numbers for each drone, beside its action
+
+
+class Component(NamedTuple):
+    """One named part of an observation, or of the global state."""
+
+    name: str
+    size: int
+    """How many numbers."""
+    frame: str
+    """A key of `FRAMES`, or "-"."""
+    unit: str
+    meaning: str
+    value: Callable[..., Any]
+    """Inlined kernel of (e, n, View) that returns a number or a tuple; n is 0 for what belongs to no drone. In the
+    global state, `seen` is the true state."""
+    turned: bool | None = None
+    """Whether `value` is a vector in the world frame, to be turned into `frame`; None: three numbers in a slot or
+    target frame are."""
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the value is turned from the world frame."""
+        return self.turned if self.turned is not None else self.size == 3 and self.frame in ("slot", "target")
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether only the level part of a turned vector counts."""
+        return self.is_turned and self.size == 2
+
+
+@inlined
+def slot_error(e, n, v):
+    """Own position minus own slot."""
+    return sub(vec(v.seen.drone_position, e, n), vec(v.goal.slots, e, n))
+
+
+@inlined
+def own_velocity(e, n, v):
+    """Own velocity."""
+    return vec(v.seen.drone_velocity, e, n)
+
+
+@inlined
+def thrust_axis(e, n, v):
+    """Own body z axis."""
+    return column(mat(v.seen.drone_rotation, e, n), 2)
+
+
+@inlined
+def relative_heading(e, n, v):
+    """Cosine and sine of the own heading relative to the target's."""
+    yaw = heading(mat(v.seen.drone_rotation, e, n)) - v.goal.yaw[e]
+    return cos(yaw), sin(yaw)
+
+
+@inlined
+def body_rates(e, n, v):
+    """Own angular velocity."""
+    return vec(v.seen.drone_body_rates, e, n)
+
+
+@inlined
+def tracking_error(e, n, v):
+    """Own position minus own smoothed reference."""
+    return sub(vec(v.seen.drone_position, e, n), vec(v.reference.position, e, n))
+
+
+@inlined
+def reference_velocity(e, n, v):
+    """Velocity of the own smoothed reference."""
+    return vec(v.reference.velocity, e, n)
+
+
+@inlined
+def anchor_position(e, n, v):
+    """Where the own cable is attached to the payload."""
+    attitude = matrow(v.seen.payload_rotation, e)
+    return add(row(v.seen.payload_position, e), mul(attitude, row(v.rig.anchors, n)))
+
+
+@inlined
+def anchor_error(e, n, v):
+    """Own anchor minus its place at the target pose."""
+    target = add(row(v.goal.position, e), mul(matrow(v.goal.rotation, e), row(v.rig.anchors, n)))
+    return sub(anchor_position(e, n, v), target)
+
+
+@inlined
+def cable_vector(e, n, v):
+    """From own anchor to own hook."""
+    hook = mul(mat(v.seen.drone_rotation, e, n), row(v.rig.drones.hooks, n))
+    return sub(add(vec(v.seen.drone_position, e, n), hook), anchor_position(e, n, v))
+
+
+@inlined
+def cable(e, n, v):
+    """From own anchor to own hook, over the cable's natural length."""
+    return scale(1.0 / v.nominal.length[n], cable_vector(e, n, v))
+
+
+@inlined
+def payload_error(e, n, v):
+    """Payload position minus target."""
+    return row(v.seen_errors.position, e)
+
+
+@inlined
+def payload_velocity(e, n, v):
+    """Payload velocity."""
+    return row(v.seen.payload_velocity, e)
+
+
+@inlined
+def payload_rotation_error(e, n, v):
+    """Rotation vector from target to payload attitude."""
+    return row(v.seen_errors.rotation, e)
+
+
+@inlined
+def payload_angular_velocity(e, n, v):
+    """Angular velocity of the payload."""
+    return mul(matrow(v.seen.payload_rotation, e), row(v.seen.payload_body_rates, e))
+
+
+@inlined
+def payload_error_integral(e, n, v):
+    """Clipped integral of payload_error."""
+    return row(v.seen_errors.position_integral, e)
+
+
+@inlined
+def rotation_error_integral(e, n, v):
+    """Clipped integral of payload_rotation_error."""
+    return row(v.seen_errors.rotation_integral, e)
+
+
+@inlined
+def slot_direction(e, n, v):
+    """Cosine and sine of the own slot's azimuth."""
+    return cos(v.rig.azimuth[n]), sin(v.rig.azimuth[n])
+
+
+@inlined
+def payload_force(e, n, v):
+    """Hidden force on the payload."""
+    return row(v.loads.payload_force, e)
+
+
+@inlined
+def wind(e, n, v):
+    """Mean wind."""
+    return row(v.loads.wind, e)
+
+
+@inlined
+def payload_mass(e, n, v):
+    """Payload mass over the nominal one, minus 1."""
+    return v.loads.payload_mass[e] / v.nominal.payload_mass - 1.0
+
+
+@inlined
+def target_height(e, n, v):
+    """Height of the target."""
+    return v.goal.position[e, 2]
+
+
+@inlined
+def cable_tension(e, n, v):
+    """Tension over that at rest, minus 1."""
+    return v.state.cable_tension[e, n] / v.resting_tension[n] - 1.0
+
+
+OBSERVATION = (
+    Component("slot_error", 3, "slot", "m", "own position minus own slot about the target pose", slot_error),
+    Component("velocity", 3, "slot", "m/s", "own velocity", own_velocity),
+    Component("thrust_axis", 3, "slot", "-", "own body z axis", thrust_axis),
+    Component(
+        "heading", 2, "target", "-", "cosine and sine of own heading relative to the target's", relative_heading
+    ),
+    Component("body_rates", 3, "body", "rad/s", "own angular velocity", body_rates),
+    Component("tracking_error", 3, "slot", "m", "own position minus own smoothed reference", tracking_error),
+    Component("reference_velocity", 3, "slot", "m/s", "velocity of own smoothed reference", reference_velocity),
+    Component(
+        "anchor_error", 3, "slot", "m", "own cable's attachment on the payload minus its place at the target pose",
+        anchor_error,
+    ),
+    Component("cable", 3, "slot", "-", "from own attachment to own hook, over the cable's natural length", cable),
+    Component("payload_error", 3, "slot", "m", "payload position minus target", payload_error),
+    Component("payload_velocity", 3, "slot", "m/s", "payload velocity", payload_velocity),
+    Component(
+        "payload_rotation_error", 3, "slot", "rad", "rotation vector from target to payload attitude",
+        payload_rotation_error,
+    ),
+    Component(
+        "payload_angular_velocity", 3, "slot", "rad/s", "angular velocity of the payload", payload_angular_velocity
+    ),
+    Component("payload_error_integral", 3, "slot", "m s", "clipped integral of payload_error", payload_error_integral),
+    Component(
+        "rotation_error_integral", 3, "slot", "rad s", "clipped integral of payload_rotation_error",
+        rotation_error_integral,
+    ),
+    Component("slot_direction", 2, "target", "-", "cosine and sine of the own slot's azimuth", slot_direction),
+)  # fmt: skip
+
+STATE = (  # global state of a critic: what belongs to no drone, hidden quantities among it
+    Component("payload_error", 3, "target", "m", "payload position minus target", payload_error),
+    Component("payload_velocity", 3, "target", "m/s", "payload velocity", payload_velocity),
+    Component(
+        "payload_rotation_error", 3, "target", "rad", "rotation vector from target to payload attitude",
+        payload_rotation_error,
+    ),
+    Component(
+        "payload_angular_velocity", 3, "target", "rad/s", "angular velocity of the payload", payload_angular_velocity
+    ),
+    Component(
+        "payload_error_integral", 3, "target", "m s", "clipped integral of payload_error", payload_error_integral
+    ),
+    Component(
+        "rotation_error_integral", 3, "target", "rad s", "clipped integral of payload_rotation_error",
+        rotation_error_integral,
+    ),
+    Component("payload_force", 3, "target", "N", "hidden force on the payload", payload_force),
+    Component("wind", 3, "target", "m/s", "mean wind", wind),
+    Component("payload_mass", 1, "-", "-", "payload mass over the nominal one, minus 1", payload_mass),
+    Component("target_height", 1, "world", "m", "height of the target", target_height),
+)  # fmt: skip
+DRONE_STATE = (  # then of each drone, and its last action
+    Component("slot_error", 3, "target", "m", "position minus slot", slot_error),
+    Component("velocity", 3, "target", "m/s", "velocity", own_velocity),
+    Component("thrust_axis", 3, "target", "-", "body z axis", thrust_axis),
+    Component("body_rates", 3, "body", "rad/s", "angular velocity", body_rates),
+    Component("tracking_error", 3, "target", "m", "position minus smoothed reference", tracking_error),
+    Component("cable_tension", 1, "-", "-", "tension over that at rest, minus 1", cable_tension),
+    Component("slot_direction", 2, "target", "-", "cosine and sine of the slot's azimuth", slot_direction),
+)
 
 
 class DroneNumbers(NamedTuple):
@@ -64,12 +269,32 @@ class DroneNumbers(NamedTuple):
 
 def drone_numbers(num_drones: int, action_size: int) -> DroneNumbers:
     """Return where the drones' numbers stand in the global state."""
-    return DroneNumbers(_STATE_SHARED, num_drones, _STATE_DRONE + action_size)
+    return DroneNumbers(_count(STATE), num_drones, _count(DRONE_STATE) + action_size)
+
+
+def list_state(num_drones: int, action_size: int, extra: tuple[Component, ...] = ()) -> tuple[Component, ...]:
+    """Return what the global state holds: shared components, each drone's with its last action, a task's own."""
+    return (*STATE, *num_drones * (*DRONE_STATE, _previous_action(action_size)), *extra)
+
+
+def state_size(num_drones: int, action_size: int, extra: tuple[Component, ...] = ()) -> int:
+    """Return how many numbers the global state holds."""
+    return _count(list_state(num_drones, action_size, extra))
+
+
+def _count(parts: Sequence[Component]) -> int:
+    """Return how many numbers the components are."""
+    return sum(part.size for part in parts)
 
 
 def list_components(action_size: int, extra: tuple[Component, ...] = ()) -> tuple[Component, ...]:
     """Return what an observation holds of one step, in order; see `observation_names`."""
-    return (*OBSERVATION[:-1], OBSERVATION[-1]._replace(size=action_size), *extra)
+    return (*OBSERVATION, _previous_action(action_size), *extra)
+
+
+def _previous_action(size: int) -> Component:
+    """Return the component of the last action, which is copied rather than computed."""
+    return Component("previous_action", size, "-", "-", "own last action", own_velocity, False)
 
 
 def observation_names(action_size: int, extra: tuple[Component, ...] = (), history: int = 1) -> tuple[str, ...]:
@@ -84,106 +309,85 @@ def observation_names(action_size: int, extra: tuple[Component, ...] = (), histo
     return tuple(name + (f"@-{step}" if step else "") for step in range(history) for name in names)
 
 
+def compose_observation(extra: tuple[Component, ...], action_size: int) -> Any:
+    """Return the kernel of (lo, hi, View, observation (E, N, D)) that writes what drones observe.
+
+    Args:
+        extra: what the task adds.
+        action_size: numbers of an action.
+    """
+    functions: dict[str, Any] = {"turn": turn}
+    own = _write("own", "", "n", OBSERVATION, functions)
+    size = _count(OBSERVATION)
+    own += [f"own[{size + k}] = v.action[e, n, {k}]" for k in range(action_size)]
+    own += _write("own", f"{size + action_size} + ", "n", extra, functions)
+    lines = ["def observe(lo, hi, v, observation):", "    for e in range(lo, hi):"]
+    lines += ["        for n in range(observation.shape[1]):", "            own = observation[e, n]"]
+    lines.append("            c, s = v.goal.slot_frame[e, n, 0], -v.goal.slot_frame[e, n, 1]")  # world to slot frame
+    lines += [f"            {line}" for line in own]
+    return compose("observe", "\n".join(lines) + "\n", functions)
+
+
+def compose_state(
+    extra: tuple[Component, ...], look: Callable[..., Any] | None, num_drones: int, action_size: int
+) -> Any:
+    """Return the kernel of (lo, hi, View, critic (E, S)) that writes the global state, in the target's heading frame.
+
+    Args:
+        extra: what the task adds at the end.
+        look: inlined kernel of (e, View), called first; None for none.
+        num_drones, action_size: N, A.
+    """
+    functions: dict[str, Any] = {"turn": turn, "cos": cos, "sin": sin} | ({"look": look} if look else {})
+    first, rows, size = drone_numbers(num_drones, action_size)
+    drone = _write("out", "at + ", "n", DRONE_STATE, functions)
+    drone += [f"out[at + {size - action_size + k}] = v.action[e, n, {k}]" for k in range(action_size)]
+    lines = ["def observe_state(lo, hi, v, critic):", "    for e in range(lo, hi):", "        out = critic[e]"]
+    lines += ["        look(e, v)"] if look else []
+    lines.append("        c, s = cos(v.goal.yaw[e]), -sin(v.goal.yaw[e])")  # world to the target's heading frame
+    lines += [f"        {line}" for line in _write("out", "", "0", STATE, functions)]
+    lines += [f"        for n in range({rows}):", f"            at = {first} + n * {size}"]
+    lines += [f"            {line}" for line in drone]
+    lines += [f"        {line}" for line in _write("out", f"{first + rows * size} + ", "0", extra, functions)]
+    return compose("observe_state", "\n".join(lines) + "\n", functions)
+
+
+def _write(out: str, at: str, drone: str, parts: Sequence[Component], functions: dict[str, Any]) -> list[str]:
+    """Return statements that write components one after the other, vectors turned by `c` and `s`.
+
+    Args:
+        out: what is written to.
+        at: position of the first number, such as "3 + ".
+        drone: number of the drone.
+        parts: the components.
+        functions: what the statements call, by name; written.
+    """
+    lines, size = [], 0
+    for part in parts:
+        name = f"{part.name}_{len(functions)}"
+        functions[name] = part.value
+        call = f"{name}(e, {drone}, v)"
+        target = ", ".join(f"{out}[{at}{size + k}]" for k in range(part.size))
+        lines.append(f"{target} = {f'turn(c, s, {call})' if part.is_turned else call}{'[:2]' if part.is_cut else ''}")
+        size += part.size
+    return lines
+
+
+def check_written(written: np.ndarray, parts: Sequence[Component], what: str) -> None:
+    """Refuse components of which a number (..., D) is not finite, by a ConfigError that names the first."""
+    names = [f"{part.name}_{i}" for part in parts for i in range(part.size)]
+    bad = ~np.isfinite(written.reshape(-1, len(names))).all(axis=0)
+    if bad.any():
+        raise ConfigError(f"{names[int(bad.argmax())]} of the {what} is not finite; mend what computes it")
+
+
 @kernel
-def remember(lo, hi, observation, told):
-    """Put the newest observations (E, N, D) before those told earlier (E, N, H D) and drop the oldest."""
+def stack(lo, hi, observation, stacked):
+    """Put the newest observations (E, N, D) before the earlier ones (E, N, H D) and drop the oldest."""
     size = observation.shape[2]
     for e in range(lo, hi):
         for n in range(observation.shape[1]):
-            for k in range(told.shape[2] - 1, size - 1, -1):
-                told[e, n, k] = told[e, n, k - size]
+            for k in range(stacked.shape[2] - 1, size - 1, -1):
+                stacked[e, n, k] = stacked[e, n, k - size]
             for k in range(size):
-                told[e, n, k] = observation[e, n, k]
-
-
-def state_size(num_drones: int, action_size: int) -> int:
-    """Return how many numbers the global state holds."""
-    first, rows, size = drone_numbers(num_drones, action_size)
-    return first + rows * size
-
-
-@kernel
-def _write(out, at, v):
-    """Write a vector at position `at` and return the position after it."""
-    out[at], out[at + 1], out[at + 2] = v
-    return at + 3
-
-
-@kernel
-def observe_team(lo, hi, state, hidden_loads, goal, reference, errors, action, rig, nominal, observation, critic):
-    """Write observations (E, N, D) and global states (E, S) of environments lo to hi.
-
-    The global state holds, in the target's heading frame, the payload's errors, velocities and integrals, then what
-    is hidden from the drones (payload mass over nominal minus 1, force, wind), then for each drone its slot error,
-    velocity, thrust axis, body rates, tracking error, cable tension over nominal, cosine and sine of its azimuth, and
-    previous action.
-
-    Args:
-        lo, hi: the environments.
-        state, plant, goal, reference, errors: see their types.
-        action: previous actions (E, N, A).
-        rig: the nominal formation.
-        nominal: cable length and tension (N, 2) and, in its last row, payload mass [m, N, kg].
-        observation, critic: written.
-    """
-    for e in range(lo, hi):
-        payload, attitude = row(state.payload_position, e), matrow(state.payload_rotation, e)
-        target, target_attitude = row(goal.position, e), matrow(goal.rotation, e)
-        spin = mul(attitude, row(state.payload_body_rates, e))
-        payload_velocity = row(state.payload_velocity, e)
-        count = action.shape[1]
-        c, s = cos(goal.yaw[e]), -sin(goal.yaw[e])  # world to the target's heading frame
-        out = critic[e]
-        at = _write(out, 0, turn(c, s, row(errors.position, e)))
-        at = _write(out, at, turn(c, s, payload_velocity))
-        at = _write(out, at, turn(c, s, row(errors.rotation, e)))
-        at = _write(out, at, turn(c, s, spin))
-        at = _write(out, at, turn(c, s, row(errors.position_integral, e)))
-        at = _write(out, at, turn(c, s, row(errors.rotation_integral, e)))
-        at = _write(out, at, turn(c, s, row(hidden_loads.payload_force, e)))
-        at = _write(out, at, turn(c, s, row(hidden_loads.wind, e)))
-        out[at] = hidden_loads.payload_mass[e] / nominal[count, 0] - 1.0
-        out[at + 1] = target[2]
-        at += 2
-        for n in range(count):
-            cn, sn = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]  # world to slot frame
-            position, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
-            slot = vec(goal.slots, e, n)
-            slot_error, velocity = sub(position, slot), vec(state.drone_velocity, e, n)
-            tracking_error = sub(position, vec(reference.position, e, n))
-            rates = vec(state.drone_body_rates, e, n)
-            anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
-            at_payload = add(payload, mul(attitude, anchor))
-            anchor_error = sub(at_payload, add(target, mul(target_attitude, anchor)))
-            cable = sub(add(position, mul(frame, row(rig.drones.hooks, n))), at_payload)
-            own = observation[e, n]
-            i = _write(own, 0, turn(cn, sn, slot_error))
-            i = _write(own, i, turn(cn, sn, velocity))
-            i = _write(own, i, turn(cn, sn, column(frame, 2)))
-            yaw = heading(frame) - goal.yaw[e]
-            own[i], own[i + 1] = cos(yaw), sin(yaw)
-            i = _write(own, i + 2, rates)
-            i = _write(own, i, turn(cn, sn, tracking_error))
-            i = _write(own, i, turn(cn, sn, vec(reference.velocity, e, n)))
-            i = _write(own, i, turn(cn, sn, anchor_error))
-            i = _write(own, i, turn(cn, sn, scale(1.0 / nominal[n, 0], cable)))
-            i = _write(own, i, turn(cn, sn, row(errors.position, e)))
-            i = _write(own, i, turn(cn, sn, payload_velocity))
-            i = _write(own, i, turn(cn, sn, row(errors.rotation, e)))
-            i = _write(own, i, turn(cn, sn, spin))
-            i = _write(own, i, turn(cn, sn, row(errors.position_integral, e)))
-            i = _write(own, i, turn(cn, sn, row(errors.rotation_integral, e)))
-            own[i], own[i + 1] = cos(rig.azimuth[n]), sin(rig.azimuth[n])
-            i += 2
-            at = _write(out, at, turn(c, s, slot_error))
-            at = _write(out, at, turn(c, s, velocity))
-            at = _write(out, at, turn(c, s, column(frame, 2)))
-            at = _write(out, at, rates)
-            at = _write(out, at, turn(c, s, tracking_error))
-            out[at] = state.cable_tension[e, n] / nominal[n, 1] - 1.0
-            out[at + 1], out[at + 2] = own[i - 2], own[i - 1]
-            at += 3
-            for k in range(action.shape[2]):
-                own[i + k] = action[e, n, k]
-                out[at + k] = action[e, n, k]
-            at += action.shape[2]
+                stacked[e, n, k] = observation[e, n, k]

@@ -14,7 +14,7 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.math3d import add, put, row, scale, sub, turn
-from multilift_marl.tasks.spline import NO_FILE, spline_place
+from multilift_marl.tasks.spline import spline_place
 
 PATHS = ("circle", "figure8", "lemniscate", "helix", "random", "file")
 CIRCLE, FIGURE8, LEMNISCATE, HELIX, RANDOM, FILE = range(len(PATHS))
@@ -40,16 +40,13 @@ class Path(NamedTuple):
     """(E,) half the height that a helix goes up and down [m]."""
     curve: np.ndarray
     """(E, WAYPOINTS, 2, 3) way-points of a random path and the second derivatives of its spline there."""
-    table: np.ndarray
-    """(K, 13) spline through the rows of a file, the same for all environments; see `spline.fit_spline`."""
 
     @classmethod
-    def zeros(cls, num_envs: int, table: np.ndarray = NO_FILE) -> Path:
-        """Return paths that stay where they are, and the spline of a file."""
+    def zeros(cls, num_envs: int) -> Path:
+        """Return paths that stay where they are."""
         e = num_envs
         shapes = ((e, 3), (e,), (e,), (e,), (e,), (e, WAYPOINTS, 2, 3))
-        arrays = [np.zeros(shape) for shape in shapes]
-        return cls(np.zeros(e, np.int64), *[*arrays, table])
+        return cls(np.zeros(e, np.int64), *(np.zeros(shape) for shape in shapes))
 
 
 @kernel
@@ -60,11 +57,11 @@ def own_time(t):
 
 
 @kernel
-def place(e, t, path):
-    """Return where the path of environment e is t seconds after the start [m]."""
+def place(e, t, path, table):
+    """Return where the path of environment e is t seconds after the start [m]; `table` is the spline of a file."""
     kind = path.kind[e]
     if kind == FILE:
-        return spline_place(path.table, t)
+        return spline_place(table, t)
     a, angle = path.size[e], path.rate[e] * own_time(t)
     if kind == CIRCLE:
         at = (a * cos(angle), a * sin(angle), 0.0)
@@ -95,10 +92,10 @@ def _spline(curve, u):
 
 
 @kernel
-def motion(e, t, path):
-    """Return position, velocity, acceleration and jerk of the path of environment e, [m] and [s]."""
-    a, b, c = place(e, t - 2.0 * STEP, path), place(e, t - STEP, path), place(e, t, path)
-    return differences(a, b, c, place(e, t + STEP, path), place(e, t + 2.0 * STEP, path))
+def motion(e, t, path, table):
+    """Return position, velocity, acceleration and jerk of the path of environment e, [m] and [s]; see `place`."""
+    a, b, c = place(e, t - 2.0 * STEP, path, table), place(e, t - STEP, path, table), place(e, t, path, table)
+    return differences(a, b, c, place(e, t + STEP, path, table), place(e, t + 2.0 * STEP, path, table))
 
 
 @kernel

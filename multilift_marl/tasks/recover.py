@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import atan2, cos, pi, radians, sin
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import bind, kernel
-from multilift_marl.config.config import Config
+from multilift_marl._jit import inlined, kernel
 from multilift_marl.config.values import Float, Section
-from multilift_marl.control.formation import Reference, place_formation
+from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import (
     add,
     axis_angle,
@@ -32,12 +30,11 @@ from multilift_marl.math3d import (
 )
 from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.catenary import SLACK
-from multilift_marl.sim.hover import hook_position, place_at_hook
-from multilift_marl.sim.world import World
-from multilift_marl.tasks.base import Task
+from multilift_marl.sim.hover import place_at_hook
+from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
-from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import action_rate, tolerance
+from multilift_marl.tasks.observations import Component, cable_vector
+from multilift_marl.tasks.rewards import Term, action_rate, attitude, distance, stillness
 from multilift_marl.tasks.starts import TargetOptions, check_heights, in_ball
 
 
@@ -54,87 +51,8 @@ class RecoverOptions(TargetOptions):
     success_seconds: Float = Field(0.5, gt=0, description="[s] ... throughout the last seconds")
 
 
-class Recover(Task):
-    """Recover from a harsh start; see docs/recover.md."""
-
-    name: ClassVar[str] = "recover"
-    Options: ClassVar[type[Section]] = RecoverOptions
-    options: RecoverOptions
-    REWARD: ClassVar[dict[str, float]] = {
-        "position": 0.4,
-        "precision": 0.25,
-        "attitude": 0.15,
-        "stillness": 0.2,
-        "action_rate": -0.05,
-    }
-    EXTRA: ClassVar[tuple[Component, ...]] = (
-        Component("grace", 1, "-", "-", "share of the time left in which tilt and cable angle are no failure"),
-        Component("slack", 1, "-", "-", "own cable's natural length minus the distance it spans, over the length"),
-    )
-    EXTRA_STATE: ClassVar[int] = 1
-
-    def __init__(self, config: Config, world: World, reference: Reference):
-        super().__init__(config, world, reference)
-        check_heights(self.options)
-        taut = SLACK if world.system.cable_model == "chain" else 1.0  # chains that hang straighter pull at once
-        self._slack = min(self.options.start_slack, taut), taut
-        self._early = ignore(TILT, CABLE)
-        if self.options.start == "crazymarl":  # a quarter of its teams start on the ground
-            self._early = ignore(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
-
-    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
-        """Draw target and team; see `Task.start`."""
-        option, goal, state = self.options, self.goal, self.world.state
-        flat = rng.uniform(-option.target_xy, option.target_xy, 2)
-        goal.position[env] = *flat, rng.uniform(*option.target_height)
-        putmat(goal.rotation[env], rot_z(radians(rng.uniform(-option.target_yaw, option.target_yaw))))
-        place_formation(env, goal, self.rig)
-        self.watch.ignored[env] = self._early
-        throw = SlackStart(option.start_radius, radians(option.start_tilt), option.start_speed, *self._slack)
-        if option.start == "slack":
-            _throw(env, rng, state, goal, self.rig, self.hanging, throw)
-        else:
-            _throw_as_crazymarl(env, rng, state, goal, self.rig.drones, self.hanging)
-        if not self.rig.anchors.any():
-            _turn_formation(env, state, goal, self.rig)
-        drones = self.hanging.drones
-        carried = drones.mass + mass / self.world.num_drones
-        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / drones.thrust_coefficient)[:, None]
-        state.payload_body_rates[env] = 0.0
-
-    def planner(self, lo: int, hi: int) -> Callable[[], None]:
-        """Count the time; the goals stay. See `Task.planner`."""
-        return bind(_wait, lo, hi, self.time, self.control_dt, self.options.grace, self.watch)
-
-    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
-        """Tell grace and slack; see `Task.observer`."""
-        return bind(
-            _write_observation,
-            lo,
-            hi,
-            self.time,
-            self.options.grace,
-            self.seen,
-            self.rig,
-            self.hanging,
-            observation,
-            critic,
-        )
-
-    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
-        """Pay for closeness, attitude and stillness; see `Task.scorer`."""
-        return bind(
-            _score, lo, hi, self.world.state, self.errors, action, previous, self.weights,
-            self.options.success_distance, self.dt, self.terms, self.good_time,
-        )  # fmt: skip
-
-    def succeeded(self) -> np.ndarray:
-        """Close to the target throughout the last moments."""
-        return self.good_time >= self.options.success_seconds - 1e-9
-
-
 class SlackStart(NamedTuple):
-    """RecoverOptions of the start `slack`, in SI units."""
+    """Ranges of the start `slack`, in SI units."""
 
     radius: float
     tilt: float
@@ -227,35 +145,89 @@ def _turn_formation(e, state, goal, rig):
     place_formation(e, goal, rig)
 
 
-@kernel
-def _wait(lo, hi, time, dt, grace, watch):
-    for e in range(lo, hi):
-        time[e] += dt
-        if time[e] > grace:
-            watch.ignored[e] = 0
+class RecoverSettings(NamedTuple):
+    """Constants of the task."""
+
+    grace: float
+    """[s] in which tilt and cable angle are no failure."""
+    distance: float
+    """[m] payload within this of its target is good."""
 
 
-@kernel
-def _write_observation(lo, hi, time, grace, state, rig, hanging, observation, critic):
-    for e in range(lo, hi):
-        left = clip(1.0 - time[e] / max(grace, 1e-9), 0.0, 1.0)
-        critic[e, critic.shape[1] - 1] = left
-        attitude = matrow(state.payload_rotation, e)
-        for n in range(observation.shape[1]):
-            anchor = add(row(state.payload_position, e), mul(attitude, row(rig.anchors, n)))
-            span = norm(sub(hook_position(e, n, state, rig.drones.hooks), anchor))
-            own = observation[e, n, observation.shape[2] - 2 :]
-            own[0], own[1] = left, 1.0 - span / hanging.length[n]
+@inlined
+def end_grace(e, v):
+    """Let all failures count once the grace is over; the goals stay."""
+    if v.time[e] > v.settings.grace:
+        v.mask.ignored[e] = 0
 
 
-@kernel
-def _score(lo, hi, state, errors, action, previous, weights, near, dt, terms, good_time):
-    for e in range(lo, hi):
-        distance, angle = errors.distance[e], errors.angle[e]
-        speed, spin = norm(row(state.payload_velocity, e)), norm(row(state.payload_body_rates, e))
-        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
-        terms[e, 1] = weights[1] * tolerance(distance, 0.01)
-        terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
-        terms[e, 3] = weights[3] * tolerance(speed, 0.2) * tolerance(spin, 0.3)
-        terms[e, 4] = weights[4] * action_rate(e, action, previous)
-        good_time[e] = good_time[e] + dt if distance <= near else 0.0
+@inlined
+def is_close(e, v):
+    """Payload at its target."""
+    return v.errors.distance[e] <= v.settings.distance
+
+
+@inlined
+def grace(e, n, v):
+    """Share of the grace that is left."""
+    return clip(1.0 - v.time[e] / max(v.settings.grace, 1e-9), 0.0, 1.0)
+
+
+@inlined
+def slack(e, n, v):
+    """Own cable's natural length minus the distance it spans, over the length."""
+    return 1.0 - norm(cable_vector(e, n, v)) / v.nominal.length[n]
+
+
+class Recover(Task):
+    """Recover from a harsh start; see docs/recover.md."""
+
+    name: ClassVar[str] = "recover"
+    Options: ClassVar[type[Section]] = RecoverOptions
+    options: RecoverOptions
+    REWARD: ClassVar[dict[str, Term]] = {
+        "position": Term(0.4, distance, 0.25, "m"),
+        "precision": Term(0.25, distance, 0.01, "m"),
+        "attitude": Term(0.15, attitude, 6.0, "deg"),
+        "stillness": Term(0.2, stillness, (0.2, 0.3), "m/s, rad/s"),
+        "action_rate": Term(-0.05, action_rate),
+    }
+    KERNELS: ClassVar[Kernels] = Kernels(is_good=is_close, plan=end_grace)
+    EXTRA: ClassVar[tuple[Component, ...]] = (
+        Component("grace", 1, "-", "-", "share of the time left in which tilt and cable angle are no failure", grace),
+        Component(
+            "slack", 1, "-", "-", "own cable's natural length minus the distance it spans, over the length", slack
+        ),
+    )
+    EXTRA_STATE: ClassVar[tuple[Component, ...]] = (EXTRA[0],)
+
+    def prepare(self) -> None:
+        """See `Task.prepare`."""
+        option = self.options
+        check_heights(option)
+        taut = SLACK if self.world.system.cable_model == "chain" else 1.0  # chains that hang straighter pull at once
+        self._slack = min(option.start_slack, taut), taut
+        self._early = ignore(TILT, CABLE)
+        if option.start == "crazymarl":  # a quarter of its teams start on the ground
+            self._early = ignore(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
+        self.settings = RecoverSettings(option.grace, option.success_distance)
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw target and team; see `Task.start`."""
+        option, goal, state = self.options, self.goal, self.world.state
+        flat = rng.uniform(-option.target_xy, option.target_xy, 2)
+        goal.position[env] = *flat, rng.uniform(*option.target_height)
+        putmat(goal.rotation[env], rot_z(radians(rng.uniform(-option.target_yaw, option.target_yaw))))
+        place_formation(env, goal, self.rig)
+        self.mask.ignored[env] = self._early
+        throw = SlackStart(option.start_radius, radians(option.start_tilt), option.start_speed, *self._slack)
+        if option.start == "slack":
+            _throw(env, rng, state, goal, self.rig, self.hanging, throw)
+        else:
+            _throw_as_crazymarl(env, rng, state, goal, self.rig.drones, self.hanging)
+        if not self.rig.anchors.any():
+            _turn_formation(env, state, goal, self.rig)
+        drones = self.hanging.drones
+        carried = drones.mass + mass / self.world.num_drones
+        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / drones.thrust_coefficient)[:, None]
+        state.payload_body_rates[env] = 0.0

@@ -1,22 +1,26 @@
-"""What stands between the true state and a drone's observation, and between its command and its flight.
+"""Sensing: noise, bias and delay between the true state and an observation, and delay of actions.
 
-Noise and bias are those of measured states: each drone measures its own, and all are told one measurement of the
-payload's. Delays are whole policy steps. Success, reward and the critic's global state know nothing of it, and the
-drones' own controllers fly by the true state. docs/randomization.md says the same in a table.
+Noise and bias are those of measured states: each drone measures its own, and all observe one measurement of the
+payload's. Delays are whole policy steps. Success, reward and the critic's global state are computed from the true
+state, which the drones' own controllers use, too. docs/randomization.md says the same in a table.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import kernel, prebind
 from multilift_marl.config.schema import RandomizationConfig
 from multilift_marl.math3d import add, axis_angle, mat, matmul, matrow, norm, put, putmat, row, scale, vec
 from multilift_marl.sim.rng import normal_pair
 from multilift_marl.sim.state import SystemState
-from multilift_marl.tasks.rewards import Errors
+from multilift_marl.tasks.observations import observation_names
+from multilift_marl.tasks.view import Errors, View, reduce_view, update_errors
+
+Call = Callable[[int, int], None]  # of environments lo to hi
 
 STANDARD = np.array([0.005, 0.05, 0.01, 0.1])  # position [m], velocity [m/s], rotation [rad], angular velocity [rad/s]
 
@@ -48,20 +52,22 @@ class Sensing:
     Args:
         ranges: how large they are.
         shape: E, N, A, D.
-        critic: numbers of the global state.
         attitude: whether the payload has one.
 
     Attributes:
         memory: Memory.
         state: what is measured (SystemState; tensions, rotors and cables are not).
         errors: the payload's errors as measured, with their own integrals.
-        noisy, late, slow: whether there is noise or bias, a delay of observations, one of actions.
-        on: whether there is any of these.
-        applied: actions that the drones fly (E, N, A).
+        has_noise, delays_observation, delays_action: whether there is noise or bias, a delay of observations, one of
+            actions.
+        enabled: whether there is any of these.
+        applied: actions that reach the drones (E, N, A).
+        action_size, observation_size: A, D.
     """
 
-    def __init__(self, ranges: RandomizationConfig, shape: tuple[int, int, int, int], critic: int, attitude: bool):
+    def __init__(self, ranges: RandomizationConfig, shape: tuple[int, int, int, int], attitude: bool):
         e, n, a, d = shape
+        self.action_size, self.observation_size = a, d
         self.noise = STANDARD * ranges.observation_noise
         self.bias = STANDARD * ranges.observation_bias
         (_, slowest), (_, latest) = ranges.action_delay, ranges.observation_delay
@@ -75,7 +81,6 @@ class Sensing:
         )  # fmt: skip
         self.state, self.errors = SystemState.zeros(e, n), Errors.zeros(e)
         self.applied = np.zeros((e, n, a))
-        self.unused = np.zeros((e, critic), np.float32)
         self.enabled = self.has_noise or self.delays_observation or self.delays_action
         self._attitude = attitude
 
@@ -88,17 +93,25 @@ class Sensing:
         memory.actions[env] = 0.0
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
 
-    def sense(self, lo: int, hi: int, state: SystemState) -> tuple[Any, tuple[Any, ...]]:
-        """Return the kernel that measures, with its arguments."""
-        return sense, (lo, hi, state, self.state, self.memory, self.noise, self._attitude)
+    def bind_sense(self, view: View, dt: float) -> Call:
+        """Return the call of (lo, hi) that measures state and errors of environments, integrated over `dt` [s]."""
+        measure = prebind(sense, view.state, self.state, self.memory, self.noise, self._attitude)
+        update = prebind(update_seen_errors, reduce_view(view, update_seen_errors), dt)
 
-    def delay(self, lo: int, hi: int, observation: np.ndarray, own: tuple[int, int]) -> tuple[Any, tuple[Any, ...]]:
-        """Return the kernel that holds observations back, with its arguments; see `delay_observations`."""
-        return delay_observations, (lo, hi, observation, self.memory, *own)
+        def call(lo: int, hi: int) -> None:
+            measure(lo, hi)
+            update(lo, hi)
 
-    def send(self, lo: int, hi: int, action: np.ndarray) -> tuple[Any, tuple[Any, ...]]:
-        """Return the kernel that holds actions back, with its arguments."""
-        return delay_actions, (lo, hi, action, self.memory, self.applied)
+        return call
+
+    def bind_delay(self, observation: np.ndarray) -> Call:
+        """Return the call of (lo, hi) that holds observations (E, N, D) back, but for the drones' own last action."""
+        first = len(observation_names(0))
+        return prebind(delay_observations, observation, self.memory, first, first + self.action_size)
+
+    def bind_send(self, action: np.ndarray) -> Call:
+        """Return the call of (lo, hi) that holds actions (E, N, A) back; `applied` is what arrives."""
+        return prebind(delay_actions, action, self.memory, self.applied)
 
     def drawn(self) -> dict[str, np.ndarray]:
         """Return the live arrays of what an episode draws of it, by the names of `randomization`."""
@@ -170,6 +183,13 @@ def sense(lo, hi, state, seen, memory, noise, attitude):
             turned = _turned(_off(e, count, 2, memory, noise), matrow(state.payload_rotation, e))
             putmat(seen.payload_rotation[e], turned)
             put(seen.payload_body_rates[e], add(row(state.payload_body_rates, e), _off(e, count, 3, memory, noise)))
+
+
+@kernel
+def update_seen_errors(lo, hi, v, dt):
+    """Update the errors of environments lo to hi as the drones measure them, integrated over `dt` [s]."""
+    for e in range(lo, hi):
+        update_errors(e, v.seen, v.seen_errors, v, dt)
 
 
 @kernel

@@ -10,15 +10,14 @@ from pydantic import Field
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.values import Float, Section
-from multilift_marl.control.formation import Goal, Rig, goal_hook, place_formation
+from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, scale, sub, vec
+from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables import cable_end
 from multilift_marl.sim.hover import Drones, hover_drone, make_drones, place_at_hook
 from multilift_marl.sim.parameters import Parameters
-from multilift_marl.sim.state import SystemState
 
 
 class CableEquilibrium(NamedTuple):
@@ -31,6 +30,8 @@ class CableEquilibrium(NamedTuple):
     segments: np.ndarray
     payload_mass: float
     """Nominal [kg]."""
+    load: float
+    """True mass of the payload over the nominal one."""
     drones: Drones
 
 
@@ -42,6 +43,7 @@ def make_hanging(system: System) -> CableEquilibrium:
         weight=system.cable_mass * GRAVITY,
         segments=system.cable_segments,
         payload_mass=system.payload_mass,
+        load=1.0,
         drones=make_drones(system),
     )
 
@@ -50,6 +52,7 @@ def true_hanging(nominal: CableEquilibrium, parameters: Parameters, e: int) -> C
     """Return the numbers of the team in environment e."""
     p, drones = parameters, nominal.drones
     return nominal._replace(
+        load=float(p.payload_mass[e] / nominal.payload_mass),
         length=p.cable_length[e],
         stiffness=p.cable_stiffness[e],
         weight=nominal.weight * (p.cable_length[e] / nominal.length),
@@ -70,33 +73,36 @@ def in_ball(rng, radius):
 
 
 @kernel
-def hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, moved):
+def hang_team(e, v, goal, hanging, pose, velocity, moved):
     """Write a team that moves as one, its cables at the tension of rest and in the directions of its slots.
 
     Args:
         e: the environment.
-        state: SystemState, written.
-        goal: whose slots and pulls, moved, the drones' cables point to.
-        rig, hanging: Rig, Hanging.
-        mass: true mass of the payload [kg].
-        payload, attitude: where it is [m] and its attitude, 9 numbers; cables keep their lengths.
+        v: View; its state is written.
+        goal: whose slots and cable forces, moved, the drones' cables point to.
+        hanging: CableEquilibrium, the true one.
+        pose: of the payload: position [m] and attitude, 9 numbers; cables keep their lengths.
         velocity: of all bodies [m/s].
         moved: of the slots from the goal's [m].
     """
+    state, rig = v.state, v.rig
+    payload, attitude = pose
     put(state.payload_position[e], payload)
     put(state.payload_velocity[e], velocity)
     putmat(state.payload_rotation[e], attitude)
     state.payload_body_rates[e] = 0.0
-    load = mass / hanging.payload_mass
     for n in range(rig.slots.shape[0]):
-        anchor = add(payload, mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])))
+        # the direction of the cable, from the payload's anchor to the hook at the slot
+        anchor = add(payload, mul(attitude, row(rig.anchors, n)))
         cable = sub(add(goal_hook(e, n, goal, rig), moved), anchor)
         direction = scale(1.0 / norm(cable), cable)
+        # its tension in the middle, where the direction of a heavy cable is that of its chord
         half = (0.0, 0.0, 0.5 * hanging.weight[n])
-        tension = load * norm(sub(vec(goal.cable_force, e, n), half))  # in the middle, whose direction is the cable's
+        tension = hanging.load * norm(sub(vec(goal.cable_force, e, n), half))
         end = cable_end(
             direction, tension, hanging.length[n], hanging.stiffness[n], hanging.segments[n], hanging.weight[n]
         )
+        # the drone hovers there, and carries the cable's force
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
         cable_force = add(scale(tension, direction), half)
@@ -148,11 +154,17 @@ def make_ranges(option: StartOptions) -> StartRanges:
 
 
 @kernel
-def start_near_target(
-    e: int, rng: np.random.Generator, state: SystemState, goal: Goal, rig: Rig, ranges: StartRanges,
-    hanging: CableEquilibrium, mass: float,
-) -> None:  # fmt: skip
-    """Draw a target, and a team in hanging equilibrium there, then moved, tilted and set in motion as one."""
+def start_near_target(e, rng, v, ranges, hanging):
+    """Draw a target, and a team in hanging equilibrium there, then moved, tilted and set in motion as one.
+
+    Args:
+        e: the environment.
+        rng: generator of the episode.
+        v: View; goal and state are written.
+        ranges: StartRanges.
+        hanging: CableEquilibrium, the true one.
+    """
+    goal, rig = v.goal, v.rig
     x, y = rng.uniform(-ranges.xy, ranges.xy), rng.uniform(-ranges.xy, ranges.xy)
     put(goal.position[e], (x, y, rng.uniform(ranges.low, ranges.high)))
     putmat(goal.rotation[e], rot_z(rng.uniform(-ranges.yaw, ranges.yaw)))
@@ -161,8 +173,7 @@ def start_near_target(
     axis = in_ball(rng, 1.0)
     tilt = axis_angle(scale(1.0 / max(norm(axis), 1e-9), axis), rng.uniform(0.0, ranges.tilt))
     velocity = in_ball(rng, ranges.speed)
-    payload = add((goal.position[e, 0], goal.position[e, 1], goal.position[e, 2]), moved)
     attitude = matrow(goal.rotation, e)
     if np.any(rig.anchors != 0.0):  # a point has no attitude: it counts as aligned
         attitude = matmul(tilt, attitude)
-    hang_team(e, state, goal, rig, hanging, mass, payload, attitude, velocity, moved)
+    hang_team(e, v, goal, hanging, (add(row(goal.position, e), moved), attitude), velocity, moved)

@@ -60,17 +60,16 @@ def make_bounds(system: System, control: ControlConfig, limits: Limits, load: fl
 
 
 @kernel
-def draw_plan(e, rng, ranges, plan, goal, rig, hanging, bounds):
+def draw_plan(e, rng, v, ranges):
     """Draw the poses of environment e, each anew until the team can hold it; return how many were drawn in vain, or -1.
 
     Args:
         e: the environment.
         rng: generator of the episode.
+        v: View of task `pose`; its plan is written, its goal overwritten.
         ranges: of x and y [m], lowest and highest z [m], of yaw [rad], of roll and pitch [rad]; the start is level.
-        plan: written.
-        goal: overwritten.
-        rig, hanging, bounds: Rig, Hanging, Bounds.
     """
+    plan, goal, rig, hanging, bounds = v.own.plan, v.goal, v.rig, v.nominal, v.settings.bounds
     xy, low, high, yaw, tilt = ranges
     vain, k = 0, 0
     while k < plan.pose.shape[1]:
@@ -88,6 +87,7 @@ def draw_plan(e, rng, ranges, plan, goal, rig, hanging, bounds):
             if vain > MAX_REDRAWS:
                 return -1
             continue
+        # what the cables exert on the payload there, without their own weight, in the frame of the heading
         c, s = cos(pose[3]), -sin(pose[3])
         for n in range(rig.slots.shape[0]):
             cable_force = sub(vec(goal.cable_force, e, n), (0.0, 0.0, hanging.weight[n]))

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import cos, pi, radians, sin, sqrt
-from typing import Annotated, ClassVar, Literal
+from math import pi, sqrt
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import bind, kernel
-from multilift_marl.config.config import Config
+from multilift_marl._jit import inlined, kernel
 from multilift_marl.config.values import Choice, Float, Section, Span, Vector
-from multilift_marl.control.formation import Reference, place_formation, set_heading
+from multilift_marl.control.formation import place_formation, set_heading
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import add, matrow, norm, put, putmat, rot_z, row, scale, sub, turn, vec
-from multilift_marl.sim.world import World
-from multilift_marl.tasks.base import Task
+from multilift_marl.math3d import add, matrow, put, putmat, rot_z, row, scale, sub, vec
+from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.path_file import load_path
 from multilift_marl.tasks.paths import (
@@ -38,7 +35,7 @@ from multilift_marl.tasks.paths import (
     place,
     set_goal,
 )  # fmt: skip
-from multilift_marl.tasks.rewards import action_rate, tolerance
+from multilift_marl.tasks.rewards import Term, action_rate, attitude, distance, tolerance, velocity
 from multilift_marl.tasks.spline import NO_FILE, spline_yaw
 from multilift_marl.tasks.starts import hang_team, in_ball
 
@@ -73,141 +70,25 @@ class TrackOptions(Section):
     rmse_from: Float = Field(5.0, ge=0, description="[s] errors count for payload_rmse_m from this time on")
 
 
-class Track(Task):
-    """Follow a path; see docs/track.md."""
+class TrackArrays(NamedTuple):
+    """What an episode holds beside its goal."""
 
-    name: ClassVar[str] = "track"
-    Options: ClassVar[type[Section]] = TrackOptions
-    options: TrackOptions
-    REWARD: ClassVar[dict[str, float]] = {
-        "position": 0.4,
-        "precision": 0.3,
-        "attitude": 0.1,
-        "velocity": 0.2,
-        "heading": 0.0,
-        "action_rate": -0.05,
-    }
-    EXTRA: ClassVar[tuple[Component, ...]] = (
-        Component("target_velocity", 3, "slot", "m/s", "velocity of the target"),
-        Component("target_acceleration", 3, "slot", "m/s²", "acceleration of the target"),
-        *(
-            Component(
-                f"target_ahead_{round(1000 * t)}ms", 3, "slot", "m", f"the way the target moves in the next {t:g} s"
-            )
-            for t in AHEAD
-        ),
-    )
-    EXTRA_STATE: ClassVar[int] = 6 + 3 * len(AHEAD)
-    SAVED: ClassVar[tuple[str, ...]] = ("worst", *(f"path.{name}" for name in Path._fields if name != "table"))
-
-    def __init__(self, config: Config, world: World, reference: Reference):
-        super().__init__(config, world, reference)
-        self.seconds = config.env.episode_seconds
-        self.rmse_after = self.options.rmse_from if self.options.rmse_from < self.seconds else 0.0
-        file, spacing = self._file(), self.options.file_spacing
-        table = load_path(file, spacing, world.system, config.randomization) if file else NO_FILE
-        self.path, self.worst = Path.zeros(world.num_envs, table), np.zeros(world.num_envs)
-
-    def _file(self) -> str:
-        """Return the reference to the file that is flown, "" if none is; a ConfigError if the options disagree."""
-        forms, file = self.options.path, self.options.file
-        if "file" in forms and not file:
-            raise ConfigError("task_options.path=file needs the path of one; set task_options.file=<path>")
-        if file and "file" not in forms:
-            raise ConfigError(
-                f"task_options.file is given, but task_options.path={','.join(forms)} does not fly it; set "
-                "task_options.path=file, or task_options.file=null"
-            )
-        return file or ""
-
-    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
-        """Draw heading, form and figures of the path; the team hangs at its start. See `Task.start`.
-
-        The path of a file has its own heading and place.
-        """
-        option, path = self.options, self.path
-        heading = rng.uniform(-pi, pi)
-        form = option.path[rng.integers(len(option.path))] if len(option.path) > 1 else option.path[0]
-        kind = PATHS.index(form)
-        path.kind[env], path.heading[env], path.climb[env] = kind, heading, option.climb
-        v, a = _draw(rng, option.speed), _draw(rng, option.acceleration)
-        if kind in (CIRCLE, HELIX):
-            path.size[env], path.rate[env] = _draw(rng, option.radius), _draw(rng, option.rate)
-        elif kind == FIGURE8:  # peak speed A ω √2, peak acceleration with its factor at that size
-            path.size[env], path.rate[env] = 1.0625 * v**2 / a, 0.6655 * a / v
-        elif kind == LEMNISCATE:  # Bernoulli's: peak speed A ω and acceleration 3 A ω² at the ends
-            path.size[env], path.rate[env] = 3 * v**2 / a, a / (3 * v)
-        elif kind == RANDOM:
-            path.curve[env] = draw_curve(rng, np.array(option.room))
-            fastest, hardest = largest_rates(path.curve[env])
-            path.rate[env] = min(v / fastest, sqrt(a / hardest))
-        _start(env, rng, self.world.state, self.goal, self.rig, self.hanging, mass, path, option.height,
-               option.start_radius)  # fmt: skip
-        self.worst[env] = 0.0
-
-    def planner(self, lo: int, hi: int) -> Callable[[], None]:
-        """Move the goals along their paths; see `Task.planner`."""
-        return bind(_plan, lo, hi, self.time, self.control_dt, self.path, self.goal, self.rig)
-
-    def observe_extra(self, lo: int, hi: int, observation: np.ndarray, critic: np.ndarray) -> Callable[[], None]:
-        """Tell how the target will move; see `Task.observer`."""
-        return bind(_look_ahead, lo, hi, self.time, self.path, self.goal, observation, critic)
-
-    def target_path(self, env: int) -> np.ndarray:
-        """Return the path, one round of it if it repeats; see `Task.route`."""
-        points, kind = np.zeros((_DRAWN, 3)), self.path.kind[env]
-        turns = 4 if kind == HELIX else 1
-        if kind == FILE:
-            lap = float(self.path.table[-1, 0])
-        else:
-            lap = np.inf if kind == RANDOM else turns * 2 * pi / self.path.rate[env] + RAMP / 2  # half the ramp is lost
-        _trace(env, min(self.seconds, lap), self.path, points)
-        return points
-
-    def reward(self, lo: int, hi: int, action: np.ndarray, previous: np.ndarray) -> Callable[[], None]:
-        """Pay for closeness to the moving target; see `Task.scorer`."""
-        return bind(
-            _score, lo, hi, self.world.state, self.goal, self.errors, action, previous, self.weights, self.terms,
-            self.worst,
-        )  # fmt: skip
-
-    def succeeded(self) -> np.ndarray:
-        """Never too far from the target."""
-        return self.worst <= self.options.success_distance
+    path: Path
+    worst: np.ndarray
+    """(E,) largest distance from the target in the episode [m]."""
+    ahead: np.ndarray
+    """(E, K, 3) how the target moves in the next seconds, see `AHEAD` [m]."""
 
 
-def _draw(rng: np.random.Generator, span: tuple[float, float]) -> float:
-    """Return a number uniform in a range; one that is given is not drawn."""
-    return span[0] if span[0] == span[1] else float(rng.uniform(*span))
+class TrackSettings(NamedTuple):
+    """Constants of the task."""
 
-
-@kernel
-def _start(e, rng, state, goal, rig, hanging, mass, path, height, radius):
-    put(path.centre[e], (0.0, 0.0, 0.0))
-    begin = place(e, 0.0, path)
-    put(path.centre[e], (-begin[0], -begin[1], height - begin[2]))  # every path but a file's starts above the origin
-    putmat(goal.rotation[e], rot_z(path.heading[e]))
-    goal.drone_yaw_rate[e] = 0.0  # the last episode may have been on a path of another form
-    for turning in (goal.slot_velocity, goal.slot_acceleration, goal.slot_jerk):
-        turning[e] = 0.0
-    goal.angular_velocity[e] = 0.0
-    _aim(e, 0.0, path, goal, rig)
-    moved = in_ball(rng, radius)
-    payload = add(row(goal.position, e), moved)
-    hang_team(e, state, goal, rig, hanging, mass, payload, matrow(goal.rotation, e), row(goal.velocity, e), moved)
-
-
-@kernel
-def _aim(e, t, path, goal, rig):
-    """Write the goal of environment e at a time."""
-    set_goal(e, motion(e, t, path), goal)
-    if path.kind[e] == FILE:
-        _turn_target(e, t, path.table, goal, rig)
-        return
-    place_formation(e, goal, rig)
-    if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
-        set_heading(e, path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi, goal, rig)
-        goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
+    table: np.ndarray
+    """Spline of a file's path, see `path_file.load_path`."""
+    height: float
+    """Of the path's centre [m]."""
+    radius: float
+    """Of the ball about the path's start in which the team starts [m]."""
 
 
 @kernel
@@ -229,53 +110,211 @@ def _turn_target(e, t, table, goal, rig):
         put(goal.slot_jerk[e, n], sub(scale(ddw - w**3, across), scale(3.0 * w * dw, level)))
 
 
-@kernel
-def _plan(lo, hi, time, dt, path, goal, rig):
-    for e in range(lo, hi):
-        time[e] += dt
-        _aim(e, time[e], path, goal, rig)
+@inlined
+def aim(e, t, v):
+    """Write the goal of environment e at a time."""
+    path, goal, rig = v.own.path, v.goal, v.rig
+    set_goal(e, motion(e, t, path, v.settings.table), goal)
+    if path.kind[e] == FILE:
+        _turn_target(e, t, v.settings.table, goal, rig)
+        return
+    place_formation(e, goal, rig)
+    if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
+        set_heading(e, path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi, goal, rig)
+        goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
 
 
 @kernel
-def _trace(e, seconds, path, points):
-    for i in range(points.shape[0]):
-        put(points[i], place(e, seconds * i / (points.shape[0] - 1), path))
+def start_on_path(e, rng, v, hanging):
+    """Write goal and team at the start of the path, with the target's velocity."""
+    goal, path = v.goal, v.own.path
+    put(path.centre[e], (0.0, 0.0, 0.0))
+    begin = place(e, 0.0, path, v.settings.table)
+    # every path but a file's starts above the origin
+    put(path.centre[e], (-begin[0], -begin[1], v.settings.height - begin[2]))
+    putmat(goal.rotation[e], rot_z(path.heading[e]))
+    goal.drone_yaw_rate[e] = 0.0  # the last episode may have been on a path of another form
+    for turning in (goal.slot_velocity, goal.slot_acceleration, goal.slot_jerk):
+        turning[e] = 0.0
+    goal.angular_velocity[e] = 0.0
+    aim(e, 0.0, v)
+    moved = in_ball(rng, v.settings.radius)
+    pose = add(row(goal.position, e), moved), matrow(goal.rotation, e)
+    hang_team(e, v, goal, hanging, pose, row(goal.velocity, e), moved)
 
 
-@kernel
-def _look_ahead(lo, hi, time, path, goal, observation, critic):
-    many = 6 + 3 * len(AHEAD)
-    for e in range(lo, hi):
-        c, s = cos(goal.yaw[e]), -sin(goal.yaw[e])
-        told = critic[e, critic.shape[1] - many :]
-        _write_observation(e, c, s, time[e], path, goal, told)
-        for n in range(observation.shape[1]):
-            cn, sn = goal.slot_frame[e, n, 0], -goal.slot_frame[e, n, 1]
-            own = observation[e, n, observation.shape[2] - many :]
-            for k in range(0, many, 3):  # from the target's frame to the slot's
-                cos_turn, sin_turn = cn * c + sn * s, sn * c - cn * s
-                v = turn(cos_turn, sin_turn, (float(told[k]), float(told[k + 1]), float(told[k + 2])))
-                own[k], own[k + 1], own[k + 2] = v
+@inlined
+def advance_target(e, v):
+    """Move the goal along its path."""
+    aim(e, v.time[e], v)
 
 
-@kernel
-def _write_observation(e, c, s, t, path, goal, out):
-    """Write velocity, acceleration and places to come of a target, in its heading frame."""
-    put(out[0:3], turn(c, s, row(goal.velocity, e)))
-    put(out[3:6], turn(c, s, row(goal.acceleration, e)))
+@inlined
+def look_ahead(e, v):
+    """Compute how the target moves in the next seconds."""
     for i in range(len(AHEAD)):
-        put(out[6 + 3 * i : 9 + 3 * i], turn(c, s, sub(place(e, t + AHEAD[i], path), row(goal.position, e))))
+        there = place(e, v.time[e] + AHEAD[i], v.own.path, v.settings.table)
+        put(v.own.ahead[e, i], sub(there, row(v.goal.position, e)))
+
+
+@inlined
+def note_worst(e, v):
+    """Note the largest distance from the target."""
+    v.own.worst[e] = max(v.own.worst[e], v.errors.distance[e])
+
+
+@inlined
+def never(e, v):
+    """Success does not depend on the last seconds."""
+    return False
+
+
+@inlined
+def heading(e, v, margin):
+    """Payload's heading close to its target's."""
+    return tolerance(v.errors.rotation[e, 2], margin)
+
+
+@inlined
+def target_velocity(e, n, v):
+    """Velocity of the target."""
+    return row(v.goal.velocity, e)
+
+
+@inlined
+def target_acceleration(e, n, v):
+    """Acceleration of the target."""
+    return row(v.goal.acceleration, e)
+
+
+@inlined
+def target_ahead_0(e, n, v):
+    """How the target moves in the next seconds, number 0 of `AHEAD`."""
+    return row(v.own.ahead[e], 0)
+
+
+@inlined
+def target_ahead_1(e, n, v):
+    """How the target moves in the next seconds, number 1 of `AHEAD`."""
+    return row(v.own.ahead[e], 1)
+
+
+@inlined
+def target_ahead_2(e, n, v):
+    """How the target moves in the next seconds, number 2 of `AHEAD`."""
+    return row(v.own.ahead[e], 2)
+
+
+@inlined
+def target_ahead_3(e, n, v):
+    """How the target moves in the next seconds, number 3 of `AHEAD`."""
+    return row(v.own.ahead[e], 3)
 
 
 @kernel
-def _score(lo, hi, state, goal, errors, action, previous, weights, terms, worst):
-    for e in range(lo, hi):
-        distance, angle = errors.distance[e], errors.angle[e]
-        slip = norm(sub(row(state.payload_velocity, e), row(goal.velocity, e)))
-        terms[e, 0] = weights[0] * tolerance(distance, 0.25)
-        terms[e, 1] = weights[1] * tolerance(distance, 0.02)
-        terms[e, 2] = weights[2] * tolerance(angle, radians(6.0))
-        terms[e, 3] = weights[3] * tolerance(slip, 0.2)
-        terms[e, 4] = weights[4] * tolerance(errors.rotation[e, 2], radians(0.5))
-        terms[e, 5] = weights[5] * action_rate(e, action, previous)
-        worst[e] = max(worst[e], distance)
+def _trace(e, seconds, path, table, points):
+    for i in range(points.shape[0]):
+        put(points[i], place(e, seconds * i / (points.shape[0] - 1), path, table))
+
+
+def _components(frame: str) -> tuple[Component, ...]:
+    values = (target_ahead_0, target_ahead_1, target_ahead_2, target_ahead_3)
+    ahead = (
+        Component(
+            f"target_ahead_{round(1000 * t)}ms", 3, frame, "m", f"how the target moves in the next {t:g} s", value
+        )
+        for t, value in zip(AHEAD, values, strict=True)
+    )
+    return (
+        Component("target_velocity", 3, frame, "m/s", "velocity of the target", target_velocity),
+        Component("target_acceleration", 3, frame, "m/s²", "acceleration of the target", target_acceleration),
+        *ahead,
+    )
+
+
+class Track(Task):
+    """Follow a path; see docs/track.md."""
+
+    name: ClassVar[str] = "track"
+    Options: ClassVar[type[Section]] = TrackOptions
+    options: TrackOptions
+    own: TrackArrays
+    settings: TrackSettings
+    REWARD: ClassVar[dict[str, Term]] = {
+        "position": Term(0.4, distance, 0.25, "m"),
+        "precision": Term(0.3, distance, 0.02, "m"),
+        "attitude": Term(0.1, attitude, 6.0, "deg"),
+        "velocity": Term(0.2, velocity, 0.2, "m/s"),
+        "heading": Term(0.0, heading, 0.5, "deg"),
+        "action_rate": Term(-0.05, action_rate),
+    }
+    KERNELS: ClassVar[Kernels] = Kernels(never, plan=advance_target, update=note_worst, look=look_ahead)
+    EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
+    EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")
+
+    def prepare(self) -> None:
+        """See `Task.prepare`."""
+        option, world, e = self.options, self.world, self.world.num_envs
+        seconds = self.config.env.episode_seconds
+        self.rmse_after = option.rmse_from if option.rmse_from < seconds else 0.0
+        file = self._file()
+        table = load_path(file, option.file_spacing, world.system, self.config.randomization) if file else NO_FILE
+        self.own = TrackArrays(Path.zeros(e), np.zeros(e), np.zeros((e, len(AHEAD), 3)))
+        self.settings = TrackSettings(table, option.height, option.start_radius)
+
+    def _file(self) -> str:
+        """Return the reference to the file of the path, "" if none is; a ConfigError if the options disagree."""
+        forms, file = self.options.path, self.options.file
+        if "file" in forms and not file:
+            raise ConfigError("task_options.path=file needs the path of one; set task_options.file=<path>")
+        if file and "file" not in forms:
+            raise ConfigError(
+                f"task_options.file is given, but task_options.path={','.join(forms)} does not fly it; set "
+                "task_options.path=file, or task_options.file=null"
+            )
+        return file or ""
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw heading, form and figures of the path; the team hangs at its start. See `Task.start`.
+
+        The path of a file has its own heading and place.
+        """
+        option, path = self.options, self.own.path
+        heading = rng.uniform(-pi, pi)
+        form = option.path[rng.integers(len(option.path))] if len(option.path) > 1 else option.path[0]
+        kind = PATHS.index(form)
+        path.kind[env], path.heading[env], path.climb[env] = kind, heading, option.climb
+        v, a = _draw(rng, option.speed), _draw(rng, option.acceleration)
+        if kind in (CIRCLE, HELIX):
+            path.size[env], path.rate[env] = _draw(rng, option.radius), _draw(rng, option.rate)
+        elif kind == FIGURE8:  # peak speed A ω √2, peak acceleration with its factor at that size
+            path.size[env], path.rate[env] = 1.0625 * v**2 / a, 0.6655 * a / v
+        elif kind == LEMNISCATE:  # Bernoulli's: peak speed A ω and acceleration 3 A ω² at the ends
+            path.size[env], path.rate[env] = 3 * v**2 / a, a / (3 * v)
+        elif kind == RANDOM:
+            path.curve[env] = draw_curve(rng, np.array(option.room))
+            fastest, hardest = largest_rates(path.curve[env])
+            path.rate[env] = min(v / fastest, sqrt(a / hardest))
+        start_on_path(env, rng, self.view_for(start_on_path), self.hanging)
+        self.own.worst[env] = 0.0
+
+    def target_path(self, env: int) -> np.ndarray:
+        """Return the path, one round of it if it repeats; see `Task.target_path`."""
+        path, table, length = self.own.path, self.settings.table, self.config.env.episode_seconds
+        points, kind = np.zeros((_DRAWN, 3)), path.kind[env]
+        turns = 4 if kind == HELIX else 1
+        if kind == FILE:
+            lap = float(table[-1, 0])
+        else:
+            lap = np.inf if kind == RANDOM else turns * 2 * pi / path.rate[env] + RAMP / 2  # half the ramp is lost
+        _trace(env, min(length, lap), path, table, points)
+        return points
+
+    def succeeded(self) -> np.ndarray:
+        """Never too far from the target."""
+        return self.own.worst <= self.options.success_distance
+
+
+def _draw(rng: np.random.Generator, span: tuple[float, float]) -> float:
+    """Return a number uniform in a range; one that is given is not drawn."""
+    return span[0] if span[0] == span[1] else float(rng.uniform(*span))

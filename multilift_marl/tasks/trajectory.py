@@ -1,8 +1,8 @@
-"""The planned way of a payload from pose to pose, from rest to rest, and of the formation that carries it so.
+"""The planned trajectory of a payload from pose to pose, from rest to rest, and of the formation that carries it.
 
 Slots that merely moved to a target half a turn away would meet in the middle. Here the target itself moves and turns
-smoothly, and the slots are where the drones pull the payload just so: its motion tells the force and the moment that
-it needs, these the pulls, these the slots (differential flatness, Sreenath and Kumar, RSS 2013).
+smoothly. Its motion determines the force and the moment that the payload needs, these the cable forces, and these the
+slots (differential flatness, Sreenath and Kumar, RSS 2013).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import inlined, kernel
 from multilift_marl.control.cable_forces import drone_offset, place_slots, spread
 from multilift_marl.control.formation import hook_arm, place_formation, wrap
 from multilift_marl.math3d import (
@@ -45,10 +45,10 @@ CANDIDATES = (  # the usual one first: whether to turn the longer way round, and
     (True, 0.0, 0.6),
     (False, 0.75, -0.3),
 )
-GENTLE = 5.0  # [m/s²] of a slot, about: a way is flown by the first course that asks no more
-GAIN = 0.95  # of what the course before asks for, at most, where another one is to be taken
-CLOSE = 30.0  # [m/s²] that drones or cables count, which touch, and in proportion those closer than their bound
-_SAMPLES = 60
+GENTLE = 5.0  # [m/s²] of a slot, about: the first candidate that asks for no more is taken
+GAIN = 0.95  # of the peak of the candidate before, at most, for another one to be taken
+CLOSE = 30.0  # [m/s²] that drones or cables that touch count as, and in proportion those closer than their bound
+_SAMPLES = 60  # of a trajectory, by which candidates are compared
 
 
 class Plan(NamedTuple):
@@ -59,9 +59,9 @@ class Plan(NamedTuple):
     cable_force: np.ndarray
     """(E, K + 1, N, 3) of the cables on the payload at rest there, in the frame turned by the yaw alone [N]."""
     course: np.ndarray
-    """(E, K, 3) of the way to each target: by how much it turns [rad], which share of roll and pitch is taken away
-    half-way (a payload that turns is easier to pull the less it tilts), and which share the pulls of the level start
-    have there, where a negative one leads away from them."""
+    """(E, K, 3) of the trajectory to each target: by how much it turns [rad], which share of roll and pitch is taken
+    away half-way (a payload that turns takes smaller forces the less it tilts), and which share the cable forces of the
+    level start have there, where a negative one leads away from them."""
     stage: np.ndarray
     """(E,) int64, which target is the present one, from 0."""
 
@@ -87,7 +87,7 @@ def _tilt(roll, pitch):
 
 @kernel
 def set_goal_from_plan(e, k, plan, goal, rig, hanging):
-    """Let pose k of the plan be the goal of environment e: its slots and pulls too."""
+    """Let pose k of the plan be the goal of environment e: its slots and cable forces too."""
     pose = plan.pose[e, k]
     put(goal.position[e], (pose[0], pose[1], pose[2]))
     putmat(goal.rotation[e], attitude_of(pose[3], pose[4], pose[5]))
@@ -105,47 +105,47 @@ def mat_row(a, i, j, n):
 
 
 @kernel
-def select_candidate(e, time, plan, planned, rig, hanging, inertia, balance, hold, seconds, bounds):
-    """Choose the course of each way of environment e: the first of `COURSES` that is gentle, else the gentlest one.
+def select_candidate(e, v):
+    """Choose the course to each target of environment e: the first of `CANDIDATES` that is gentle, else the gentlest.
 
-    What decides is how a slot is accelerated: a drone whose cable is nearly slack is swung about by little changes.
+    The measure is the acceleration of a slot: a drone whose cable is nearly slack is swung about by little changes.
 
     Args:
         e: the environment.
-        time, way: overwritten.
-        plan: Plan, its courses written.
-        rig, hanging, inertia, balance, hold, seconds: see `lead`.
-        bounds: Bounds, those of distances between drones and cables.
+        v: View of task `pose`; its courses are written, its time and plan overwritten.
     """
+    plan = v.own.plan
     for k in range(plan.course.shape[1]):
         least, best = np.inf, 0
         for i in range(len(CANDIDATES)):
-            _take(e, k, plan, i)
-            asked = _peak_acceleration(e, k, time, plan, planned, rig, hanging, inertia, balance, hold, seconds, bounds)
-            if asked < GAIN * least:
-                least, best = asked, i
-            if asked <= GENTLE:
+            _set_course(e, k, plan, i)
+            peak = _peak_acceleration(e, k, v)
+            if peak < GAIN * least:
+                least, best = peak, i
+            if peak <= GENTLE:
                 break
-        _take(e, k, plan, best)
-    time[e] = 0.0
+        _set_course(e, k, plan, best)
+    v.time[e] = 0.0
 
 
 @kernel
-def _take(e, k, plan, i):
-    """Let way k have course i."""
+def _set_course(e, k, plan, i):
+    """Let the trajectory to target k have candidate i."""
     longer, dip, level = CANDIDATES[i]
     turned = wrap(plan.pose[e, k + 1, 3] - plan.pose[e, k, 3])
     put(plan.course[e, k], (turned - 2.0 * pi * np.sign(turned) if longer else turned, dip, level))
 
 
-@kernel
-def _peak_acceleration(e, k, time, plan, planned, rig, hanging, inertia, balance, hold, seconds, bounds):
-    """Return the largest acceleration of a slot on way k [m/s²], or more where drones or cables come too close."""
-    hold_plan_pose(e, k, plan, planned, rig, hanging)
-    plan.stage[e], most, room, dt = k, 0.0, 1.0, seconds / _SAMPLES
+@inlined
+def _peak_acceleration(e, k, v):
+    """Return the largest acceleration of a slot on the way to target k [m/s²], more if drones or cables come close."""
+    plan, planned, rig, bounds = v.own.plan, v.planned, v.rig, v.settings.bounds
+    hold_plan_pose(e, k, plan, planned, rig, v.nominal)
+    plan.stage[e] = k
+    most, room, dt = 0.0, 1.0, v.settings.seconds / _SAMPLES
     for i in range(_SAMPLES):
-        time[e] = k * hold + (i + 1) * dt
-        _evaluate_plan(e, e + 1, time, dt, plan, planned, rig, hanging, inertia, balance, hold, seconds)
+        v.time[e] = k * v.settings.hold + (i + 1) * dt
+        evaluate_plan(e, v, dt)
         position, attitude = row(planned.position, e), matrow(planned.rotation, e)
         for n in range(rig.slots.shape[0]):
             most = max(most, norm(add(row(planned.acceleration, e), vec(planned.slot_acceleration, e, n))))
@@ -159,7 +159,7 @@ def _peak_acceleration(e, k, time, plan, planned, rig, hanging, inertia, balance
 
 @kernel
 def hold_plan_pose(e, k, plan, planned, rig, hanging):
-    """Let the way of environment e be at rest at pose k of the plan."""
+    """Let the planned trajectory of environment e be at rest at pose k of the plan."""
     set_goal_from_plan(e, k, plan, planned, rig, hanging)
     for moving in (planned.velocity, planned.acceleration, planned.jerk, planned.angular_velocity):
         moving[e] = 0.0
@@ -168,100 +168,88 @@ def hold_plan_pose(e, k, plan, planned, rig, hanging):
     planned.drone_yaw_rate[e] = 0.0
 
 
-@kernel
-def advance_plan(
-    lo, hi, time, dt, plan, goal, planned, rig, hanging, inertia, balance, payload_rotation, hold, seconds
-):
-    """Go on by one control step: the way of environments lo to hi, and their goals where a new target's time has come.
+@inlined
+def advance_plan(e, v):
+    """Move the planned pose of environment e on to its time, and its goal where a new target's time has come."""
+    plan = v.own.plan
+    stage = min(int((v.time[e] - 0.5 * v.control_dt) / v.settings.hold), plan.pose.shape[1] - 2)
+    if stage != plan.stage[e]:
+        plan.stage[e] = stage
+        set_goal_from_plan(e, stage + 1, plan, v.goal, v.rig, v.nominal)
+    evaluate_plan(e, v, v.control_dt)
+    if v.settings.is_point:  # its attitude is that of the plan
+        putmat(v.state.payload_rotation[e], matrow(v.planned.rotation, e))
 
-    Args:
-        lo, hi: the environments.
-        time: (E,) since the start, advanced by dt [s].
-        dt: control step [s].
-        plan: Plan.
-        goal: the present target.
-        way: Goal that the drones fly about.
-        rig, hanging: Rig, Hanging.
-        inertia: of the payload in its frame, 9 numbers [kg m²].
-        balance: Spread over the anchors.
-        payload_rotation: (E, 3, 3) written if the payload is a point, which is turned as its way is.
-        hold: how long each target stays [s].
-        seconds: how long the way to it takes [s].
+
+@inlined
+def evaluate_plan(e, v, dt):
+    """Write the planned pose of environment e at its time, `dt` [s] after the last one, and where the drones are then.
+
+    Settings are `hold` and `seconds`, how long each target stays and the trajectory to it takes [s], `inertia` of the
+    payload, 9 numbers [kg m²], and `distribution`, a WrenchDistribution over the anchors.
     """
-    for e in range(lo, hi):
-        time[e] += dt
-        stage = min(int((time[e] - 0.5 * dt) / hold), plan.pose.shape[1] - 2)
-        if stage != plan.stage[e]:
-            plan.stage[e] = stage
-            set_goal_from_plan(e, stage + 1, plan, goal, rig, hanging)
-    _evaluate_plan(lo, hi, time, dt, plan, planned, rig, hanging, inertia, balance, hold, seconds)
-    if not np.any(rig.anchors != 0.0):
-        for e in range(lo, hi):
-            putmat(payload_rotation[e], matrow(planned.rotation, e))
+    plan, planned, rig, hanging = v.own.plan, v.planned, v.rig, v.nominal
+    count, k = rig.slots.shape[0], plan.stage[e]
+    seconds = v.settings.seconds
+    gone = v.time[e] - k * v.settings.hold
+    if gone >= seconds + 4.5 * dt:  # a little later than the trajectory ends: the differences of the slots are zero
+        return
 
+    # pose, velocities and accelerations: position and angles go from rest to rest together
+    s, ds, dds, ddds = ease(gone, 0.0, seconds)
+    a, b = plan.pose[e, k], plan.pose[e, k + 1]
+    before, start, step = row(planned.position, e), (a[0], a[1], a[2]), (b[0] - a[0], b[1] - a[1], b[2] - a[2])
+    turned, dip, level = plan.course[e, k]
+    yaw = a[3] + s * turned
+    roll, rolled, rolling = _dipped(a[4], b[4], s, dip)
+    pitch, pitched, pitching = _dipped(a[5], b[5], s, dip)
+    attitude, position = attitude_of(yaw, roll, pitch), add(start, scale(s, step))
+    spin, swing = _spin(yaw, roll, turned, rolled, pitched)
+    swing = add(swing, _spin(yaw, roll, 0.0, rolling, pitching)[0])
+    acceleration, angular_acceleration = scale(dds, step), add(scale(dds, spin), scale(ds * ds, swing))
+    rates, c, si = scale(ds, spin), cos(yaw), sin(yaw)
+    put(planned.position[e], position)
+    put(planned.velocity[e], scale(ds, step))
+    put(planned.acceleration[e], acceleration)
+    put(planned.jerk[e], scale(ddds, step))
+    put(planned.angular_velocity[e], rates)
+    putmat(planned.rotation[e], attitude)
+    planned.yaw[e] = yaw
+    planned.drone_yaw[e] = yaw
+    planned.drone_yaw_rate[e] = ds * turned
 
-@kernel
-def _evaluate_plan(lo, hi, time, dt, plan, planned, rig, hanging, inertia, balance, hold, seconds):
-    """Write the way of environments lo to hi; arguments as of `lead`.
+    # the cable forces of the two poses, mixed, lack some of the force and the moment of this motion
+    body = matmul(matmul(attitude, v.settings.inertia), transpose(attitude))
+    moment = add(mul(body, angular_acceleration), cross(rates, mul(body, rates)))
+    force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
+    share = level * 16.0 * s * s * (1.0 - s) * (1.0 - s)
+    for n in range(count):
+        old, new = mat_row(plan.cable_force, e, k, n), mat_row(plan.cable_force, e, k + 1, n)
+        mixed = scale(1.0 - share, add(scale(1.0 - s, old), scale(s, new)))
+        cable_force = turn(c, si, add(mixed, scale(share, mat_row(plan.cable_force, e, 0, n))))
+        put(planned.cable_force[e, n], cable_force)
+        force = sub(force, cable_force)
+        moment = sub(moment, cross(mul(attitude, row(rig.anchors, n)), cable_force))
+    linear, angular = spread(force, moment, attitude, v.settings.distribution)
 
-    The loop is in here because a call for each environment would take longer than the work: see docs/architecture.md.
-    """
-    count = rig.slots.shape[0]
-    for e in range(lo, hi):
-        k = plan.stage[e]
-        gone = time[e] - k * hold
-        if gone >= seconds + 4.5 * dt:  # a little later than the way ends: the differences of the slots are zero
-            continue
-        s, ds, dds, ddds = ease(gone, 0.0, seconds)
-        a, b = plan.pose[e, k], plan.pose[e, k + 1]
-        before, start, step = row(planned.position, e), (a[0], a[1], a[2]), (b[0] - a[0], b[1] - a[1], b[2] - a[2])
-        turned, dip, level = plan.course[e, k]
-        yaw = a[3] + s * turned
-        roll, rolled, rolling = _dipped(a[4], b[4], s, dip)
-        pitch, pitched, pitching = _dipped(a[5], b[5], s, dip)
-        attitude, position = attitude_of(yaw, roll, pitch), add(start, scale(s, step))
-        spin, swing = _spin(yaw, roll, turned, rolled, pitched)
-        swing = add(swing, _spin(yaw, roll, 0.0, rolling, pitching)[0])
-        acceleration, turning = scale(dds, step), add(scale(dds, spin), scale(ds * ds, swing))
-        rates, c, si = scale(ds, spin), cos(yaw), sin(yaw)
-        put(planned.position[e], position)
-        put(planned.velocity[e], scale(ds, step))
-        put(planned.acceleration[e], acceleration)
-        put(planned.jerk[e], scale(ddds, step))
-        put(planned.angular_velocity[e], rates)
-        putmat(planned.rotation[e], attitude)
-        planned.yaw[e], planned.drone_yaw[e], planned.drone_yaw_rate[e] = yaw, yaw, ds * turned
-        # the pulls of the two poses, mixed, lack some of the force and the moment of this motion
-        body = matmul(matmul(attitude, inertia), transpose(attitude))
-        moment = add(mul(body, turning), cross(rates, mul(body, rates)))
-        force = scale(hanging.payload_mass, add(acceleration, (0.0, 0.0, GRAVITY)))
-        share = level * 16.0 * s * s * (1.0 - s) * (1.0 - s)
-        for n in range(count):
-            old, new = mat_row(plan.cable_force, e, k, n), mat_row(plan.cable_force, e, k + 1, n)
-            mixed = scale(1.0 - share, add(scale(1.0 - s, old), scale(s, new)))
-            cable_force = turn(c, si, add(mixed, scale(share, mat_row(plan.cable_force, e, 0, n))))
-            put(planned.cable_force[e, n], cable_force)
-            force, moment = sub(force, cable_force), sub(moment, cross(mul(attitude, row(rig.anchors, n)), cable_force))
-        linear, angular = spread(force, moment, attitude, balance)
-        moved = sub(position, before)
-        for n in range(count):
-            arm = mul(attitude, row(rig.anchors, n))
-            cable_force = add(vec(planned.cable_force, e, n), add(linear, cross(angular, arm)))
-            held, hook = (
-                add(cable_force, (0.0, 0.0, hanging.weight[n])),
-                add(add(position, arm), drone_offset(n, cable_force, hanging)),
-            )
-            slot = sub(hook, hook_arm(n, held, yaw, rig))
-            velocity, past = vec(planned.slot_velocity, e, n), vec(planned.slot_acceleration, e, n)
-            gained = scale(1.0 / dt, sub(sub(slot, vec(planned.slots, e, n)), moved))
-            change = scale(1.0 / dt, sub(gained, velocity))
-            put(planned.slots[e, n], slot)
-            put(planned.slot_velocity[e, n], gained)
-            put(planned.slot_acceleration[e, n], change)
-            put(planned.slot_jerk[e, n], scale(1.0 / dt, sub(change, past)))
-            # the drones' controllers add the inertia of their share of the load, which these pulls hold already
-            share = rig.force[n, 2] / GRAVITY
-            put(planned.cable_force[e, n], sub(held, scale(share, add(acceleration, change))))
+    # slots where the drones exert these forces, and their motion by differences
+    moved = sub(position, before)
+    for n in range(count):
+        arm = mul(attitude, row(rig.anchors, n))
+        cable_force = add(vec(planned.cable_force, e, n), add(linear, cross(angular, arm)))
+        held = add(cable_force, (0.0, 0.0, hanging.weight[n]))
+        hook = add(add(position, arm), drone_offset(n, cable_force, hanging))
+        slot = sub(hook, hook_arm(n, held, yaw, rig))
+        velocity, past = vec(planned.slot_velocity, e, n), vec(planned.slot_acceleration, e, n)
+        gained = scale(1.0 / dt, sub(sub(slot, vec(planned.slots, e, n)), moved))
+        change = scale(1.0 / dt, sub(gained, velocity))
+        put(planned.slots[e, n], slot)
+        put(planned.slot_velocity[e, n], gained)
+        put(planned.slot_acceleration[e, n], change)
+        put(planned.slot_jerk[e, n], scale(1.0 / dt, sub(change, past)))
+        # the drones' controllers add the inertia of their share of the load, which these forces hold already
+        load = rig.force[n, 2] / GRAVITY
+        put(planned.cable_force[e, n], sub(held, scale(load, add(acceleration, change))))
 
 
 @kernel

@@ -1,0 +1,110 @@
+"""The order of a policy step on one page: the named stages of a shard, in the order in which they run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import bind, kernel_name
+from multilift_marl.control.controller import Controller
+from multilift_marl.sim.world import Shard, World
+from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.observations import stack
+from multilift_marl.tasks.sensing import Sensing
+
+
+class Stage(NamedTuple):
+    """A part of a policy step."""
+
+    name: str
+    call: Callable[[], None]
+    times: int = 1
+    """How often it runs in a policy step."""
+
+
+class Teams(NamedTuple):
+    """What the stages of E environments work on."""
+
+    world: World
+    controller: Controller
+    task: Task
+    sensing: Sensing
+    stacked: np.ndarray
+    """(E, N, H D) float32 observations of the last H steps; the task's own array where H = 1."""
+
+
+def build_stages(teams: Teams, shard: Shard, ticks: int) -> tuple[list[Stage], list[Stage], list[Stage]]:
+    """Return what runs for a shard before its control ticks, at each of `ticks`, and after them."""
+    world, controller, task, sensing, stacked = teams
+    lo, hi = shard.lo, shard.hi
+    on_shard = {name: partial(call, lo, hi) for name, call in task.stages.items()}
+    arriving = sensing.applied if sensing.delays_action else task.action
+
+    # once, before: the action arrives
+    plan = on_shard.get("plan")
+    set_action, control = controller.bind(lo, hi, arriving, task.planned, plan)
+    before = []
+    if sensing.delays_action:
+        before.append(Stage("delay action", partial(sensing.bind_send(task.action), lo, hi)))
+    before.append(Stage("set action", set_action))
+
+    # at each control tick: plan, references, rejection of disturbances, rotor thrusts; then physics
+    named = {plan: "advance plan", set_action: "set action"}
+    tick = [Stage(named.get(call) or kernel_name(call), call, ticks) for call in control]
+    tick.append(Stage("physics", partial(world.advance, shard, world.system.control_interval), ticks))
+
+    # once, after: measure, reward, observe
+    after = [Stage("errors and failures", on_shard["check"]), Stage("reward", on_shard["reward"])]
+    after.append(Stage("observe state", on_shard["observe state"]))
+    if sensing.has_noise:
+        after.append(Stage("sense", partial(sensing.bind_sense(task.view, task.dt), lo, hi)))
+    after.append(Stage("observe", on_shard["observe"]))
+    if sensing.delays_observation:
+        after.append(Stage("delay observation", partial(sensing.bind_delay(task.observation), lo, hi)))
+    if stacked is not task.observation:
+        after.append(Stage("stack", bind(stack, lo, hi, task.observation, stacked)))
+    return before, tick, after
+
+
+class Pipeline:
+    """The stages of one shard.
+
+    Args:
+        teams: of all environments.
+        shard: the environments that are stepped.
+        ticks: control ticks of a policy step.
+
+    Attributes:
+        stages: each of them once, in order.
+    """
+
+    def __init__(self, teams: Teams, shard: Shard, ticks: int):
+        before, tick, after = build_stages(teams, shard, ticks)
+        self.stages = [*before, *tick, *after]
+        first, last = len(before), len(before) + len(tick)
+        self._order = [*range(first), *[*range(first, last)] * ticks, *range(last, len(self.stages))]
+        self._calls = tuple(self.stages[i].call for i in self._order)
+
+    def run(self) -> None:
+        """Make one policy step."""
+        for call in self._calls:
+            call()
+
+    def run_timed(self, seconds: np.ndarray) -> None:
+        """Make one policy step and add to `seconds` (S,) what each of the stages took."""
+        for i, call in zip(self._order, self._calls, strict=True):
+            begin = perf_counter()
+            call()
+            seconds[i] += perf_counter() - begin
+
+
+def describe_stages(stages: list[Stage], seconds: np.ndarray) -> str:
+    """Return the stages of a policy step as a table, with the time (S,) [s] that each takes in a step."""
+    lines = [f"{'stage':<24} {'times':>5} {'µs a step':>10} {'share':>6}"]
+    for stage, spent in zip(stages, seconds, strict=True):
+        lines.append(f"{stage.name:<24} {stage.times:>5} {1e6 * spent:>10.1f} {spent / seconds.sum():>6.0%}")
+    return "\n".join(lines)

@@ -1,0 +1,156 @@
+"""What the kernels of a task read and write: one view of all arrays, and the payload's errors against its goal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import FunctionType, ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import inlined
+from multilift_marl.control.formation import Goal, Reference, Rig
+from multilift_marl.math3d import clip, matmul, matrow, norm, put, rotation_vector, row, sub, transpose
+from multilift_marl.sim.state import HiddenLoads, SystemState
+from multilift_marl.tasks.failures import FailureMask, Limits
+from multilift_marl.tasks.starts import CableEquilibrium
+
+INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals: a full action's worth of the scripts
+
+
+class Errors(NamedTuple):
+    """How far the payload is from its goal."""
+
+    position: np.ndarray
+    """(E, 3) payload minus target, world frame [m]."""
+    rotation: np.ndarray
+    """(E, 3) rotation vector from target to payload attitude, world frame [rad]."""
+    distance: np.ndarray
+    """(E,) [m]."""
+    angle: np.ndarray
+    """(E,) [rad]."""
+    position_integral: np.ndarray
+    """(E, 3) ∫ position dt, each component clipped; from the planned position where there is a plan [m s]."""
+    rotation_integral: np.ndarray
+    """(E, 3) ∫ rotation dt, in the same way [rad s]."""
+
+    @classmethod
+    def zeros(cls, num_envs: int) -> Errors:
+        """Return zero errors."""
+        e = num_envs
+        return cls(*(np.zeros(shape) for shape in ((e, 3), (e, 3), (e,), (e,), (e, 3), (e, 3))))
+
+
+class View(NamedTuple):
+    """All that a task's kernels read and write, of E environments of N drones; live arrays."""
+
+    state: SystemState
+    """True."""
+    seen: SystemState
+    """As the drones measure it; `state` itself where nothing disturbs that."""
+    loads: HiddenLoads
+    goal: Goal
+    planned: Goal
+    """What the drones fly about: `goal` itself, unless a plan leads there."""
+    has_plan: bool
+    errors: Errors
+    seen_errors: Errors
+    """From `seen`; `errors` itself where nothing disturbs that."""
+    reference: Reference
+    rig: Rig
+    nominal: CableEquilibrium
+    """The nominal team."""
+    resting_tension: np.ndarray
+    """(N,) of the nominal formation's cables [N]."""
+    limits: Limits
+    mask: FailureMask
+    action: np.ndarray
+    """(E, N, A) the last one."""
+    previous: np.ndarray
+    """(E, N, A) the one before."""
+    time: np.ndarray
+    """(E,) since the start of the episode [s]; advances where the task has a plan."""
+    cause: np.ndarray
+    """(E,) failure cause, an index into `failures.CAUSES`."""
+    good_time: np.ndarray
+    """(E,) for how long the payload has been within the success region [s]."""
+    min_separation: np.ndarray
+    """(E,) smallest distance between drones in the episode [m]."""
+    terms: np.ndarray
+    """(E, T) weighted reward terms."""
+    dt: float
+    """Policy step [s]."""
+    control_dt: float
+    """Control step [s]."""
+    own: Any
+    """Named tuple of the task's own arrays, environment first; saved with the state."""
+    settings: Any
+    """Named tuple of the task's constants."""
+
+
+def reduce_view(view: View, *kernels: Callable[..., Any]) -> View:
+    """Return the view with None in place of what no kernel names, neither itself nor by what it calls.
+
+    Numba copies named tuples, array by array, wherever one is handed on: fewer of them compile and run faster.
+    """
+    names, seen = set[str](), set[Any]()
+    for each in kernels:
+        _collect_names(getattr(each, "py_func", each), names, seen)
+    reduced: View = _keep(view, names)
+    return reduced
+
+
+def _collect_names(function: Any, names: set[str], seen: set[Any]) -> None:
+    """Add the names in a function's code, and in that of the functions that it names."""
+    if function in seen:
+        return
+    seen.add(function)
+    names.update(function.__code__.co_names)
+    modules = [
+        value for value in map(function.__globals__.get, function.__code__.co_names) if isinstance(value, ModuleType)
+    ]
+    for name in function.__code__.co_names:
+        for value in (function.__globals__.get(name), *(getattr(module, name, None) for module in modules)):
+            called = getattr(value, "py_func", value)
+            if isinstance(called, FunctionType):
+                _collect_names(called, names, seen)
+
+
+def _keep(record: Any, names: set[str]) -> Any:
+    """Return a named tuple with None in place of fields that are not among `names`."""
+    values = []
+    for name, value in record._asdict().items():
+        kept = value if name in names else None
+        values.append(_keep(kept, names) if hasattr(kept, "_fields") else kept)
+    return type(record)(*values)
+
+
+@inlined
+def update_errors(e, state, errors, v, dt):
+    """Update the errors of environment e and integrate them over `dt` [s].
+
+    Where the payload follows a plan, its distance from the planned pose is integrated: the distance from a goal still
+    far away would only wind the integrals up.
+
+    Args:
+        e: the environment.
+        state: true or measured.
+        errors: written.
+        v: View.
+        dt: since the last update [s].
+    """
+    goal, planned = v.goal, v.planned
+    put(errors.position[e], sub(row(state.payload_position, e), row(goal.position, e)))
+    turned = matmul(matrow(state.payload_rotation, e), transpose(matrow(goal.rotation, e)))
+    put(errors.rotation[e], rotation_vector(turned))
+    errors.distance[e] = norm(row(errors.position, e))
+    errors.angle[e] = norm(row(errors.rotation, e))
+    offset, rotation = row(errors.position, e), row(errors.rotation, e)
+    if v.has_plan:
+        offset = sub(row(state.payload_position, e), row(planned.position, e))
+        rotation = rotation_vector(matmul(matrow(state.payload_rotation, e), transpose(matrow(planned.rotation, e))))
+    for j in range(3):
+        moved = errors.position_integral[e, j] + dt * offset[j]
+        errors.position_integral[e, j] = clip(moved, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+        moved = errors.rotation_integral[e, j] + dt * rotation[j]
+        errors.rotation_integral[e, j] = clip(moved, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
