@@ -12,7 +12,7 @@ from conftest import make, make_system, same
 
 import multilift_marl as ml
 from multilift_marl.errors import RenderingError
-from multilift_marl.rendering import CAMERAS, Renderer, opengl, write_video
+from multilift_marl.rendering import CAMERAS, Renderer, renderer, write_video
 from multilift_marl.sim.scene import build_model
 
 needs_gl = pytest.mark.skipif(
@@ -187,7 +187,7 @@ def test_opengl_that_does_not_work_is_named_with_its_cure(monkeypatch, chosen, m
     if chosen is not None:
         monkeypatch.setenv("MUJOCO_GL", chosen)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
-    monkeypatch.setattr(opengl.importlib, "import_module", broken)
+    monkeypatch.setattr(renderer.importlib, "import_module", broken)
     with pytest.raises(RenderingError, match=message):
         Renderer(make(num_envs=1))
 

@@ -46,12 +46,12 @@ def test_a_pause_holds_everything_and_a_step_goes_on_by_one():
     assert flight.advance(0.1) == 5  # the second of the pause is not made up for
 
 
-def test_a_slow_machine_falls_behind_in_place_of_choking():
+def test_a_slow_machine_falls_behind_the_clock():
     flight = session()
     assert flight.advance(60.0) == 20
 
 
-def test_reset_flies_the_same_episode_again_and_next_another():
+def test_reset_repeats_the_episode_and_next_starts_another():
     flight = session()
     start = positions(flight)
     flight.advance(0.2)
@@ -76,7 +76,7 @@ def test_the_episodes_are_those_of_evaluation():
         assert (flight.vec.world.state.payload_position[0] == place).all()
 
 
-def test_an_episode_that_ends_is_told_and_the_next_one_begins():
+def test_the_outcome_of_an_episode_is_shown_and_the_next_one_begins():
     flight = session(**{"env.episode_seconds": 0.1})
     for _ in range(5):
         flight.step()
@@ -130,7 +130,7 @@ def test_policies_change_in_flight():
     flight.advance(0.2)
 
 
-def test_a_trained_policy_flies_first_and_one_that_does_not_fit_is_refused():
+def test_a_trained_policy_is_the_first_and_one_that_does_not_fit_is_refused():
     pytest.importorskip("torch")
     flight = make_session({"run": "hover"} | SMALL)[0]
     assert flight.policy == "run" and flight.vec.task.name == "hover" and "formation" in flight.policies

@@ -20,12 +20,12 @@ _USAGE = f"""Watch a team in the browser, at an address of this machine alone ({
   python -m multilift_marl.view task=hover run=hover [key=value ...]
 
   task    a configuration's name or path                      (the run's own, or hover)
-  config  a rig or other configuration for that task; its vehicles, payload, cables and control count, see
+  config  a rig or other configuration for that task; its vehicles, payload, cables and control are used, see
           python train.py --help
   run     a run folder, "latest", or the name of a shipped policy ("hover"); none: scripts only
-  policy  which flies first: run, a script, module:Class, an exported policy (.onnx), a checkpoint (.pt)
+  policy  which controls first: run, a script, module:Class, an exported policy (.onnx), a checkpoint (.pt)
                                                               (run, or formation)
-  import  a module of one's own with tasks or vehicles (docs/plugins.md)
+  import  a module of yours with tasks or vehicles (docs/plugins.md)
   seed    evaluation seed: the episodes are those of evaluate.py        (1000)
   port    of the address; 0 for any free one                  (8080)
 

@@ -20,22 +20,22 @@ HOST = "127.0.0.1"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _FRAME = 1 / 25  # [s]
 _TRAIL = 2.0  # [s]
-_GAMMA = 2.2  # browsers take the colours of many meshes at once for light, not for sRGB
+_GAMMA = 2.2  # browsers take the colours of batched meshes for linear light, not for sRGB
 _AMBIENT = 1.5  # light from all around
 _GEOM = mujoco.mjtGeom
 _SLOTS = 64  # geoms of one shape that are sent at first; doubled as needed
 
 
 class Page:
-    """Serves a session on 127.0.0.1, to who has its address.
+    """Serves a session on 127.0.0.1, to those who have its address.
 
     Args:
-        session: what is watched.
+        session: the simulation to watch.
         port: on which; 0 for any free one.
 
     Attributes:
         port: on which it is served.
-        address: to be opened in a browser; its token is known to who started the viewer alone.
+        address: to be opened in a browser, with a token that is printed only here.
         controls: buttons and fields by name, viser's handles.
 
     Raises:
@@ -48,7 +48,8 @@ class Page:
             import viser
         except ImportError as error:
             raise RenderingError(f"the browser viewer needs {error.name}: {pip_install('view')}") from error
-        self._session, self._shapes = session, trimesh.creation
+        self._session = session
+        self._shapes = trimesh.creation
         self._stage = Stage(session.vec, trail=_TRAIL)
         _check_port(port)
         guard = Guard()
@@ -60,14 +61,15 @@ class Page:
             self.close()
             raise _taken(port)
         self._batches: dict[tuple[int, int, bool], _Batch] = {}
-        self._follow, self._middle = True, session.vec.world.state.payload_position[0].copy()
+        self._follow = True
+        self._middle = session.vec.world.state.payload_position[0].copy()
         self._stage.update(0)
         self._build()
         self.draw()
         self.controls = self._add_controls()
 
     def run(self) -> None:
-        """Fly and show until interrupted."""
+        """Simulate and show until interrupted."""
         last = time.perf_counter()
         while True:
             now = time.perf_counter()
@@ -179,10 +181,13 @@ class Page:
 
 
 class _Batch:
-    """All geoms of one shape, solid ones or clear ones, drawn by the browser in one go."""
+    """All geoms of one shape, solid or translucent, as one batch of viser."""
 
     def __init__(self, server: Any, name: str, mesh: tuple[np.ndarray, np.ndarray], clear: bool):
-        self._server, self._name, self._mesh, self._clear = server, name, mesh, clear
+        self._server = server
+        self._name = name
+        self._mesh = mesh
+        self._clear = clear
         self._slots = 0
         self._handle: Any = None
         self._shown: dict[str, np.ndarray] | None = None
