@@ -1,8 +1,8 @@
-"""What each part of the air costs: the core's speed with it on as a ratio to the core with all of it off.
+"""Computing time of each part of the air: speed of the core with it, as a ratio to the core without any.
 
     python bench/air.py [repeats=5] [seconds=1.0] [any configuration key]
 
-All are measured in turn, in one run, and the medians reported, as in bench.py.
+All are measured alternately in one run, and the medians reported, as in bench.py.
 """
 
 from __future__ import annotations

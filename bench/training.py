@@ -1,11 +1,11 @@
-"""What an iteration of training spends its time on.
+"""Computing time of the parts of a training iteration.
 
     python bench/training.py [repeats=15] [any configuration key of hover]
 
 Of each iteration of `python train.py config=hover` these are timed: physics, control, observation and reward, in the
-threads that step the shards; the actor in flight; starts of episodes. What learning computes is timed by doing the same
-arithmetic without TorchRL's losses and estimators on copies of the networks, in turn with the iterations. All else is
-TorchRL, TensorDict and Python, the package's own too: collecting, packing, checking, losses, diagnostics.
+threads that step the shards; the actor during rollouts; starts of episodes. The arithmetic of learning is
+timed without TorchRL's losses and estimators on copies of the networks, alternating with the iterations. The rest is
+TorchRL, TensorDict and Python, the package's own included: collecting, packing, checking, losses, diagnostics.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from multilift_marl.errors import ConfigError
 
 PARTS = {
     "core": "physics, control, observation, reward",
-    "actor": "actor in flight",
+    "actor": "actor in rollouts",
     "learning": "arithmetic of learning",
     "starts": "starts of episodes",
     "other": "TorchRL, TensorDict, Python",
@@ -51,12 +51,12 @@ def timed(function: Callable[..., Any], name: str, spent: dict[str, float]) -> C
 
 
 class Arithmetic:
-    """What `agents.mappo.update` computes (MAPPO, no entropy bonus) without TensorDicts, on copies of the networks."""
+    """The arithmetic of `agents.mappo.update` (MAPPO, no entropy bonus) without TensorDicts, on copied networks."""
 
     def __init__(self, trainer: Trainer):
         self.config = trainer.config.train
         if self.config.algorithm != "mappo" or self.config.entropy > 0:
-            raise ConfigError("bench/training.py knows train.algorithm=mappo with train.entropy=0 alone; set these")
+            raise ConfigError("bench/training.py supports train.algorithm=mappo with train.entropy=0 only; set these")
         learner = trainer.learner
         self.actor, self.critic = copy.deepcopy(learner.actor), copy.deepcopy(learner.critic)
         groups = [{"params": list(network.parameters())} for network in (self.actor, self.critic)]

@@ -1,6 +1,6 @@
-"""A task of one's own, complete: the team lifts its payload by a metre and holds it there.
+"""A complete task of your own: the team lifts its payload by a metre and holds it there.
 
-Everything else (doors, seeding, failures, observations, training, evaluation) works by itself. In the package, `Lift`
+The package provides everything else: APIs, seeding, failures, observations, training, evaluation. Within it, `Lift`
 would be a file in multilift_marl/tasks/ with a line in tasks/__init__.py, and CONFIG a file configs/lift.yaml.
 
 Run: python examples/new_task.py
@@ -43,7 +43,7 @@ class Lift(Task):
         goal.slots[env, :, 2] += rise
 
     def reward(self, lo, hi, action, previous):
-        """Return the call that pays environments lo to hi after every step."""
+        """Return the call that writes the rewards of environments lo to hi after every step."""
         state, near = self.world.state, self.options.near
         return bind(
             score, lo, hi, state, self.errors, action, previous, self.weights, near, self.dt, self.terms, self.good_time
@@ -70,7 +70,7 @@ ml.register_task(Lift, CONFIG)
 
 
 def main() -> float:
-    """Fly the new task by a script and return its success."""
+    """Evaluate a script on the new task and return its success."""
     vec = ml.make_vec("lift")
     script = make_scripted("formation_integral", vec)
     observation, info = vec.reset(seed=0)

@@ -1,6 +1,6 @@
 """Stable-Baselines3's PPO, one policy for all drones: SuperSuit makes agents the rows of an SB3 vector environment.
 
-Needs an environment of its own with examples/requirements/sb3_supersuit.txt. Run: python examples/sb3_supersuit.py
+Needs its own environment with examples/requirements/sb3_supersuit.txt. Run: python examples/sb3_supersuit.py
 """
 
 import sys

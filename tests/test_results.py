@@ -119,7 +119,7 @@ def test_judging_can_be_stopped_and_started_again(tmp_path, monkeypatch):
     assert reproduce.fly(job).startswith("land, formation: success ")
     assert job.done and {path.name for path in (tmp_path / "land").iterdir()} == {"formation.json", "formation.npz"}
     monkeypatch.setattr(reproduce, "fly", None)  # would be called for what is left
-    reproduce.judge(["land/formation"], 1)
+    reproduce.evaluate(["land/formation"], 1)
     job.files[1].unlink()
     assert not job.done
 
@@ -189,7 +189,7 @@ def test_the_search_prints_gains_that_a_script_can_have(capsys):
 
 def test_the_search_finds_gains_that_cost_less(monkeypatch):
     def bowl(config, script, seed):
-        return search_gains.Flown(sum((gain - 0.3) ** 2 for *_, gain in script.GAINS), 0.0, 0.0, 0.0)
+        return search_gains.Score(sum((gain - 0.3) ** 2 for *_, gain in script.GAINS), 0.0, 0.0, 0.0)
 
     clock = count()  # a second from one generation to the next
     monkeypatch.setattr(search_gains, "fly", bowl)
