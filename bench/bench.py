@@ -29,7 +29,8 @@ Runner = Callable[[], int]
 def mujoco_alone(vec: MultiliftVec, threads: int) -> Runner:
     """Return a runner of MuJoCo alone, from the present states and loads of the teams of `vec`."""
     batch = Batch(vec.world.model, vec.num_envs, nthread=threads)
-    interval, ticks = vec.world.system.control_interval, vec.control_ticks
+    interval = vec.world.system.control_interval
+    ticks = vec.control_ticks
     batch.bind("sensordata")
 
     def run() -> int:
@@ -97,17 +98,23 @@ def measure(runners: dict[str, Runner], repeats: int, seconds: float) -> dict[st
     rates: dict[str, list[float]] = {name: [] for name in runners}
     for _ in range(repeats):
         for name, run in runners.items():
-            start, steps = time.perf_counter(), 0
+            start = time.perf_counter()
+            steps = 0
             while (passed := time.perf_counter() - start) < seconds:
                 steps += run()
             rates[name].append(steps / passed)
     return rates
 
 
+def settings(defaults: dict, arguments: list[str]) -> tuple[dict, int, float]:
+    """Return configuration values, repeats and seconds of key=value arguments."""
+    values = defaults | parse_overrides(arguments)
+    return values, int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+
+
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
-    values = {"env.num_envs": 256} | parse_overrides(arguments)
-    repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+    values, repeats, seconds = settings({"env.num_envs": 256}, arguments)
     config = load_config("hover", values)
     vec = ml.make_vec(config)
     threads = len(vec.world.shards)
@@ -122,7 +129,8 @@ def main(arguments: list[str]) -> dict:
         rates = measure(runners, repeats, seconds)
         for name, values in rates.items():
             ratios = [value / reference for value, reference in zip(values, rates["mujoco"], strict=True)]
-            rate, ratio = statistics.median(values), statistics.median(ratios)
+            rate = statistics.median(values)
+            ratio = statistics.median(ratios)
             result[f"{name}_{envs}"] = {"steps_per_s": rate, "ratio": ratio}
             print(
                 f"| {name} | {envs} | {used} | {rate:,.0f} | {rate / config.env.policy_hz:,.0f} | "

@@ -44,9 +44,13 @@ class Flight:
     """
 
     def __init__(self, config: Config, mass: np.ndarray):
-        self.system, self.dt, self.kind = config.system, 1 / config.sim.control_hz, config.control.disturbance
-        e, n = len(mass), self.system.num_drones
-        self.world, self.reference = World(self.system, e, 1), Reference.zeros(e, n)
+        self.system = config.system
+        self.dt = 1 / config.sim.control_hz
+        self.kind = config.control.disturbance
+        e = len(mass)
+        n = self.system.num_drones
+        self.world = World(self.system, e, 1)
+        self.reference = Reference.zeros(e, n)
         self.world.set_parameters(np.ones(e, bool), payload_mass=mass * self.system.payload_mass)
         self.gains = make_gains(config.control, self.system)
         self.cable_force = np.broadcast_to(self.system.hook_force, (e, n, 3)).copy()
@@ -70,7 +74,8 @@ class Flight:
 
     def step(self) -> None:
         """Simulate one control step."""
-        cable_force, thrust = self.cable_force, self.world.thrust
+        cable_force = self.cable_force
+        thrust = self.world.thrust
         if self.kind != "none":
             self.reject()
             cable_force = self.disturbance.cable_force
@@ -85,8 +90,10 @@ def circle(t: float, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     w = rate * s**3 * (10 - 15 * s + 6 * s**2)
     w1 = rate / RAMP * 30 * s**2 * (1 - s) ** 2
     w2 = rate / RAMP**2 * 60 * s * (1 - s) * (1 - 2 * s)
-    outward, along = np.array([np.cos(angle), np.sin(angle), 0]), np.array([-np.sin(angle), np.cos(angle), 0])
-    velocity, acceleration = w * along, w1 * along - w**2 * outward
+    outward = np.array([np.cos(angle), np.sin(angle), 0])
+    along = np.array([-np.sin(angle), np.cos(angle), 0])
+    velocity = w * along
+    acceleration = w1 * along - w**2 * outward
     jerk = (w2 - w**3) * along - 3 * w * w1 * outward
     return RADIUS * (outward - [1, 0, 0]), RADIUS * velocity, RADIUS * acceleration, RADIUS * jerk, angle, w
 
@@ -101,8 +108,12 @@ def fly_cases(config: Config, rate: float, seconds: float) -> tuple[np.ndarray, 
     """
     cases = np.array(list(CASES.values()))
     flight = Flight(config, cases[:, 0])
-    state, reference, rest = flight.world.state, flight.reference, np.array([0, 0, REST_HEIGHT])
-    drones, payload, counted = np.zeros(len(cases)), np.zeros(len(cases)), 0
+    state = flight.world.state
+    reference = flight.reference
+    rest = np.array([0, 0, REST_HEIGHT])
+    drones = np.zeros(len(cases))
+    payload = np.zeros(len(cases))
+    counted = 0
     for tick in range(round((START + seconds) / flight.dt)):
         t = tick * flight.dt
         flight.world.hidden_loads.wind[:, 0] = cases[:, 1] + cases[:, 2] * np.sin(cases[:, 3] * t)
@@ -146,7 +157,9 @@ def swing_decay(config: Config, seconds: float) -> np.ndarray:
         return speed
 
     most(4.0)
-    early, _, late = most(2.0), most(seconds), most(2.0)
+    early = most(2.0)
+    most(seconds)
+    late = most(2.0)
     return np.log(early / late).reshape(2, 3).min(axis=0) / (seconds + 2.0)
 
 

@@ -12,8 +12,8 @@ import statistics
 import sys
 
 import multilift_marl as ml
-from bench import core, measure, mujoco_alone
-from multilift_marl.config.load import load_config, parse_overrides
+from bench import core, measure, mujoco_alone, settings
+from multilift_marl.config.load import load_config
 
 CASES = {  # name: options beside the shipped configuration
     "inertia": {"payload_inertia": 0.2},
@@ -33,8 +33,7 @@ CASES = {  # name: options beside the shipped configuration
 
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
-    values = {"env.num_envs": 256} | parse_overrides(arguments)
-    repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+    values, repeats, seconds = settings({"env.num_envs": 256}, arguments)
     everything = {key: width for case in CASES.values() for key, width in case.items()}
     cases = {"off": {}, **CASES, "everything": everything}
     teams = {
@@ -43,7 +42,8 @@ def main(arguments: list[str]) -> dict:
     }
     off = teams["off"]
     runners = {"mujoco": mujoco_alone(off, len(off.world.shards)), **{name: core(team) for name, team in teams.items()}}
-    rates, result = measure(runners, repeats, seconds), {}
+    rates = measure(runners, repeats, seconds)
+    result = {}
     print(f"{off.num_drones} drones, {off.num_envs} environments; medians of {repeats}")
     print("| on | core / MuJoCo alone | relative to off |")
     print("|---|---|---|")

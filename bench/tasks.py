@@ -11,8 +11,8 @@ import statistics
 import sys
 
 import multilift_marl as ml
-from bench import core, measure, mujoco_alone
-from multilift_marl.config.load import load_config, parse_overrides
+from bench import core, measure, mujoco_alone, settings
+from multilift_marl.config.load import load_config
 
 TEAMS = (2, 4, 8, 16)
 
@@ -27,8 +27,7 @@ def ratio(config: str, repeats: int, seconds: float, overrides: dict) -> tuple[f
 
 def main(arguments: list[str]) -> None:
     """Measure and print two tables."""
-    values = parse_overrides(arguments)
-    repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+    values, repeats, seconds = settings({}, arguments)
     print("| task | ratio to MuJoCo alone | MuJoCo [µs] | core [µs] |\n|---|---|---|---|")
     for task in ml.list_tasks():
         found, plain, whole = ratio(task, repeats, seconds, values)

@@ -31,7 +31,8 @@ from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.evaluation.plots import POLICY_COLOURS
 from multilift_marl.evaluation.rollout import Trace, fly_episodes, trace_episode
 
-HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
+HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
 HELD, SEED = 4, 1000  # steps of 5 ms that the reference is held; evaluation seed
 NO_DRAG = {"payload.drag_area": 0.0}
 AXES = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
-EPISODES, SEED = 1000, 1000
+HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
+EPISODES = 1000
+SEED = 1000
 FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
 AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
 FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}

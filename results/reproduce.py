@@ -59,7 +59,8 @@ def keep(recipe: str, run: Path) -> None:
     from multilift_marl.agents.policy import strip_checkpoint
     from multilift_marl.evaluation.plots import plot_training
 
-    rows, last = read_metrics(run), load_checkpoint(run / "checkpoints" / "last.pt")
+    rows = read_metrics(run)
+    last = load_checkpoint(run / "checkpoints" / "last.pt")
     folder = HERE / recipe / f"seed{last['config']['seed']}"
     folder.mkdir(parents=True, exist_ok=True)
     names = ("frames", "return", *(name for name in rows[0] if name.startswith("eval/")))
@@ -125,7 +126,9 @@ def fly(job: Job) -> str:
     if job.weights:
         policy = load_policy(job.weights)
         scales = {f"control.{key}": getattr(policy.config.control, key) for key in ("max_offset", "max_yaw")}
-        maker, overrides = policy.bind, overrides | scales  # the full scale of actions is that of training
+        # the full scale of actions is that of training
+        maker = policy.bind
+        overrides = overrides | scales
     results = fly_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
     metrics = summarize(results)
     error = results[error_metric(flight)]

@@ -23,7 +23,10 @@ from multilift_marl.control.scripted import LINEAR, Formation, check_interface
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
 
-LEVEL, TANGENT, RADIAL, UP = ((0, 0), (1, 1)), ((2, 1),), ((1, 0),), ((2, 2),)
+LEVEL = ((0, 0), (1, 1))
+TANGENT = ((2, 1),)
+RADIAL = ((1, 0),)
+UP = ((2, 2),)
 LIFT = ((1, 2),)  # what a drone does up and down turns the payload about the tangent at its slot
 FREE: tuple[tuple[str, tuple[tuple[int, int], ...], float], ...] = (
     ("payload_error_integral", LEVEL, 0.2),
@@ -83,7 +86,8 @@ def fly(config: Config, script: type[Formation], seed: int) -> Score:
     """Simulate one episode in every environment of `config`; return the scores of its worst moment that counts."""
     vec = MultiliftVec(config, TRAINING_EVALUATION)
     bound = np.array([[vec.task.options.success_distance], [radians(vec.task.options.success_angle)]])
-    policy, worst = script(vec), np.zeros((2, vec.num_envs))
+    policy = script(vec)
+    worst = np.zeros((2, vec.num_envs))
     observation, _ = vec.reset(seed=seed)
     failed = np.zeros(vec.num_envs, bool)
     for step in range(vec.max_steps):
@@ -112,7 +116,9 @@ def search(config: Config, start: np.ndarray, spread: float, minutes: float) -> 
         raise ConfigError("the search needs the package cma; install it with: pip install cma") from None
     scale = np.array([width for _, _, width in FREE])
     options = {"popsize": POPULATION, "seed": config.seed % (2**32 - 1) + 1, "verbose": -9}
-    strategy, end, generation = cma.CMAEvolutionStrategy(np.zeros(len(FREE)), spread, options), 60 * minutes, 0
+    strategy = cma.CMAEvolutionStrategy(np.zeros(len(FREE)), spread, options)
+    end = 60 * minutes
+    generation = 0
     begun = time.monotonic()
     try:
         while time.monotonic() - begun < end:
@@ -147,7 +153,8 @@ def main(values: dict[str, Any]) -> int:
     check_interface(script, config.control.action)
     if config.task not in TASKS:
         raise ConfigError(f"task {config.task} cannot be searched; take hover or pose")
-    start, fresh = starting_gains(script), build_config(config.model_dump(), {"env.num_envs": 256})
+    start = starting_gains(script)
+    fresh = build_config(config.model_dump(), {"env.num_envs": 256})
     gains = search(config, start, own["spread"], own["minutes"])
     for (name, axes, _), gain in zip(FREE, gains, strict=True):
         for axis, moved in axes:

@@ -78,7 +78,8 @@ def gain(flight: str) -> str:
     if not learned or not best:
         return "-"
     script = np.load(HERE / flight / f"{best}.npz")
-    parts, differences = [], []
+    parts = []
+    differences = []
     for key, unit, digits in (("success", "points", 1), ("error", "cm", 2)):
         mean = np.mean([each[key].astype(float) for each in learned], axis=0)
         difference = 100 * (mean - script[key].astype(float))

@@ -158,8 +158,10 @@ def test_a_machine_without_display_needs_no_settings_and_exits_quietly():
         "vec = ml.make_vec(num_envs=1, num_threads=1)\nvec.reset(seed=0)\nrenderer = Renderer(vec, 64, 36)\n"
         "print(renderer.frame().shape)"  # and never closed
     )
-    bare = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=bare)
+    without_display = {
+        key: value for key, value in os.environ.items() if key not in ("DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")
+    }
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=without_display)
     assert (done.stdout, done.stderr, done.returncode) == ("(36, 64, 3)\n", "", 0)
 
 

@@ -30,9 +30,9 @@ def test_time_passes_at_the_speed_chosen():
     flight = session()
     for speed in (1.0, 0.5, 4.0):
         before, flight.speed = flight.vec.steps[0], speed
-        flown = sum(flight.advance(0.03) for _ in range(10))
-        assert abs(flown - 0.3 * speed / flight.vec.task.dt) <= 1
-        assert flight.vec.steps[0] - before == flown
+        steps = sum(flight.advance(0.03) for _ in range(10))
+        assert abs(steps - 0.3 * speed / flight.vec.task.dt) <= 1
+        assert flight.vec.steps[0] - before == steps
 
 
 def test_a_pause_holds_everything_and_a_step_goes_on_by_one():
@@ -55,11 +55,11 @@ def test_reset_repeats_the_episode_and_next_starts_another():
     flight = session()
     start = positions(flight)
     flight.advance(0.2)
-    flown = positions(flight)
+    steps = positions(flight)
     flight.reset()
     assert (positions(flight) == start).all() and flight.vec.steps[0] == 0 and flight.vec.episodes[0] == 0
     flight.advance(0.2)
-    assert (positions(flight) == flown).all()
+    assert (positions(flight) == steps).all()
     flight.skip()
     assert flight.vec.episodes[0] == 1 and (positions(flight) != start).any()
 

@@ -1,4 +1,4 @@
-"""Where a picture is taken from: beside, above or behind the team, as far away as its size asks for."""
+"""Cameras beside, above or behind the team, at a distance that follows from its size."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ class Camera:
 
     def aim(self, env: int, path: np.ndarray) -> None:
         """Point at the team of an environment; `path` (P, 3) is its target's, P = 0 for none."""
-        target, payload = self._vec.task.goal.position[env], self._vec.world.state.payload_position[env]
+        target = self._vec.task.goal.position[env]
+        payload = self._vec.world.state.payload_position[env]
         if self._name == "chase":
             self._turn(payload)
             self.view.lookat[:] = payload
@@ -86,15 +87,20 @@ class Camera:
 
         For the camera above, a team anywhere on `path` (P, 3).
         """
-        system, tilt = self._vec.world.system, np.deg2rad(self.view.elevation)
+        system = self._vec.world.system
+        tilt = np.deg2rad(self.view.elevation)
         drone = 2 * max(vehicle.arm for vehicle in system.vehicles)
         half_payload = system.payload_size / 2 + np.abs(system.payload_center)
         reach = max(np.hypot(*system.slots[:, :2].T).max() + drone, np.hypot(*half_payload[:2]))
-        top, bottom = max(system.slots[:, 2].max() + drone, half_payload[2]), -half_payload[2]
+        top = max(system.slots[:, 2].max() + drone, half_payload[2])
+        bottom = -half_payload[2]
         self._lift = (top + bottom) / 2
         height = (top - bottom) / 2
-        across, along = abs(np.cos(tilt)), abs(np.sin(tilt))  # how much of the height, of the floor a picture shows
-        vertical, depth = height * across + reach * along, height * along + reach * across
+        # shares of the height and of the floor in the direction of the picture's vertical
+        across = abs(np.cos(tilt))
+        along = abs(np.sin(tilt))
+        vertical = height * across + reach * along
+        depth = height * along + reach * across
         wide, high = np.ptp(path[:, :2], axis=0) / 2 if len(path) else (0.0, 0.0)
         view = max(vertical + high + _ROOM, (reach + wide + _ROOM) / self._aspect)
         self.view.distance = depth + view / np.tan(self._fov / 2)

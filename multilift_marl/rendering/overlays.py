@@ -58,8 +58,12 @@ def _add(
         return None
     geom = scene.geoms[scene.ngeom]
     mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), rgba)
-    geom.objtype, geom.objid, geom.segid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1, -1  # left as they were by mjv_initGeom
-    geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, False
+    # mjv_initGeom leaves these unchanged
+    geom.objtype = mujoco.mjtObj.mjOBJ_UNKNOWN
+    geom.objid = -1
+    geom.segid = -1
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+    geom.castshadow = False
     scene.ngeom += 1
     return geom
 

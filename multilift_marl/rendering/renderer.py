@@ -46,9 +46,12 @@ class Renderer:
     def __init__(
         self, vec: MultiliftVec, width: int = 960, height: int = 540, camera: str = "side", trail: float = 0.0
     ):
-        self._vec, self._stage = vec, Stage(vec, camera, width / height, trail)
-        self.scene, size = self._stage.scene, self._stage.model.vis.global_
-        size.offwidth, size.offheight = width, height
+        self._vec = vec
+        self._stage = Stage(vec, camera, width / height, trail)
+        self.scene = self._stage.scene
+        size = self._stage.model.vis.global_
+        size.offwidth = width
+        size.offheight = height
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._gl, self._context = make_contexts(self._stage.model)
         self._free = weakref.finalize(self, free_contexts, self._gl, self._context)  # at the latest when Python exits
@@ -83,7 +86,7 @@ class Renderer:
 
 
 def make_contexts(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
-    """Return an OpenGL context, of the kind MUJOCO_GL asks for or else the first one installed, and MuJoCo's in it."""
+    """Return an OpenGL context, of the kind named by MUJOCO_GL or else the first one installed, and MuJoCo's in it."""
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
     if asked in ("disable", "disabled", "off", "false", "0"):
         raise RenderingError(f"MUJOCO_GL={asked} forbids drawing; unset it")
@@ -96,7 +99,7 @@ def make_contexts(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
         gl = importlib.import_module(f"mujoco.{kind}").GLContext(size.offwidth, size.offheight)
         gl.make_current()
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    except Exception as error:  # each kind fails in its own ways: import, attribute, OpenGL and runtime errors
+    except Exception as error:  # the kinds raise different errors: import, attribute, OpenGL and runtime errors
         cure = f"unset MUJOCO_GL={asked}" if asked else f"run '{_INSTALL}'"
         raise RenderingError(f"drawing by {kind} does not work ({' '.join(str(error).split())}); {cure}") from error
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 _MAX_GEOMS = 20_000
 _CABLE, _LINE, _DASH = 0.0013, 0.0011, 0.016  # radii and length, over the camera's distance: visible from anywhere
 _GLOW = 0.5  # of cables, so that light and shade change their colour less
-_PATH_COLOUR, _TRAIL_STRENGTH = (0.0, 0.60, 0.25, 0.9), 0.75
+_PATH_COLOUR = (0.0, 0.60, 0.25, 0.9)
+_TRAIL_STRENGTH = 0.75
 
 
 class Stage:
@@ -43,7 +44,8 @@ class Stage:
     """
 
     def __init__(self, vec: MultiliftVec, camera: str = "side", aspect: float = 16 / 9, trail: float = 0.0):
-        self._vec, system = vec, vec.world.system
+        self._vec = vec
+        system = vec.world.system
         self.model, _ = build_model(system, visuals=True)
         self.data = mujoco.MjData(self.model)
         self.camera = Camera(vec, self.model, camera, aspect)
@@ -95,7 +97,8 @@ class Stage:
         self._add_overlays(env, time, path)
 
     def _pose(self, env: int) -> None:
-        world, goal = self._vec.world, self._vec.task.goal
+        world = self._vec.world
+        goal = self._vec.task.goal
         if not world.diverged[env]:
             self.data.qpos[:] = world.qpos(env)
         colours = tension_colours(world.state.cable_tension[env], world.system.resting_tension)
@@ -110,8 +113,11 @@ class Stage:
         mujoco.mj_fwdPosition(self.model, self.data)
 
     def _add_overlays(self, env: int, time: float, path: np.ndarray) -> None:
-        task, state, scene = self._vec.task, self._vec.world.state, self.scene
-        line, dash = _LINE * self.camera.view.distance, _DASH * self.camera.view.distance
+        task = self._vec.task
+        state = self._vec.world.state
+        scene = self.scene
+        line = _LINE * self.camera.view.distance
+        dash = _DASH * self.camera.view.distance
         if self._vec.world.nodes is not None and not self._vec.world.diverged[env]:
             radius = _CABLE * self.camera.view.distance
             for n, colour in enumerate(self._colours):

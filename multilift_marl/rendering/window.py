@@ -14,7 +14,8 @@ from multilift_marl.rendering.scene import Stage
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
-_WIDTH, _HEIGHT = 1280, 720
+_WIDTH = 1280
+_HEIGHT = 720
 _TRAIL = 2.0  # [s]
 _CURE = (
     "use render_mode=\"rgb_array\" for pictures, or watch in a browser by 'python -m multilift_marl.view', both of "

@@ -94,9 +94,12 @@ def turbulence_spectra(fast: bool) -> Result:
 
 def _add_spectra(result: Result, height: float, fast: bool) -> None:
     """Add the spectra at a height, averaged over third-octave bands, and their plot."""
-    every, timestep, steps = 5, 0.004, 8192
+    every = 5
+    timestep = 0.004
+    steps = 8192
     samples = sample_turbulence(height, timestep, steps, 40 if fast else 200, every)
-    window, interval = np.hanning(steps)[:, None], every * timestep
+    window = np.hanning(steps)[:, None]
+    interval = every * timestep
     power = np.abs(np.fft.rfft(samples * window, axis=1)) ** 2
     density = 2 * interval * power.mean(axis=0) / (window**2).sum()
     frequency = np.fft.rfftfreq(steps, interval)
@@ -140,9 +143,15 @@ def _apart(system: System) -> World:
 
 def gust(fast: bool) -> Result:
     """A "1 - cosine" gust: its profile, and what it does to a drone with linear drag."""
-    amplitude, start, rise, hold, seconds = np.array([2.0, -1.0, 0.5]), 0.2, 0.5, 0.3, 2.0
+    amplitude = np.array([2.0, -1.0, 0.5])
+    start = 0.2
+    rise = 0.5
+    hold = 0.3
+    seconds = 2.0
     system = _system(wind__gust=amplitude.tolist(), wind__gust_start=start, wind__gust_rise=rise, wind__gust_hold=hold)
-    world, vehicle, h = _apart(system), system.vehicle, system.timestep
+    world = _apart(system)
+    vehicle = system.vehicle
+    h = system.timestep
 
     def profile(t: np.ndarray) -> np.ndarray:
         phase = np.clip(t - start, 0, rise) - np.clip(t - start - rise - hold, 0, rise)
@@ -150,7 +159,8 @@ def gust(fast: bool) -> Result:
 
     t = h * np.arange(round(seconds / h))
     thrust = np.full((1, 1, 4), vehicle.mass * GRAVITY / 4)
-    found, speed = [], []
+    found = []
+    speed = []
     for _ in t:
         world.step(thrust)
         found.append(world.air.gust[0].copy())
@@ -173,8 +183,11 @@ def gust(fast: bool) -> Result:
 def wash(fast: bool) -> Result:
     """The wash below a hovering drone: momentum theory at the rotors, momentum at any distance, nothing above."""
     system = _system(wind__wash=True)
-    world, c, vehicle = _apart(system), make_air(system), system.vehicle
-    thrust, result = vehicle.mass * GRAVITY, Result()
+    world = _apart(system)
+    c = make_air(system)
+    vehicle = system.vehicle
+    thrust = vehicle.mass * GRAVITY
+    result = Result()
 
     def velocity(x: float, y: float, depth: float) -> np.ndarray:
         return np.array(wash_at(0, (x, y, 102.0 - depth), 0.0, world.state, c))
@@ -210,11 +223,13 @@ def wash(fast: bool) -> Result:
 
 def ground_effect(fast: bool) -> Result:
     """Thrust near the ground, from a drone's acceleration at constant rotor speed."""
-    system, result = _system(wind__ground_effect=True), Result()
+    system = _system(wind__ground_effect=True)
+    result = Result()
     vehicle, radius = system.vehicle, system.vehicle.rotor_radius
     squares = ((vehicle.rotor_positions - vehicle.rotor_positions[0]) ** 2).sum(axis=1)
     for ratio in (1.0, 2.0, 4.0, 8.0, 1000.0):
-        world, height = _apart(system), ratio * radius
+        world = _apart(system)
+        height = ratio * radius
         world.state.payload_position[0] = [3.0, 0, 0.5]
         world.state.drone_position[0, 0] = [0, 0, height]
         world.load(np.ones(1, bool))

@@ -27,10 +27,13 @@ _BACK = 0.05  # [m]
 
 def free_fall(fast: bool) -> Result:
     """A drone and a payload fall for a second: without drag, with drag that slows the fall, and coasting sideways."""
-    result, seconds, cast = Result(), 1.0, 5.0
+    result = Result()
+    seconds = 1.0
+    cast = 5.0
     errors: dict[str, list[float]] = {"depth without drag": [], "speed with drag": [], "speed of a coasting drone": []}
     for timestep in STEPS:
-        bare, dragged = _fall(timestep, seconds, 0.0, 0.0), _fall(timestep, seconds, 0.09, cast)
+        bare = _fall(timestep, seconds, 0.0, 0.0)
+        dragged = _fall(timestep, seconds, 0.09, cast)
         system = dragged.system
         name = f"free fall, {ms(timestep)}"
         speed = float(-bare.state.payload_velocity[0, 2])
@@ -77,8 +80,10 @@ def motor_lag(fast: bool) -> Result:
     result = Result(plots=[plot])
     for timestep in STEPS:
         system = make_config(4, timestep).system
-        world, vehicle = World(system, 1, 1), system.vehicle
-        start, target = world.state.rotor_speed[0, 0, 0], 0.9 * vehicle.rotor_speed_max
+        world = World(system, 1, 1)
+        vehicle = system.vehicle
+        start = world.state.rotor_speed[0, 0, 0]
+        target = 0.9 * vehicle.rotor_speed_max
         thrust = np.full((1, 4, 4), vehicle.thrust_coefficient * target**2)
         steps = round(0.1 / timestep)
         t = timestep * np.arange(1, steps + 1)
@@ -95,17 +100,19 @@ def spin(fast: bool) -> Result:
     """A torque-free asymmetric body tumbles at 10 rad/s: angular momentum kept, the better the smaller the step."""
     caption = "A tumbling drone: change of its angular momentum, which is the integrator's error."
     plot = Plot("spin", "torque-free tumbling", "time [s]", "angular momentum, relative change", caption=caption)
-    result, errors = Result(plots=[plot]), []
+    result = Result(plots=[plot])
+    errors = []
     for timestep in STEPS:
         system = make_config(4, timestep).system
         world = World(system, 1, 1)
         model = world.model
         data = mujoco.MjData(model)
         data.qpos[:] = world.qpos(0)
-        model.tendon_limited[:] = 0  # cables pull at once, so they are cut for this experiment
+        model.tendon_limited[:] = 0  # cables would act at once, so they are cut for this experiment
         model.opt.gravity[:] = 0
         data.qvel[9:12] = [10 / np.sqrt(3)] * 3  # body rates of the first drone, after the payload's six velocities
-        inertia, frame = np.asarray(system.vehicle.inertia), np.zeros(9)
+        inertia = np.asarray(system.vehicle.inertia)
+        frame = np.zeros(9)
         kept = []
         for _ in range(round(1.0 / timestep) + 1):
             mujoco.mju_quat2Mat(frame, data.qpos[10:14])
@@ -124,8 +131,10 @@ def swing(fast: bool) -> Result:
     """A load of 1 kg swings from 30° for 20 s: its period, and what the integrator takes of its energy."""
     caption = "A load swings from 30°: its energy, averaged over a swing, of which integrator and damper take a little."
     plot = Plot("swing", "energy of a swinging load", "time [s]", "mean energy over the initial one", caption=caption)
-    result, seconds = Result(plots=[plot]), 5.0 if fast else 20.0
-    start, length = np.deg2rad(30.0), 1.0 + GRAVITY / 1e5
+    result = Result(plots=[plot])
+    seconds = 5.0 if fast else 20.0
+    start = np.deg2rad(30.0)
+    length = 1.0 + GRAVITY / 1e5
     period = 2 * np.pi * np.sqrt(length / GRAVITY) / _mean(1.0, np.cos(start / 2))
     losses = []
     for timestep in STEPS:
@@ -152,7 +161,9 @@ def _swing(timestep: float, seconds: float, start: float, length: float) -> tupl
     model = hanging_load(1.0, timestep)
     data = mujoco.MjData(model)
     data.qpos[:] = length * np.sin(start), 0, 1.0 - length * np.cos(start)
-    scale, angle, energy = GRAVITY * length * (1 - np.cos(start)), [], []
+    scale = GRAVITY * length * (1 - np.cos(start))
+    angle = []
+    energy = []
     for _ in range(round(seconds / timestep)):
         mujoco.mj_step(model, data)
         angle.append(np.arctan2(data.qpos[0], 1.0 - data.qpos[2]))
@@ -175,7 +186,8 @@ def ground(fast: bool) -> Result:
     for timestep in (4e-3, 1e-3):
         system = make_config(4, timestep, vehicle__rotor_speed_min=0.0).system
         world = World(system, 1, 1)
-        state, half = world.state, drone_half_size(system.vehicle)[2]
+        state = world.state
+        half = drone_half_size(system.vehicle)[2]
         frame = np.zeros(9)
         mujoco.mju_quat2Mat(frame, np.array([np.cos(np.deg2rad(5)), np.sin(np.deg2rad(5)), 0, 0]))
         state.payload_position[0] = [0, 0, system.payload_size[2] / 2 + 0.3]
@@ -185,7 +197,8 @@ def ground(fast: bool) -> Result:
         state.payload_rotation[:] = state.drone_rotation[:] = frame.reshape(3, 3)
         state.rotor_speed[:] = 0.0
         world.load(np.ones(1, bool))
-        rest, thrust = np.array([system.payload_size[2] / 2] + [half] * 4), np.zeros((1, 4, 4))
+        rest = np.array([system.payload_size[2] / 2] + [half] * 4)
+        thrust = np.zeros((1, 4, 4))
         heights = []
         for _ in range(round(3.0 / timestep)):
             world.step(thrust)
@@ -230,7 +243,9 @@ def release_drones(preset: str, start: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Return how far each drone fell (K,) [m], and whether it is not back at its reference (K,)."""
     count = len(start)
     system = load_config("hover", {"env.num_drones": 1, "vehicle.preset": preset, "payload.mass": 1e-3}).system
-    world, gains, reference = World(system, count, 1), make_gains(ControlConfig(), system), Reference.zeros(count, 1)
+    world = World(system, count, 1)
+    gains = make_gains(ControlConfig(), system)
+    reference = Reference.zeros(count, 1)
     state = world.state
     reference.position[:] = [0.0, 0.0, _RELEASE_HEIGHT]
     state.payload_position[:] = [0.0, 50.0, 0.0]
@@ -239,7 +254,8 @@ def release_drones(preset: str, start: np.ndarray) -> tuple[np.ndarray, np.ndarr
     state.rotor_speed[:] = np.sqrt(system.drone_mass[0] * GRAVITY / 4 / system.vehicle.thrust_coefficient)
     world.load(np.ones(count, bool))
     world.break_cables(np.ones((count, 1), bool))
-    lowest, no_force = np.full(count, _RELEASE_HEIGHT), np.zeros((count, 1, 3))
+    lowest = np.full(count, _RELEASE_HEIGHT)
+    no_force = np.zeros((count, 1, 3))
     for _ in range(round(_RELEASE_SECONDS / system.timestep)):
         fly(0, count, state, reference, no_force, world.thrust, gains)
         world.step(world.thrust)

@@ -104,7 +104,8 @@ def single_cable(fast: bool) -> Result:
 
 def six_cables(fast: bool) -> Result:
     """Report figures 12-14: six cables 30° from the vertical, loads of 6-60 kg, both models, and how fast they are."""
-    result, angle = Result(), np.pi / 6
+    result = Result()
+    angle = np.pi / 6
     for mass in (6.0, 30.0, 60.0):
         upright = 6 * np.cos(angle) ** 2  # stiffness of the vertical motion over a cable's; small depths
         theory = second_order(mass, upright * STIFFNESS, upright * DAMPING, _TIMES)
@@ -123,7 +124,8 @@ def six_cables(fast: bool) -> Result:
 def _add_massless(result: Result, load: Load, theory: np.ndarray, limit: float) -> None:
     """Add static stiffness and elongation over `_TIMES` of a load on massless cables."""
     model = hanging_load(load.mass, _TIMESTEP, load.cables, load.angle)
-    data, depth = mujoco.MjData(model), []
+    data = mujoco.MjData(model)
+    depth = []
     for _ in range(round(2.0 / _TIMESTEP)):
         mujoco.mj_step(model, data)
         depth.append(-float(data.qpos[2]))
@@ -204,7 +206,8 @@ def hover_thrust(world: World) -> np.ndarray:
 
 def integrators(fast: bool) -> Result:
     """Report figure 4: a stiff chain under MuJoCo's usual integrators, which cannot hold it, and under `discrete`."""
-    result, timestep = Result(), 1e-3
+    result = Result()
+    timestep = 1e-3
     model = _chain(timestep)
     below = [float(model.body_mass[-count:].sum()) for count in range(1, model.nbody)]  # hanging on each segment
     theory = GRAVITY * sum(below) / (len(below) * STIFFNESS)
@@ -229,10 +232,13 @@ def _chain(timestep: float) -> mujoco.MjModel:
     """Return a load of 1 kg on 10 nodes with springs and dampers between them (report eqs 14-16)."""
     spec = mujoco.MjSpec()
     set_options(spec, timestep)
-    above, count = spec.worldbody.add_site(name="top"), 10
+    above = spec.worldbody.add_site(name="top")
+    count = 10
     for i in range(count):
         node = spec.worldbody.add_body(name=f"node_{i}", pos=[0, 0, -(i + 1) / count])
-        node.mass, node.inertia, node.explicitinertial = (1.0 if i == count - 1 else 0.005), [1e-6] * 3, True
+        node.mass = 1.0 if i == count - 1 else 0.005
+        node.inertia = [1e-6] * 3
+        node.explicitinertial = True
         for axis in np.eye(3):
             node.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
         below = node.add_site(name=f"site_{i}")
@@ -254,7 +260,8 @@ def slack_taut(fast: bool) -> Result:
     caption = "A cable comes taut between a drone and a payload that part at 2 m/s: tension at three time steps."
     plot = Plot("slack_taut", "a cable comes taut", "time [ms]", "tension [N]", caption=caption)
     result = Result(plots=[plot])
-    after, all_steps = [], (1e-3, 2.5e-4, 6.25e-5)
+    after = []
+    all_steps = (1e-3, 2.5e-4, 6.25e-5)
     for timestep in all_steps:
         system = make_config(1, timestep, **_FREE).system
         tension, velocity = _part(system)
@@ -283,7 +290,8 @@ def slack_taut(fast: bool) -> Result:
 
 def _add_dissipation(result: Result) -> None:
     """Add what the integrator takes of the energy of an elastic bounce, over the time step."""
-    steps, lost = (1e-3, 2.5e-4, 6.25e-5, 1.5625e-5), []
+    steps = (1e-3, 2.5e-4, 6.25e-5, 1.5625e-5)
+    lost = []
     for timestep in steps:
         velocity = _part(make_config(1, timestep, cable__damping=1e-6, **_FREE).system)[1]
         lost.append(1 - float((velocity[0] - velocity[1]) / _CLOSING) ** 2)
@@ -324,8 +332,10 @@ def bounce(system: System, speed: float) -> float:
 
     μ ẍ + c ẋ + k x = 0 from x = 0, ẋ = speed, until k x + c ẋ = 0; more damped than critically.
     """
-    m, p = system.vehicle.mass, system.payload_mass
-    k, c = system.cable_stiffness[0], system.cable_damping[0]
+    m = system.vehicle.mass
+    p = system.payload_mass
+    k = system.cable_stiffness[0]
+    c = system.cable_damping[0]
     slow, fast = np.roots([m * p / (m + p), c, k])[::-1]
     leave = np.log((k + c * fast) / (k + c * slow)) / (slow - fast)
     return float(speed * (slow * np.exp(slow * leave) - fast * np.exp(fast * leave)) / (slow - fast))
@@ -335,7 +345,8 @@ def static_teams(fast: bool) -> Result:
     """Teams that have settled: tension m g/(N cos θ) if symmetric, by the law of the lever if not."""
     caption = "Teams settle from 5 cm off their place with slack cables: error of the worst tension."
     plot = Plot("static_teams", "settling", "time [s]", "tension, relative error", caption=caption, log="y")
-    result, steps = Result(plots=[plot]), (4e-3,) if fast else (4e-3, 2e-3)
+    result = Result(plots=[plot])
+    steps = (4e-3,) if fast else (4e-3, 2e-3)
     for count in range(2, 9):
         for timestep in steps:
             config = make_config(count, timestep)
@@ -354,19 +365,22 @@ def static_teams(fast: bool) -> Result:
 
 def _settle(result: Result, name: str, config: Config, theory: np.ndarray, seconds: float) -> None:
     """Add the tensions (N,) of a team that has had some seconds to settle from a start with slack cables."""
-    world, timestep = World(config.system, 1, 1), config.sim.timestep
+    world = World(config.system, 1, 1)
+    timestep = config.sim.timestep
     state = world.state
     target = state.payload_position[0].copy()
     state.drone_position[0] -= [0, 0, 0.03]
     state.payload_position[0] += [0, 0, 0.02]
     world.load(np.ones(1, bool))
-    steer, error = controller(config, world, target), []
+    steer = controller(config, world, target)
+    error = []
     for _ in range(round(seconds / timestep)):
         steer()
         world.step(world.thrust)
         error.append(np.abs(state.cable_tension[0] / theory - 1).max())
     worst = int(np.abs(state.cable_tension[0] / theory - 1).argmax())
-    quantity, tension = "tension [N], largest relative error", float(state.cable_tension[0, worst])
+    quantity = "tension [N], largest relative error"
+    tension = float(state.cable_tension[0, worst])
     result.compare(f"{name}, {ms(timestep)}", quantity, float(theory[worst]), tension, 1e-6)
     if timestep == 4e-3 and not name.startswith(("3", "5", "6", "7")):
         result.plots[0].add(name, timestep * np.arange(1, len(error) + 1), np.maximum(error, 1e-16))

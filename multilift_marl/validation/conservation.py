@@ -36,7 +36,9 @@ class Totals(NamedTuple):
 
 def totals(world: World, env: int = 0) -> Totals:
     """Return the sums of environment `env`, from the state alone."""
-    state, p, system = world.state, world.parameters, world.system
+    state = world.state
+    p = world.parameters
+    system = world.system
     mass = np.append(p.payload_mass[env], p.vehicle_mass[env])
     position = np.vstack([state.payload_position[env], state.drone_position[env]])
     velocity = np.vstack([state.payload_velocity[env], state.drone_velocity[env]])
@@ -55,8 +57,10 @@ def totals(world: World, env: int = 0) -> Totals:
             mass = np.append(mass, np.full(links - 1, system.cable_mass[n] / (links - 1)))
             position = np.vstack([position, world.nodes.position[env, n, : links - 1]])
             velocity = np.vstack([velocity, world.nodes.velocity[env, n, : links - 1]])
-    linear, center = mass @ velocity, mass @ position / mass.sum()
-    offset, speed = position - center, velocity - linear / mass.sum()
+    linear = mass @ velocity
+    center = mass @ position / mass.sum()
+    offset = position - center
+    speed = velocity - linear / mass.sum()
     angular = (np.cross(offset, mass[:, None] * speed)).sum(axis=0) + spin.sum(axis=0)
     energy = 0.5 * float(mass @ (speed**2).sum(axis=1)) + 0.5 * float((inertia * rates**2).sum()) + stored
     return Totals(float(mass.sum()), center, linear, angular, energy)
@@ -78,7 +82,8 @@ def tumbling_team(
     system = load_config("hover", values | {key.replace("__", "."): value for key, value in overrides.items()}).system
     vehicles = tuple(replace(vehicle, drag=(0.0, 0.0, 0.0)) for vehicle in system.vehicles)
     world = World(replace(system, vehicles=vehicles, payload_drag_area=0.0), 1, 1)
-    state, turning = world.state, rate * np.array(axis)
+    state = world.state
+    turning = rate * np.array(axis)
     state.payload_position[:, 2] += _HEIGHT
     state.drone_position[..., 2] += _HEIGHT
     center = totals(world).center
@@ -113,8 +118,13 @@ def without_contact(world: World) -> World:
 
 def free_flight(world: World, seconds: float) -> tuple[Drift, np.ndarray, np.ndarray]:
     """Let a team fall; return its drift, times (T,) [s] and energies (T, 2) over the first: left, and with dampers."""
-    start, shard, h = totals(world), world.shards[0], world.system.timestep
-    thrust, taken, times, energies = np.zeros((1, world.num_drones, 4)), 0.0, [], []
+    start = totals(world)
+    shard = world.shards[0]
+    h = world.system.timestep
+    thrust = np.zeros((1, world.num_drones, 4))
+    taken = 0.0
+    times = []
+    energies = []
     steps = round(seconds / h)
     for i in range(1, steps + 1):
         world.step(thrust)
@@ -164,7 +174,8 @@ def conservation(fast: bool) -> Result:
 def cut_loose(model: str) -> float:
     """Return by how much a drone with its cable broken misses the velocity of free fall after 2 s [m/s]."""
     world = tumbling_team(model, 4, 1.1, (1.0, 0.0, 0.0))
-    thrust, broken = np.zeros((1, 4, 4)), np.zeros((1, 4), bool)
+    thrust = np.zeros((1, 4, 4))
+    broken = np.zeros((1, 4), bool)
     world.step(thrust, 100)
     broken[0, 1] = True
     world.break_cables(broken)
@@ -238,7 +249,9 @@ def momentum_drift(team: Team, seconds: float) -> np.ndarray:
         about = sums.angular + np.cross(sums.center, sums.linear)
         return np.concatenate([sums.linear, about]), sums.center, sums.mass * GRAVITY
 
-    start, impulse, size = total()[0], np.zeros(6), np.zeros(2)
+    start = total()[0]
+    impulse = np.zeros(6)
+    size = np.zeros(2)
     for i in range(round(seconds / h)):
         if i % world.system.control_interval == 0:
             steer()
@@ -260,7 +273,8 @@ def loads(world: World) -> tuple[np.ndarray, np.ndarray]:
     The torques are in the frames of the bodies. What chains add for MuJoCo is taken off again.
     """
     shard = world.shards[0]
-    constants, row = make_constants(world.system, world.layout, shard.batch), shard.batch.state[0]
+    constants = make_constants(world.system, world.layout, shard.batch)
+    row = shard.batch.state[0]
     at = np.array([constants.force, *constants.drone_loads])[:, None] + np.arange(6)
     applied = row[at]
     if shard.motion is not None:

@@ -165,7 +165,8 @@ def load_path(system: System, plan: Plan, time: np.ndarray) -> tuple[np.ndarray,
     angle, rate, change = (values[:, None] for values in _turning(plan, time))
     outward = np.concatenate([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     along = np.concatenate([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
-    s, seconds = plan.share("lift", time)[:, None], plan.seconds("lift")
+    s = plan.share("lift", time)[:, None]
+    seconds = plan.seconds("lift")
     rise = np.array([0, 0, HEIGHT - ground])
     position = RADIUS * outward + [0, 0, ground] + SMOOTH(s) * rise
     velocity = RADIUS * rate * along + SMOOTH.deriv()(s) / seconds * rise
@@ -208,7 +209,8 @@ def _turning(plan: Plan, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     """Return angle on the circle [rad], angular velocity and acceleration, (T,) each."""
     angle, rate, change = np.zeros((3, len(time)))
     for name, more in (("gather", plan.rates[0]), ("gather more", plan.rates[1] - plan.rates[0])):
-        s, seconds = plan.share(name, time), plan.seconds(name)
+        s = plan.share(name, time)
+        seconds = plan.seconds(name)
         after = np.maximum(time - plan.start(name) - seconds, 0.0)
         angle += more * (seconds * SMOOTH.integ()(s) + after)
         rate += more * SMOOTH(s)
@@ -226,16 +228,23 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
     """
     values = {"control.drag_feedforward": True} | {key.replace("__", "."): value for key, value in overrides.items()}
     config = load_config(f"rigs/{rig}", values)
-    system, dt, kind = config.system, 1 / config.sim.control_hz, config.control.disturbance
+    system = config.system
+    dt = 1 / config.sim.control_hz
+    kind = config.control.disturbance
     time = dt * np.arange(round(plan.edges[-1] / dt))
     planned = [make_trajectory(system, plan, time, plain) for plain in (False, True)]
-    world, reference = World(system, 2, 1), Reference.zeros(2, system.num_drones)
-    state, disturbance = world.state, Disturbance.zeros(2, system.num_drones)
+    world = World(system, 2, 1)
+    reference = Reference.zeros(2, system.num_drones)
+    state = world.state
+    disturbance = Disturbance.zeros(2, system.num_drones)
     _put_down(world)
     gains = make_gains(config.control, system)
     rejection = None if kind == "none" else make_rejection(config.control, system, gains, dt)
     gains = gains._replace(load_share=np.zeros(system.num_drones))  # the cable forces hold the load's inertia
-    payload, drones, tension, yaw = [], [], [], []
+    payload = []
+    drones = []
+    tension = []
+    yaw = []
     for i, t in enumerate(time):
         for name in ("position", "velocity", "acceleration", "jerk", "yaw", "yaw_rate"):
             for e in (0, 1):
@@ -273,10 +282,10 @@ def flight(fast: bool) -> Result:
     """From the ground with slack cables to hover and around the circle at 0.2 and 0.4 rad/s, in one flight."""
     result = Result()
     for rig in LIMITS:
-        flown = fly_rig(rig, make_plan((0.25, 0.5) if fast else (1.0, 1.0)))
-        _add_take_off(result, f"take-off, {rig}", flown)
-        _add_circles(result, rig, flown)
-        result.plots += [_take_off_plot(rig, flown), _error_plot(rig, flown), _path_plot(rig, flown)]
+        run = fly_rig(rig, make_plan((0.25, 0.5) if fast else (1.0, 1.0)))
+        _add_take_off(result, f"take-off, {rig}", run)
+        _add_circles(result, rig, run)
+        result.plots += [_take_off_plot(rig, run), _error_plot(rig, run), _path_plot(rig, run)]
     return result
 
 
@@ -290,90 +299,95 @@ def flight_in_wind(fast: bool) -> Result:
     for rig in LIMITS:
         for kind in ("indi", "none"):
             wind = {"wind__velocity": [_WIND, 0.0, 0.0], "wind__turbulence": True}
-            flown = fly_rig(rig, plan, control__disturbance=kind, **wind)
+            run = fly_rig(rig, plan, control__disturbance=kind, **wind)
             for phase, rate in zip(_CIRCLES, plan.rates, strict=True):
-                during, name = plan.during(phase, flown.time), f"in wind, {rig}, {rate:g} rad/s, {kind}"
-                error = float(flown.drone_error[during].mean(axis=0).max())
+                during = plan.during(phase, run.time)
+                name = f"in wind, {rig}, {rate:g} rad/s, {kind}"
+                error = float(run.drone_error[during].mean(axis=0).max())
                 quantity = "mean position error [m] of the drone with the largest"
                 result.check(name, quantity, error, 0.03 if kind == "indi" else np.inf)
-                result.check(name, "mean payload error [m]", float(flown.payload_error[during, 0].mean()))
-            shown = flown.time >= plan.start("climb")
-            plot.add(f"{rig}, {kind}", flown.time[shown], 100 * flown.drone_error[shown].mean(axis=1))
+                result.check(name, "mean payload error [m]", float(run.payload_error[during, 0].mean()))
+            shown = run.time >= plan.start("climb")
+            plot.add(f"{rig}, {kind}", run.time[shown], 100 * run.drone_error[shown].mean(axis=1))
     return result
 
 
-def _add_take_off(result: Result, name: str, flown: Flight) -> None:
-    plan, time = flown.plan, flown.time
-    rest, hover = plan.during("rest", time) & (time > 1.0), plan.during("hover", time)
-    bodies = np.concatenate([flown.payload[rest, :1], flown.drones[rest]], axis=1)
+def _add_take_off(result: Result, name: str, run: Flight) -> None:
+    plan = run.plan
+    time = run.time
+    rest = plan.during("rest", time) & (time > 1.0)
+    hover = plan.during("hover", time)
+    bodies = np.concatenate([run.payload[rest, :1], run.drones[rest]], axis=1)
     drift = float(np.linalg.norm(np.ptp(bodies, axis=0), axis=1).max())
     result.check(name, "motion of payload and drones at rest on the ground [m]", drift, 1e-4)
-    slack = float(flown.tension[time < plan.start("tighten") - 0.5].max())
+    slack = float(run.tension[time < plan.start("tighten") - 0.5].max())
     result.check(name, "largest tension until the cables come taut [N]", slack, 0.0)
-    static = np.linalg.norm(flown.system.formation_force, axis=1)
-    peak = float((flown.tension[time < plan.start("gather")] / static).max())
+    static = np.linalg.norm(run.system.formation_force, axis=1)
+    peak = float((run.tension[time < plan.start("gather")] / static).max())
     result.at_most(name, "peak tension over the static one, excess over 2", 1.0, peak, peak - 2.0)
-    over = float((flown.payload[hover, 0, 2] - HEIGHT).max())
+    over = float((run.payload[hover, 0, 2] - HEIGHT).max())
     quantity = "payload's altitude [m] at its highest after take-off, overshoot"
     result.rows.append(Row(name, quantity, HEIGHT, HEIGHT + over, max(0.0, over), _OVERSHOOT))
-    over = float((flown.drones[hover] - flown.planned.position[hover])[..., 2].max())
+    over = float((run.drones[hover] - run.planned.position[hover])[..., 2].max())
     quantity = "a drone's altitude above its reference [m] after take-off, largest"
     result.rows.append(Row(name, quantity, 0.0, over, max(0.0, over), _OVERSHOOT))
-    result.check(name, "a drone off its path in any phase [m], largest", float(flown.drone_error.max()), _OVERSHOOT)
-    largest = float(flown.payload_error[:, 0].max())
+    result.check(name, "a drone off its path in any phase [m], largest", float(run.drone_error.max()), _OVERSHOOT)
+    largest = float(run.payload_error[:, 0].max())
     result.check(name, "the payload off its path in any phase [m], largest", largest, _OVERSHOOT)
 
 
-def _add_circles(result: Result, rig: str, flown: Flight) -> None:
-    for phase, rate, limit in zip(_CIRCLES, flown.plan.rates, LIMITS[rig], strict=True):
-        during, name = flown.plan.during(phase, flown.time), f"circle, {rig}, {rate:g} rad/s"
-        error = float(flown.drone_error[during].mean(axis=0).max())
+def _add_circles(result: Result, rig: str, run: Flight) -> None:
+    for phase, rate, limit in zip(_CIRCLES, run.plan.rates, LIMITS[rig], strict=True):
+        during = run.plan.during(phase, run.time)
+        name = f"circle, {rig}, {rate:g} rad/s"
+        error = float(run.drone_error[during].mean(axis=0).max())
         result.check(name, "mean position error [m] of the drone with the largest", error, limit)
-        yaw = np.abs(flown.yaw_error[during])
+        yaw = np.abs(run.yaw_error[during])
         result.check(name, "mean yaw error [deg] of the drone with the largest", float(yaw.mean(axis=0).max()), 0.1)
         result.check(name, "largest yaw error [deg]", float(yaw.max()), 0.3)
-        payload, plain = flown.payload_error[during].mean(axis=0).tolist()
+        payload, plain = run.payload_error[during].mean(axis=0).tolist()
         quantity = "mean payload error [m]; limit: half of that with the weight alone fed forward"
         result.check(name, quantity, payload, 0.5 * plain)
 
 
-def _take_off_plot(rig: str, flown: Flight) -> Plot:
+def _take_off_plot(rig: str, run: Flight) -> Plot:
     caption = f"{rig} takes off: altitudes, and the tension of each cable below."
     plot = Plot(f"take_off_{rig}", f"{rig}: take-off", "time [s]", "altitude [m]", "tension [N]", caption=caption)
-    plot.shade(flown.plan.phases("gather"))
-    shown = flown.time < flown.plan.start("slow circle")
-    time, planned = flown.time[shown], flown.planned
-    plot.add("drones (mean)", time, flown.drones[shown, :, 2].mean(axis=1))
-    plot.add("payload", time, flown.payload[shown, 0, 2])
+    plot.shade(run.plan.phases("gather"))
+    shown = run.time < run.plan.start("slow circle")
+    time = run.time[shown]
+    planned = run.planned
+    plot.add("drones (mean)", time, run.drones[shown, :, 2].mean(axis=1))
+    plot.add("payload", time, run.payload[shown, 0, 2])
     plot.add("references", time, planned.position[shown, :, 2].mean(axis=1), theory=True)
     plot.add("", time, planned.payload[shown, 2], theory=True)
-    for n, tension in enumerate(flown.tension[shown].T):
+    for n, tension in enumerate(run.tension[shown].T):
         plot.add(f"cable {n}", time, tension, panel=1)
     return plot
 
 
-def _error_plot(rig: str, flown: Flight) -> Plot:
+def _error_plot(rig: str, run: Flight) -> Plot:
     caption = f"{rig}: position error of each drone and of the payload, yaw error of each drone, over the whole flight."
     plot = Plot(f"flight_error_{rig}", f"{rig}: tracking", "time [s]", "error [mm]", "yaw error [deg]", caption=caption)
-    plot.shade(flown.plan.phases("fast circle"))
-    airborne = flown.time >= flown.plan.start("climb")
-    time = flown.time[airborne]
-    for n in range(flown.system.num_drones):
-        plot.add(f"drone {n}", time, 1e3 * flown.drone_error[airborne, n])
-        plot.add(f"drone {n}", time, flown.yaw_error[airborne, n], panel=1)
-    plot.add("payload", time, 1e3 * flown.payload_error[airborne, 0])
+    plot.shade(run.plan.phases("fast circle"))
+    airborne = run.time >= run.plan.start("climb")
+    time = run.time[airborne]
+    for n in range(run.system.num_drones):
+        plot.add(f"drone {n}", time, 1e3 * run.drone_error[airborne, n])
+        plot.add(f"drone {n}", time, run.yaw_error[airborne, n], panel=1)
+    plot.add("payload", time, 1e3 * run.payload_error[airborne, 0])
     return plot
 
 
-def _path_plot(rig: str, flown: Flight) -> Plot:
+def _path_plot(rig: str, run: Flight) -> Plot:
     caption = f"{rig} from above: the payload on its circle, the second time faster, and the drones about it."
     plot = Plot(f"flight_path_{rig}", f"{rig}: path from above", "x [m]", "y [m]", caption=caption)
     plot.figure.set_figheight(4.8)
     plot.panels[0].set_aspect("equal")
-    circling = flown.time >= flown.plan.start("gather")
-    for n in range(flown.system.num_drones):
-        plot.add(f"drone {n}", *flown.drones[circling, n, :2].T)
-    plot.add("payload", *flown.payload[circling, 0, :2].T)
-    x, y = flown.planned.payload[circling, :2].T
+    circling = run.time >= run.plan.start("gather")
+    for n in range(run.system.num_drones):
+        plot.add(f"drone {n}", *run.drones[circling, n, :2].T)
+    plot.add("payload", *run.payload[circling, 0, :2].T)
+    x, y = run.planned.payload[circling, :2].T
     plot.add("payload's path", x, y, theory=True)
     return plot

@@ -118,7 +118,8 @@ def make_team(model: str) -> Team:
 
 def about_z(angle: float) -> np.ndarray:
     """Return the rotation (3, 3) by an angle [rad] about the vertical."""
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
@@ -137,12 +138,16 @@ def controller(config: Config, world: World, target: np.ndarray, yaw: float = 0.
         target: about which the drones hold the resting formation, behind smoothed references (3,) [m].
         yaw: of target and drones [rad].
     """
-    system, option = config.system, config.control
-    goal, reference = Goal.zeros(1, system.num_drones), Reference.zeros(1, system.num_drones)
-    goal.position[0], goal.rotation[0] = target, about_z(yaw)
+    system = config.system
+    option = config.control
+    goal = Goal.zeros(1, system.num_drones)
+    reference = Reference.zeros(1, system.num_drones)
+    goal.position[0] = target
+    goal.rotation[0] = about_z(yaw)
     place_formation(0, goal, make_rig(system))
     start_reference(0, world.state, reference)
-    reference.command[:], reference.command_yaw[:] = goal.slots, yaw
+    reference.command[:] = goal.slots
+    reference.command_yaw[:] = yaw
     gains = make_gains(option, system)
     smoothing = option.reference_frequency, option.reference_speed, 1 / config.sim.control_hz
 
@@ -176,7 +181,7 @@ def turned(team: Team, angle: float = _TURN) -> Team:
 
 
 def mirrored(team: Team) -> Team:
-    """Return the team behind a mirror in the x-z plane: y, the rotors' sense and all turning the other way round."""
+    """Return the team behind a mirror in the x-z plane: y, the rotors' sense and all rotation reversed."""
     m = _MIRROR
     return replace(
         team, anchors=team.anchors @ m, middle=m @ team.middle, azimuth=-team.azimuth, spin=-team.spin,
@@ -212,12 +217,13 @@ def fly_home(team: Team, seconds: float) -> tuple[np.ndarray, np.ndarray]:
 
 def symmetry(fast: bool) -> Result:
     """A team without any symmetry flies to its target in wind; so do its turned, mirrored and renumbered twins."""
-    caption = "Largest difference of the twins' positions from those of the first team, mapped the same way."
+    caption = "Largest difference of the twins' positions from those of the first team, mapped in the same way."
     title = "how far twins differ over the flight"
     plot = Plot("symmetry", title, "time [s]", "largest difference [m]", caption=caption, log="y")
     result = Result(plots=[plot])
     for model in ("massless", "chain"):
-        team, seconds = make_team(model), 2.0 if fast and model == "chain" else 5.0
+        team = make_team(model)
+        seconds = 2.0 if fast and model == "chain" else 5.0
         position, rotation = fly_home(team, seconds)
         time = np.arange(1, len(position) + 1) / CONTROL_HZ
         for name, twin, map_position, map_rotation in _twins(team):
@@ -233,7 +239,8 @@ def symmetry(fast: bool) -> Result:
 
 def _twins(team: Team) -> list[tuple[str, Team, Map, Map]]:
     """Return names, teams, and how positions and attitudes of the first team map to each one's."""
-    r, m = about_z(_TURN), _MIRROR
+    r = about_z(_TURN)
+    m = _MIRROR
     rows = np.concatenate([[0], 1 + _ORDER])
     return [
         ("turned by 73°", turned(team), lambda p: p @ r.T, lambda a: r @ a),

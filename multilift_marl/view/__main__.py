@@ -51,7 +51,7 @@ def _view(values: dict[str, Any]) -> int:
 
 
 def make_session(values: dict[str, Any]) -> tuple[Session, int]:
-    """Return the session that key=value arguments ask for, and the port.
+    """Return the session and the port of key=value arguments.
 
     Raises:
         ConfigError, CheckpointError: a wrong value, or there is no such task, run or policy.
@@ -70,7 +70,8 @@ def make_session(values: dict[str, Any]) -> tuple[Session, int]:
 
 
 def _find_config(own: dict[str, Any], learned: dict[str, NamedPolicy], overrides: dict[str, Any]) -> Config:
-    task, config = own["task"], own["config"]
+    task = own["task"]
+    config = own["config"]
     if config is not None:
         return load_config(str(config), overrides if task is None else {**overrides, "task": task})
     trained = [policy.config for policy in learned.values() if policy.config is not None]

@@ -34,7 +34,7 @@ class Session:
         vec: the environment.
         policies: names of the policies that fit it.
         policy: name of the present one.
-        paused: whether the clock stands still.
+        paused: whether the clock is stopped.
         speed: simulated seconds in a second.
         outcome: how the last episode ended, in words.
 
@@ -121,7 +121,8 @@ class Session:
             force: its strength [N].
         """
         with self._lock:
-            azimuth, up = np.deg2rad(heading), np.deg2rad(elevation)
+            azimuth = np.deg2rad(heading)
+            up = np.deg2rad(elevation)
             direction = [np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)]
             hidden_loads = self.vec.world.hidden_loads
             if not self._push_left:
