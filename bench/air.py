@@ -1,8 +1,8 @@
-"""What each part of the air costs: the core's speed with it on as a ratio to the core with all of it off.
+"""Computing time of each part of the air: speed of the core with it, as a ratio to the core without any.
 
     python bench/air.py [repeats=5] [seconds=1.0] [any configuration key]
 
-All are measured in turn, in one run, and the medians reported, as in bench.py.
+All are measured alternately in one run, and the medians reported, as in bench.py.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import statistics
 import sys
 
 import multilift_marl as ml
-from bench import core, measure
-from multilift_marl.config.load import load_config, parse_overrides
+from bench import core, measure, settings
+from multilift_marl.config.load import load_config
 
 WIND = {"wind.velocity": [3.0, 0.0, 0.0]}
 PARTS = {
@@ -29,20 +29,21 @@ PARTS = {
 
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
-    values = {"env.num_envs": 256} | parse_overrides(arguments)
-    repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+    values, repeats, seconds = settings({"env.num_envs": 256}, arguments)
     everything = {key: value for part in PARTS.values() for key, value in part.items()}
     runners = {
         name: core(ml.make_vec(load_config("hover", values | part)))
         for name, part in (PARTS | {"all": everything}).items()
     }
-    rates, result = measure(runners, repeats, seconds), {}
+    rates = measure(runners, repeats, seconds)
+    result = {}
     print(f"medians of {repeats}")
     print("| switched on | steps/s | ratio to none (least - largest) |")
     print("|---|---|---|")
     for name, found in rates.items():
         ratios = [rate / reference for rate, reference in zip(found, rates["off"], strict=True)]
-        rate, ratio = statistics.median(found), statistics.median(ratios)
+        rate = statistics.median(found)
+        ratio = statistics.median(ratios)
         result[name] = {"steps_per_s": rate, "ratio": ratio}
         print(f"| {name} | {rate:,.0f} | {ratio:.2f} ({min(ratios):.2f} - {max(ratios):.2f}) |")
     return result

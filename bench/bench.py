@@ -1,10 +1,10 @@
-"""Speed against the limit: every door of the environment as a ratio to bare MuJoCo stepping of the same model.
+"""Speed of every API of the environment as a ratio to stepping the same model by MuJoCo alone.
 
     python bench/bench.py [repeats=5] [seconds=1.0] [any configuration key]
 
-Bare stepping is `Batch.step(nstep=control interval)` of the compiled model, contacts and all, on the same threads,
-with the drones' hover thrust applied. All are measured in turn, in one run, and the medians reported: these ratios
-compare on a noisy machine, times do not. Doors fly random actions in the shipped configuration, resets included.
+MuJoCo alone is `Batch.step(nstep=control interval)` of the compiled model, with contacts, on the same threads, with
+the drones' hover thrust applied. All are measured alternately in one run, and the medians reported: on a noisy machine
+ratios compare, times do not. The APIs are stepped with random actions in the shipped configuration, with resets.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ Runner = Callable[[], int]
 """Does a chunk of work and returns how many environment steps it made."""
 
 
-def bare(vec: MultiliftVec, threads: int) -> Runner:
-    """Return a runner of bare stepping, from the states and loads that the teams of `vec` are in at present."""
+def mujoco_alone(vec: MultiliftVec, threads: int) -> Runner:
+    """Return a runner of MuJoCo alone, from the present states and loads of the teams of `vec`."""
     batch = Batch(vec.world.model, vec.num_envs, nthread=threads)
-    interval, ticks = vec.world.system.control_interval, vec.control_ticks
+    interval = vec.world.system.control_interval
+    ticks = vec.control_ticks
     batch.bind("sensordata")
 
     def run() -> int:
@@ -59,7 +60,7 @@ def core(vec: MultiliftVec) -> Runner:
 
 
 def torchrl(env) -> Runner:
-    """Return a runner of the TorchRL door with its own random actions."""
+    """Return a runner of the TorchRL environment with its own random actions."""
     carried = env.reset()
 
     def run() -> int:
@@ -72,7 +73,7 @@ def torchrl(env) -> Runner:
 
 
 def pettingzoo(env) -> Runner:
-    """Return a runner of the PettingZoo door."""
+    """Return a runner of the PettingZoo environment."""
     rng = np.random.default_rng(0)
     size = env.action_space("drone_0").shape[0]
     actions = [
@@ -91,38 +92,45 @@ def pettingzoo(env) -> Runner:
 
 
 def measure(runners: dict[str, Runner], repeats: int, seconds: float) -> dict[str, list[float]]:
-    """Return environment steps per second of each runner, `repeats` times, in turn."""
+    """Return environment steps per second of each runner, `repeats` times, alternately."""
     for run in runners.values():
         run()
     rates: dict[str, list[float]] = {name: [] for name in runners}
     for _ in range(repeats):
         for name, run in runners.items():
-            start, steps = time.perf_counter(), 0
+            start = time.perf_counter()
+            steps = 0
             while (passed := time.perf_counter() - start) < seconds:
                 steps += run()
             rates[name].append(steps / passed)
     return rates
 
 
+def settings(defaults: dict, arguments: list[str]) -> tuple[dict, int, float]:
+    """Return configuration values, repeats and seconds of key=value arguments."""
+    values = defaults | parse_overrides(arguments)
+    return values, int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+
+
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
-    values = {"env.num_envs": 256} | parse_overrides(arguments)
-    repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+    values, repeats, seconds = settings({"env.num_envs": 256}, arguments)
     config = load_config("hover", values)
     vec = ml.make_vec(config)
     threads = len(vec.world.shards)
-    many = {"bare": bare(vec, threads), "core": core(vec), "torchrl_env": torchrl(ml.torchrl_env(config))}
+    many = {"mujoco": mujoco_alone(vec, threads), "core": core(vec), "torchrl_env": torchrl(ml.torchrl_env(config))}
     single = ml.make_vec(config, num_envs=1, num_threads=1)
-    one = {"bare": bare(single, 1), "core": core(single), "parallel_env": pettingzoo(ml.parallel_env(config))}
+    one = {"mujoco": mujoco_alone(single, 1), "core": core(single), "parallel_env": pettingzoo(ml.parallel_env(config))}
     result = {}
     print(f"{config.env.num_drones} drones; medians of {repeats}")
-    print("| door | environments | threads | steps/s | simulated s/s | ratio to bare (least - largest) |")
+    print("| API | environments | threads | steps/s | simulated s/s | ratio to MuJoCo alone (least - largest) |")
     print("|---|---|---|---|---|---|")
     for runners, envs, used in ((many, vec.num_envs, threads), (one, 1, 1)):
         rates = measure(runners, repeats, seconds)
         for name, values in rates.items():
-            ratios = [value / reference for value, reference in zip(values, rates["bare"], strict=True)]
-            rate, ratio = statistics.median(values), statistics.median(ratios)
+            ratios = [value / reference for value, reference in zip(values, rates["mujoco"], strict=True)]
+            rate = statistics.median(values)
+            ratio = statistics.median(ratios)
             result[f"{name}_{envs}"] = {"steps_per_s": rate, "ratio": ratio}
             print(
                 f"| {name} | {envs} | {used} | {rate:,.0f} | {rate / config.env.policy_hz:,.0f} | "

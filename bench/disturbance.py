@@ -1,11 +1,11 @@
-"""How far wind and a payload heavier than thought move the drones, with each `control.disturbance`.
+"""Drones' errors in wind and with a wrong payload mass, for each `control.disturbance`.
 
     python bench/disturbance.py [rigs=falcon4] [seconds=30] [any configuration key]
 
 A team hovers, then flies a circle of 5 m with its yaw along the path, at 0.2 and at 0.4 rad/s (1 and 2 m/s). The drones
-are told where to be, with all derivatives, and feed forward the nominal load and drag; the payload is not controlled.
-Printed are the mean distances of the drones from their places over the last `seconds`, and in brackets the payload's
-from its own; then how fast a swing of the payload dies out. `rigs` may name several, as rigs=falcon4,report4.
+follow references with all derivatives and feed forward the nominal load and drag; the payload is not controlled.
+Printed are the mean position errors of the drones over the last `seconds`, and in brackets the payload's; then the
+decay rate of a swing of the payload. `rigs` may name several, as rigs=falcon4,report4.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from multilift_marl.control.geometric import fly
 from multilift_marl.sim.world import REST_HEIGHT, World
 
 RADIUS = 5.0  # [m]
-START, RAMP = 10.0, 6.0  # [s] before anything is counted, and of it to gather speed
+START, RAMP = 10.0, 6.0  # [s] before errors are counted, and of it to gather speed
 CASES = {  # true payload mass over nominal, mean wind [m/s], gust amplitude [m/s] and frequency [rad/s]
     "nominal": (1.0, 0.0, 0.0, 0.0),
     "payload +20 %": (1.2, 0.0, 0.0, 0.0),
@@ -36,7 +36,7 @@ CASES = {  # true payload mass over nominal, mean wind [m/s], gust amplitude [m/
 
 
 class Flight:
-    """Teams of one rig whose drones are told to hold their formation, or to follow `reference`.
+    """Teams of one rig whose drones hold their formation, or follow `reference`.
 
     Args:
         config: rig and rejection.
@@ -44,9 +44,13 @@ class Flight:
     """
 
     def __init__(self, config: Config, mass: np.ndarray):
-        self.system, self.dt, self.kind = config.system, 1 / config.sim.control_hz, config.control.disturbance
-        e, n = len(mass), self.system.num_drones
-        self.world, self.reference = World(self.system, e, 1), Reference.zeros(e, n)
+        self.system = config.system
+        self.dt = 1 / config.sim.control_hz
+        self.kind = config.control.disturbance
+        e = len(mass)
+        n = self.system.num_drones
+        self.world = World(self.system, e, 1)
+        self.reference = Reference.zeros(e, n)
         self.world.set_parameters(np.ones(e, bool), payload_mass=mass * self.system.payload_mass)
         self.gains = make_gains(config.control, self.system)
         self.cable_force = np.broadcast_to(self.system.hook_force, (e, n, 3)).copy()
@@ -58,22 +62,20 @@ class Flight:
         self.begin()
 
     def begin(self) -> None:
-        """Start from what stands in `world.state`."""
+        """Start from `world.state`."""
         self.world.load(np.ones(self.world.num_envs, bool))
         for e in range(self.world.num_envs):
             reset_estimate(e, self.world.state, self.disturbance)
 
     def reject(self) -> None:
-        """Bring the estimates up to date."""
-        known, own = (
-            (self.world.state, self.reference, self.cable_force),
-            (self.disturbance, self.gains, self.rejection),
-        )
-        REJECTIONS[self.kind](0, self.world.num_envs, *known, *own)
+        """Update the estimates."""
+        known = self.world.state, self.reference, self.cable_force
+        REJECTIONS[self.kind](0, self.world.num_envs, *known, self.disturbance, self.gains, self.rejection)
 
     def step(self) -> None:
-        """Fly one control step."""
-        cable_force, thrust = self.cable_force, self.world.thrust
+        """Simulate one control step."""
+        cable_force = self.cable_force
+        thrust = self.world.thrust
         if self.kind != "none":
             self.reject()
             cable_force = self.disturbance.cable_force
@@ -88,14 +90,16 @@ def circle(t: float, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     w = rate * s**3 * (10 - 15 * s + 6 * s**2)
     w1 = rate / RAMP * 30 * s**2 * (1 - s) ** 2
     w2 = rate / RAMP**2 * 60 * s * (1 - s) * (1 - 2 * s)
-    outward, along = np.array([np.cos(angle), np.sin(angle), 0]), np.array([-np.sin(angle), np.cos(angle), 0])
-    velocity, acceleration = w * along, w1 * along - w**2 * outward
+    outward = np.array([np.cos(angle), np.sin(angle), 0])
+    along = np.array([-np.sin(angle), np.cos(angle), 0])
+    velocity = w * along
+    acceleration = w1 * along - w**2 * outward
     jerk = (w2 - w**3) * along - 3 * w * w1 * outward
     return RADIUS * (outward - [1, 0, 0]), RADIUS * velocity, RADIUS * acceleration, RADIUS * jerk, angle, w
 
 
 def fly_cases(config: Config, rate: float, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean distances from their places [m] of the drones and of the payload, (cases,) each.
+    """Return mean position errors [m] of the drones and of the payload, (cases,) each.
 
     Args:
         config: rig and rejection.
@@ -104,15 +108,22 @@ def fly_cases(config: Config, rate: float, seconds: float) -> tuple[np.ndarray, 
     """
     cases = np.array(list(CASES.values()))
     flight = Flight(config, cases[:, 0])
-    state, reference, rest = flight.world.state, flight.reference, np.array([0, 0, REST_HEIGHT])
-    drones, payload, counted = np.zeros(len(cases)), np.zeros(len(cases)), 0
+    state = flight.world.state
+    reference = flight.reference
+    rest = np.array([0, 0, REST_HEIGHT])
+    drones = np.zeros(len(cases))
+    payload = np.zeros(len(cases))
+    counted = 0
     for tick in range(round((START + seconds) / flight.dt)):
         t = tick * flight.dt
         flight.world.hidden_loads.wind[:, 0] = cases[:, 1] + cases[:, 2] * np.sin(cases[:, 3] * t)
         position, velocity, acceleration, jerk, yaw, yaw_rate = circle(t, rate)
-        reference.position[:], reference.velocity[:] = flight.slots + position, velocity
-        reference.acceleration[:], reference.jerk[:] = acceleration, jerk
-        reference.yaw[:], reference.yaw_rate[:] = yaw, yaw_rate
+        reference.position[:] = flight.slots + position
+        reference.velocity[:] = velocity
+        reference.acceleration[:] = acceleration
+        reference.jerk[:] = jerk
+        reference.yaw[:] = yaw
+        reference.yaw_rate[:] = yaw_rate
         if t >= START:
             drones += np.linalg.norm(state.drone_position - reference.position, axis=-1).mean(axis=1)
             payload += np.linalg.norm(state.payload_position - rest - position, axis=-1)
@@ -126,7 +137,7 @@ def fly_cases(config: Config, rate: float, seconds: float) -> tuple[np.ndarray, 
 
 
 def swing_decay(config: Config, seconds: float) -> np.ndarray:
-    """Return the least rate [1/s] at which swings of payloads of 0.8, 1 and 1.2 of the nominal mass die out, (3,).
+    """Return the least decay rate [1/s] of swings of payloads of 0.8, 1 and 1.2 of the nominal mass, (3,).
 
     They start at 0.3 m/s and 0.3 rad/s, about either axis; counted from 6 s on, `seconds` long.
     """
@@ -146,7 +157,9 @@ def swing_decay(config: Config, seconds: float) -> np.ndarray:
         return speed
 
     most(4.0)
-    early, _, late = most(2.0), most(seconds), most(2.0)
+    early = most(2.0)
+    most(seconds)
+    late = most(2.0)
     return np.log(early / late).reshape(2, 3).min(axis=0) / (seconds + 2.0)
 
 
@@ -155,17 +168,17 @@ def main(arguments: list[str]) -> None:
     values = parse_overrides(arguments)
     seconds = float(values.pop("seconds", 30.0))
     for rig in str(values.pop("rigs", "falcon4")).split(","):
-        told = {"control.drag_feedforward": True} | values
+        options = {"control.drag_feedforward": True} | values
         configs = {
-            kind: load_config(f"rigs/{rig}", told | {"control.disturbance": kind}) for kind in ("none", *REJECTIONS)
+            kind: load_config(f"rigs/{rig}", options | {"control.disturbance": kind}) for kind in ("none", *REJECTIONS)
         }
         print(f"\n{rig}: drones' error [cm], mean over {seconds:g} s (payload's)\n")
         columns = [(rate, kind) for rate in (0.0, 0.2, 0.4) for kind in configs]
         print("| | " + " | ".join(f"{f'{rate:g} rad/s' if rate else 'hover'}, {kind}" for rate, kind in columns) + " |")
         print("|---" * (len(columns) + 1) + "|")
-        flown = [fly_cases(configs[kind], rate, seconds) for rate, kind in columns]
+        errors = [fly_cases(configs[kind], rate, seconds) for rate, kind in columns]
         for i, case in enumerate(CASES):
-            cells = [f"{100 * drones[i]:.2f} ({100 * payload[i]:.1f})" for drones, payload in flown]
+            cells = [f"{100 * drones[i]:.2f} ({100 * payload[i]:.1f})" for drones, payload in errors]
             print(f"| {case} | " + " | ".join(cells) + " |")
         print(f"\n{rig}: decay of a swing [1/s] with 0.8, 1, 1.2 of the payload's mass\n")
         for kind, config in configs.items():

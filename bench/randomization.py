@@ -1,8 +1,8 @@
-"""What each hidden parameter and imperfection costs: the core with it against the core without, and against bare.
+"""Computing time of each hidden parameter and sensing option: the core with it over the core without, and over MuJoCo.
 
     python bench/randomization.py [repeats=5] [seconds=1.0] [any configuration key]
 
-All are measured in turn, in one run, as in bench.py.
+All are measured alternately in one run, as in bench.py.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import statistics
 import sys
 
 import multilift_marl as ml
-from bench import bare, core, measure
-from multilift_marl.config.load import load_config, parse_overrides
+from bench import core, measure, mujoco_alone, settings
+from multilift_marl.config.load import load_config
 
-CASES = {  # name: what it switches on beside the shipped configuration
+CASES = {  # name: options beside the shipped configuration
     "inertia": {"payload_inertia": 0.2},
     "centre of mass": {"payload_center_of_mass": (0.02, 0.02, 0.02)},
     "cable length": {"cable_length": 0.05},
@@ -33,8 +33,7 @@ CASES = {  # name: what it switches on beside the shipped configuration
 
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
-    values = {"env.num_envs": 256} | parse_overrides(arguments)
-    repeats, seconds = int(values.pop("repeats", 5)), float(values.pop("seconds", 1.0))
+    values, repeats, seconds = settings({"env.num_envs": 256}, arguments)
     everything = {key: width for case in CASES.values() for key, width in case.items()}
     cases = {"off": {}, **CASES, "everything": everything}
     teams = {
@@ -42,15 +41,16 @@ def main(arguments: list[str]) -> dict:
         for name, case in cases.items()
     }
     off = teams["off"]
-    runners = {"bare": bare(off, len(off.world.shards)), **{name: core(team) for name, team in teams.items()}}
-    rates, result = measure(runners, repeats, seconds), {}
+    runners = {"mujoco": mujoco_alone(off, len(off.world.shards)), **{name: core(team) for name, team in teams.items()}}
+    rates = measure(runners, repeats, seconds)
+    result = {}
     print(f"{off.num_drones} drones, {off.num_envs} environments; medians of {repeats}")
-    print("| on | core / bare | against off |")
+    print("| on | core / MuJoCo alone | relative to off |")
     print("|---|---|---|")
     for name in cases:
         ratios = [
             statistics.median(a / b for a, b in zip(rates[name], rates[other], strict=True))
-            for other in ("bare", "off")
+            for other in ("mujoco", "off")
         ]
         result[name] = {"ratio": float(ratios[0]), "against_off": float(ratios[1])}
         print(f"| {name} | {ratios[0]:.2f} | {ratios[1]:.2f} |")

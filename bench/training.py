@@ -1,11 +1,11 @@
-"""What an iteration of training spends its time on.
+"""Computing time of the parts of a training iteration.
 
     python bench/training.py [repeats=15] [any configuration key of hover]
 
 Of each iteration of `python train.py config=hover` these are timed: physics, control, observation and reward, in the
-threads that step the shards; the actor in flight; starts of episodes. What learning computes is timed by doing the same
-arithmetic without TorchRL's losses and estimators on copies of the networks, in turn with the iterations. All else is
-TorchRL, TensorDict and Python, the package's own too: collecting, packing, checking, losses, diagnostics.
+threads that step the shards; the actor during rollouts; starts of episodes. The arithmetic of learning is
+timed without TorchRL's losses and estimators on copies of the networks, alternating with the iterations. The rest is
+TorchRL, TensorDict and Python, the package's own included: collecting, packing, checking, losses, diagnostics.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from multilift_marl.errors import ConfigError
 
 PARTS = {
     "core": "physics, control, observation, reward",
-    "actor": "actor in flight",
+    "actor": "actor in rollouts",
     "learning": "arithmetic of learning",
     "starts": "starts of episodes",
     "other": "TorchRL, TensorDict, Python",
@@ -51,22 +51,26 @@ def timed(function: Callable[..., Any], name: str, spent: dict[str, float]) -> C
 
 
 class Arithmetic:
-    """What `agents.mappo.update` computes (MAPPO, no entropy bonus) without TensorDicts, on copies of the networks."""
+    """The arithmetic of `agents.mappo.update` (MAPPO, no entropy bonus) without TensorDicts, on copied networks."""
 
     def __init__(self, trainer: Trainer):
         self.config = trainer.config.train
         if self.config.algorithm != "mappo" or self.config.entropy > 0:
-            raise ConfigError("bench/training.py knows train.algorithm=mappo with train.entropy=0 alone; set these")
+            raise ConfigError("bench/training.py supports train.algorithm=mappo with train.entropy=0 only; set these")
         learner = trainer.learner
-        self.actor, self.critic = copy.deepcopy(learner.actor), copy.deepcopy(learner.critic)
+        self.actor = copy.deepcopy(learner.actor)
+        self.critic = copy.deepcopy(learner.critic)
         groups = [{"params": list(network.parameters())} for network in (self.actor, self.critic)]
         self.optimizer = torch.optim.Adam(groups, lr=1e-6, eps=1e-5, fused=True)
 
     def seconds(self, batch: Any) -> float:
         """Return how long it takes for a batch of rollouts [E, T]."""
         start = time.perf_counter()
-        config, norm, after = self.config, self.critic.value_norm, batch["next"]
-        observation, state = batch["agents", "observation"], batch["state"]
+        config = self.config
+        norm = self.critic.value_norm
+        after = batch["next"]
+        observation = batch["agents", "observation"]
+        state = batch["state"]
         with torch.no_grad():
             value = self.critic(state)
             advantage = self._advantage(
@@ -110,7 +114,8 @@ class Arithmetic:
         config = self.config
         delta = reward + config.gamma * following * ~terminated.unsqueeze(-2) - value
         decay = config.gamma * config.gae_lambda * ~done.unsqueeze(-2)
-        result, last = torch.empty_like(delta), torch.zeros_like(delta[:, 0])
+        result = torch.empty_like(delta)
+        last = torch.zeros_like(delta[:, 0])
         for t in reversed(range(delta.shape[1])):
             result[:, t] = last = delta[:, t] + decay[:, t] * last
         return result
@@ -122,11 +127,14 @@ def main(arguments: list[str]) -> dict:
     repeats = int(values.pop("repeats", 15))
     trainer = Trainer(load_config("hover", {"train.target_kl": 1e3} | values), Path("runs"))  # nothing is written there
     spent: dict[str, float] = {}
-    vec, network = trainer.env.vec, trainer.learner.policy.network
+    vec = trainer.env.vec
+    network = trainer.learner.policy.network
     vec.world.run = timed(vec.world.run, "core", spent)
     vec.reset = timed(vec.reset, "starts", spent)
     network.forward = timed(network.forward, "actor", spent)
-    arithmetic, batches, iterations = Arithmetic(trainer), iter(trainer.collector), []
+    arithmetic = Arithmetic(trainer)
+    batches = iter(trainer.collector)
+    iterations = []
     for i in range(repeats + 2):
         spent.clear()
         start = time.perf_counter()
@@ -146,7 +154,8 @@ def main(arguments: list[str]) -> dict:
     print("|---|---|---|")
     for name, title in PARTS.items():
         shares = [100 * found.get(name, 0.0) / found["total"] for found in iterations]
-        taken, share = statistics.median(found.get(name, 0.0) for found in iterations), statistics.median(shares)
+        taken = statistics.median(found.get(name, 0.0) for found in iterations)
+        share = statistics.median(shares)
         result[name] = {"seconds": taken, "percent": share}
         print(f"| {title} | {1e3 * taken:.0f} | {share:.1f} % ({min(shares):.1f} - {max(shares):.1f}) |")
     return result

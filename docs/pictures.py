@@ -35,9 +35,9 @@ CAMERAS = {"gate": "chase"}
 
 def draw(name: str) -> np.ndarray:
     """Return the pictures of a strip, side by side (H, W, 3) uint8."""
-    config, overrides, flown, seed, times = STRIPS[name]
+    config, overrides, policy_name, seed, times = STRIPS[name]
     vec = ml.make_vec(config, num_envs=1, **overrides)
-    policy = make_scripted(flown, vec) if flown in SCRIPTED else ml.load_policy(flown)
+    policy = make_scripted(policy_name, vec) if policy_name in SCRIPTED else ml.load_policy(policy_name)
     observation, _ = vec.reset(seed=seed)
     policy.reset()
     white, frames = np.full((HEIGHT, GAP, 3), 255, np.uint8), []
@@ -46,7 +46,7 @@ def draw(name: str) -> np.ndarray:
             observation, _, terminated, truncated, _ = vec.step(policy.act(observation))
             ahead = np.array(times) - step * vec.task.dt
             if (np.any((ahead > -1e-9) & (ahead < TRAIL)) and step % 3 == 0) or np.any(np.abs(ahead) < 1e-9):
-                picture = renderer.frame()  # of a trail, where none is shown
+                picture = renderer.frame()  # also between pictures, for the trails
             if np.any(np.abs(ahead) < 1e-9):
                 frames += [picture, white]
             if terminated[0] or truncated[0]:

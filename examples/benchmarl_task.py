@@ -1,6 +1,6 @@
 """BenchMARL's MAPPO and MASAC on this package's batched TorchRL environment, made known to it by one class.
 
-Needs an environment of its own with examples/requirements/benchmarl_task.txt. Run: python examples/benchmarl_task.py
+Needs its own environment with examples/requirements/benchmarl_task.txt. Run: python examples/benchmarl_task.py
 BenchMARL's other algorithms for continuous actions (IPPO, ISAC, MADDPG, IDDPG) take the same class.
 """
 

@@ -1,4 +1,4 @@
-"""Installs each example into an environment of its own, trains a little, and checks that the weights changed.
+"""Install each example into its own environment, train a little, and check that the weights changed.
 
 Run: python examples/check.py [name ...] [folder=PATH]      (in PATH the environments are made, and deleted after use)
 Prints one line for each example: result, seconds of installing and of running, versions; exit status 1 if one failed.
@@ -27,14 +27,14 @@ name, sizes, packages = json.loads(sys.argv[1])
 before, after = importlib.import_module(name).train(**sizes)
 installed = {part.metadata["Name"].lower().replace("-", "_"): part.version for part in metadata.distributions()}
 moved = float((after - before).norm(dim=-1).min())  # of several policies, one a row, that which moved least
-told = {"finite": bool(before.isfinite().all() and after.isfinite().all()), "moved": moved}
-told |= {"weights": before.numel(), "versions": {key: installed[key] for key in packages if key in installed}}
-print("\\n" + json.dumps(told))
+result = {"finite": bool(before.isfinite().all() and after.isfinite().all()), "moved": moved}
+result |= {"weights": before.numel(), "versions": {key: installed[key] for key in packages if key in installed}}
+print("\\n" + json.dumps(result))
 """
 
 
 def install(name: str, folder: Path) -> Path:
-    """Make a virtual environment with the package and what an example asks for; return its Python."""
+    """Make a virtual environment with the package and the requirements of an example; return its Python."""
     venv.create(folder / "venv", with_pip=True)
     python = folder / "venv" / "bin" / "python"
     requirements = HERE / "requirements" / f"{name}.txt"
@@ -59,10 +59,10 @@ def try_out(python: str | Path, name: str, folder: Path, **sizes: int) -> dict[s
         RuntimeError: it failed, or its weights stayed as they were or are not finite.
     """
     job = json.dumps([name, SIZES | sizes, PACKAGES])
-    told = json.loads(run([python, "-c", INSIDE, job], folder).splitlines()[-1])
-    if not told.pop("finite") or not told["moved"] > 0:
-        raise RuntimeError(f"the weights of {name} moved by {told['moved']}")
-    return told
+    result = json.loads(run([python, "-c", INSIDE, job], folder).splitlines()[-1])
+    if not result.pop("finite") or not result["moved"] > 0:
+        raise RuntimeError(f"the weights of {name} moved by {result['moved']}")
+    return result
 
 
 def run(command: list[str | Path], folder: Path) -> str:
@@ -82,13 +82,13 @@ def check(name: str, parent: str | None) -> bool:
         try:
             python = install(name, Path(folder))
             installed = time.perf_counter()
-            told = try_out(python, name, Path(folder))
+            result = try_out(python, name, Path(folder))
         except RuntimeError as error:
             print(f"| {name} | failed | | | |\n{error}", flush=True)
             return False
         seconds = f"{installed - start:.0f} | {time.perf_counter() - installed:.0f}"
-    versions = ", ".join(f"{package} {version}" for package, version in told["versions"].items())
-    print(f"| {name} | {told['weights']:,} moved by {told['moved']:.2f} | {seconds} | {versions} |", flush=True)
+    versions = ", ".join(f"{package} {version}" for package, version in result["versions"].items())
+    print(f"| {name} | {result['weights']:,} moved by {result['moved']:.2f} | {seconds} | {versions} |", flush=True)
     return True
 
 

@@ -12,7 +12,7 @@ from torch import nn
 from torch.distributions import Normal
 from torch.nn.utils import parameters_to_vector
 
-import multilift_marl  # noqa: F401 - enters the environments in Gymnasium's registry
+import multilift_marl  # noqa: F401 - registers the environments with Gymnasium
 
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES, LEARNING_RATE = 0.99, 0.95, 0.2, 4, 8, 1e-3
 

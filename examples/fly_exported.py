@@ -1,10 +1,10 @@
-"""Flies an exported policy by NumPy and onnxruntime alone, without torch, and says how well.
+"""Evaluate an exported policy with NumPy and onnxruntime alone, without torch.
 
 First: python -m multilift_marl.export run=hover
 Run:   python examples/fly_exported.py runs/shipped-hover/export      (a number behind it: how many episodes)
 
-The episodes are those of `python evaluate.py`. On a robot, what fills `observation` from its sensors and carries out
-the actions takes the place of the simulation; `check` and `Team` stay.
+The episodes are those of `python evaluate.py`. On a robot, code that fills `observation` from sensors and executes the
+actions replaces the simulation; `check` and `Team` stay.
 """
 
 import json
@@ -35,22 +35,22 @@ class Team:
         return self._session.run(["action"], {"observation": np.asarray(observation, np.float32)})[0]
 
     def reset(self, mask=None):
-        """Forget nothing: what a policy remembers is in its observation."""
+        """Do nothing: the policy has no state, its past is part of the observation."""
 
 
 def check(contract, vec):
-    """Refuse environments whose observations or actions are not what the contract says, number by number."""
+    """Refuse environments whose observations or actions differ from the contract, number by number."""
     for what, agreed, found in (
         ("observation", contract["observation"]["names"], vec.observation_names),
         ("action", [number["name"] for number in contract["action"]["numbers"]], vec.action_names),
     ):
-        for i, (asked, given) in enumerate(zip_longest(agreed, found, fillvalue="nothing")):
-            if asked != given:
-                raise SystemExit(f"error: {what} {i} is {given}, but {asked} in the contract; export anew")
+        for i, (expected, given) in enumerate(zip_longest(agreed, found, fillvalue="nothing")):
+            if expected != given:
+                raise SystemExit(f"error: {what} {i} is {given}, but {expected} in the contract; export anew")
 
 
 def main(folder, episodes=20):
-    """Fly, and print success and error."""
+    """Simulate episodes, and print success and error."""
     team = Team(Path(folder))
     config = build_config(team.contract["config"])
 
@@ -58,8 +58,9 @@ def main(folder, episodes=20):
         check(team.contract, vec)
         return team
 
-    told = summarize(fly_episodes(config, make_policy, int(episodes), seed=1000))
-    success, error = told["success_rate"]["mean"], told["payload_position_error_m"]["mean"]
+    metrics = summarize(fly_episodes(config, make_policy, int(episodes), seed=1000))
+    success = metrics["success_rate"]["mean"]
+    error = metrics["payload_position_error_m"]["mean"]
     print(f"{team.contract['task']}: {episodes} episodes, success {success:.0%}, position error {100 * error:.2f} cm")
 
 

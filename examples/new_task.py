@@ -44,7 +44,12 @@ class Lift(Task):
         self.place_goal(env, self.goal.position[env] + [0.0, 0.0, self.options.rise])
 
 
-CONFIG = {"task": "lift", "env": {"num_envs": 64, "episode_seconds": 6.0}, "randomization": {"payload_mass": 0.1}}
+CONFIG = {
+    "task": "lift",
+    "task_options": {"start_radius": 0.1, "start_tilt": 0.0, "start_speed": 0.0},
+    "env": {"num_envs": 64, "episode_seconds": 6.0},
+    "randomization": {"payload_mass": 0.1},
+}
 ml.register_task(Lift, CONFIG)
 
 if __name__ == "__main__":

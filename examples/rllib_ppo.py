@@ -1,6 +1,6 @@
 """RLlib's PPO on its current API stack, one policy for all drones, through its ParallelPettingZooEnv.
 
-Needs an environment of its own with examples/requirements/rllib_ppo.txt. Run: python examples/rllib_ppo.py
+Needs its own environment with examples/requirements/rllib_ppo.txt. Run: python examples/rllib_ppo.py
 """
 
 import os
@@ -21,7 +21,7 @@ from multilift_marl.envs import multilift_v0
 
 
 def make(context) -> ParallelPettingZooEnv:
-    """Return one environment; RLlib gives each a seed of its own at its first reset."""
+    """Return one environment; RLlib gives each its own seed at its first reset."""
     return ParallelPettingZooEnv(multilift_v0.parallel_env("hover", **context))
 
 

@@ -1,6 +1,6 @@
 """Stable-Baselines3's PPO, one policy for all drones, on the batched core: each drone is a row of its environments.
 
-Needs an environment of its own with examples/requirements/sb3_ppo.txt. Run: python examples/sb3_ppo.py
+Needs its own environment with examples/requirements/sb3_ppo.txt. Run: python examples/sb3_ppo.py
 """
 
 import sys

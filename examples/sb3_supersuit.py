@@ -1,6 +1,6 @@
 """Stable-Baselines3's PPO, one policy for all drones: SuperSuit makes agents the rows of an SB3 vector environment.
 
-Needs an environment of its own with examples/requirements/sb3_supersuit.txt. Run: python examples/sb3_supersuit.py
+Needs its own environment with examples/requirements/sb3_supersuit.txt. Run: python examples/sb3_supersuit.py
 """
 
 import sys
@@ -16,7 +16,7 @@ from multilift_marl.envs import multilift_v0
 
 
 class TellTimeLimits(BaseParallelWrapper):
-    """Tells SB3 which ends are time limits, which SuperSuit does not; it would learn from them as from failures."""
+    """Marks time limits for SB3, which SuperSuit does not; SB3 would take them for failures."""
 
     def step(self, actions):
         """Advance one step and mark time limits in the infos."""

@@ -1,6 +1,6 @@
 """skrl's MAPPO through its PettingZoo wrapper: one network for all drones, the critic sees the global state.
 
-Needs an environment of its own with examples/requirements/skrl_mappo.txt. Run: python examples/skrl_mappo.py
+Needs its own environment with examples/requirements/skrl_mappo.txt. Run: python examples/skrl_mappo.py
 skrl steps one PettingZoo environment at a time, so this is the slowest of the examples.
 """
 

@@ -1,6 +1,6 @@
 """tianshou's PPO on the Gymnasium environment: the whole team is one agent.
 
-Needs an environment of its own with examples/requirements/tianshou_ppo.txt. Run: python examples/tianshou_ppo.py
+Needs its own environment with examples/requirements/tianshou_ppo.txt. Run: python examples/tianshou_ppo.py
 tianshou's own multi-agent interface asks agents one after another, which suits games; drones act at once.
 """
 
@@ -21,7 +21,7 @@ from torch import nn
 from torch.distributions import Independent, Normal
 from torch.nn.utils import parameters_to_vector
 
-import multilift_marl  # noqa: F401 - enters the environments in Gymnasium's registry
+import multilift_marl  # noqa: F401 - registers the environments with Gymnasium
 
 
 def gaussian(mean_and_std: tuple[torch.Tensor, torch.Tensor]) -> Independent:

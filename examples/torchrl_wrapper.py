@@ -1,7 +1,7 @@
 """IPPO with TorchRL through its own PettingZooWrapper: parameters shared by the drones, losses and collector TorchRL's.
 
 Needs the package's `train` extra, or examples/requirements/torchrl_wrapper.txt. Run: python examples/torchrl_wrapper.py
-`ml.torchrl_env` is the native, batched door and many times faster; this shows that TorchRL's general one works, too.
+`ml.torchrl_env` is the native, batched API and many times faster; this shows that TorchRL's general wrapper works, too.
 """
 
 import sys
@@ -40,7 +40,7 @@ def network(env: SerialEnv, outputs: int, **keywords) -> MultiAgentMLP:
 
 def train(iterations: int = 60, num_envs: int = 8, horizon: int = 128, seed: int = 0, **overrides):
     """Train on `hover` and return the policy's weights before and after, as flat tensors."""
-    # 1. Environments, one after another in this process, each with a seed of its own.
+    # 1. Environments, one after another in this process, each with its own seed.
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     env = SerialEnv(num_envs, [partial(make, seed + e, **overrides) for e in range(num_envs)])

@@ -1,10 +1,10 @@
-"""Fly the figure-eight that Auto-Multilift's authors published, and compare with what their team did on it.
+"""Follow the figure-eight that Auto-Multilift's authors published, and compare with their team's result on it.
 
   python results/auto_multilift.py <folder> [episodes]     (16)
 
 <folder> is "Source code A/Evaluation_Little_faster_Fig-8/Evaluation results(cl_3)" of a clone of the repository
 RCL-NUS/Auto-Multilift (arXiv 2406.04858). It holds 20 s at 5 ms: Ref_Load (the load's reference, held for 20 ms),
-Load_State and EULERl (what the load did). The path is written to runs/auto_multilift/fig8.npy, for
+Load_State and EULERl (the load's motion). The path is written to runs/auto_multilift/fig8.npy, for
 
   python evaluate.py run=track_auto6 task_options.path=file task_options.file=runs/auto_multilift/fig8.npy
 
@@ -31,7 +31,8 @@ from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.evaluation.plots import POLICY_COLOURS
 from multilift_marl.evaluation.rollout import Trace, fly_episodes, trace_episode
 
-HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
+HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
 HELD, SEED = 4, 1000  # steps of 5 ms that the reference is held; evaluation seed
 NO_DRAG = {"payload.drag_area": 0.0}
 AXES = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
@@ -48,7 +49,7 @@ def read_published(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
 
 
 def make_teams(config: Config) -> dict[str, Callable[[MultiliftVec], Any]]:
-    """Return what makes each team: the scripts that fit, and the learned teams of the recipe track_auto6."""
+    """Return the makers of all teams: the scripts that fit, and the learned teams of the recipe track_auto6."""
     probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
     teams: dict[str, Callable[[MultiliftVec], Any]] = {
         script: (lambda vec, script=script: make_scripted(script, vec)) for script in fitting_scripts(probe)
@@ -60,13 +61,13 @@ def make_teams(config: Config) -> dict[str, Callable[[MultiliftVec], Any]]:
 
 def fly(config: Config, episodes: int) -> dict[str, dict[str, float]]:
     """Return {team: {metric: mean}} over some episodes, and the largest distance of the first one [m]."""
-    flown = {}
+    results = {}
     for team, make in make_teams(config).items():
         measured = fly_episodes(config, make, episodes, SEED)
         means = {axis: float(measured[f"payload_rmse_{axis}"].mean()) for axis in AXES}
         largest = float(trace_episode(config, make, 0, SEED).distance.max())
-        flown[team] = means | {"distance_m": float(measured["payload_rmse_m"].mean()), "largest_m": largest}
-    return flown
+        results[team] = means | {"distance_m": float(measured["payload_rmse_m"].mean()), "largest_m": largest}
+    return results
 
 
 def draw(path: Path, reference: np.ndarray, distances: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
@@ -99,7 +100,7 @@ def row(team: str, errors: dict[str, float]) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Do what is asked."""
+    """Evaluate, print, write and draw."""
     if not arguments or not Path(arguments[0]).is_dir():
         sys.exit(__doc__)
     time, reference, position, angles = read_published(Path(arguments[0]))
@@ -115,16 +116,16 @@ def main(arguments: list[str]) -> None:
     options = {"path": "file", "file": str(file), "rmse_from": 0.0, "start_radius": round(start, 3)}
     config = load_config("track_auto6", {f"task_options.{name}": value for name, value in options.items()})
     episodes = int(arguments[1]) if len(arguments) > 1 else 16
-    flown = fly(config, episodes)
+    nominal = fly(config, episodes)
     no_drag = fly(build_config(config.model_dump(), NO_DRAG), episodes)
 
     head = ("x [cm]", "y [cm]", "z [cm]", "roll [deg]", "pitch [deg]", "yaw [deg]", "distance [cm]", "largest [cm]")
     print(f"| | {' | '.join(head)} |\n|---|{'---|' * len(head)}")
     print(row("Auto-Multilift", theirs))
-    for name, teams in (("", flown), (", payload without drag", no_drag)):
+    for name, teams in (("", nominal), (", payload without drag", no_drag)):
         for team, errors in teams.items():
             print(row(team + name, errors))
-    content = {"episodes": episodes, "seed": SEED, "published": theirs, "teams": flown, "teams_without_drag": no_drag}
+    content = {"episodes": episodes, "seed": SEED, "published": theirs, "teams": nominal, "teams_without_drag": no_drag}
     (HERE / "auto_multilift.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
     drawn = {"Auto-Multilift (published flight)": (time, position, distance)}

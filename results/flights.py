@@ -1,17 +1,19 @@
-"""The flights by which teams are judged: rows of the tables, and the recipe whose policies fly them."""
+"""The flights on which teams are evaluated: rows of the tables, and the recipe whose policies are used."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any, NamedTuple
 
-HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
-EPISODES, SEED = 1000, 1000
+HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
+EPISODES = 1000
+SEED = 1000
 FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
 AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
 FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
 
-ESTIMATED = "load without sensor"  # what differs with the published figures, briefly; docs/track.md, docs/recover.md
+ESTIMATED = "load without sensor"  # the largest difference from the published figures; docs/track.md, docs/recover.md
 AUTO = "41 cm: path of 2.8 m/s², start included; MPC, no motor lag, no drag"
 CRAZYMARL = "79.7 %: motor commands, noise, pushes"
 
@@ -22,7 +24,7 @@ class Flight(NamedTuple):
     config: str
     overrides: dict[str, Any]
     recipe: str
-    """Whose policies fly it."""
+    """Whose policies are evaluated."""
     title: str
     published: str = ""
 

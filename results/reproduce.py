@@ -1,15 +1,15 @@
-"""Train the recipes, judge learned and scripted teams on the same episodes, and rebuild the tables from what they did.
+"""Train the recipes, evaluate learned and scripted teams on the same episodes, and rebuild the tables from the results.
 
   python results/reproduce.py train gate [seed ...]     train configs/gate.yaml; keep curve and weights in results/gate/
-  python results/reproduce.py keep gate runs/<run>      the same of a run that is there already
-  python results/reproduce.py judge [flight ...]        the same 1000 episodes of every learned team and every script
+  python results/reproduce.py keep gate runs/<run>      the same for an existing run
+  python results/reproduce.py evaluate [flight ...]     the same 1000 episodes of every learned team and every script
                                                         -> results/<flight>/<team>.json, .npz; also <flight>/<team>
                                                         for one team, workers=<processes> (as many as there are CPUs)
   python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
   python results/reproduce.py table                     the tables of README.md and docs/
 
-Every number in those tables comes from these files. `judge` skips teams whose files are there already, so it can be
-stopped and started again; delete the files of what has changed.
+Every number in those tables comes from these files. `evaluate` skips teams whose files exist, so it can be stopped
+and started again; delete the files of what has changed.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from multilift_marl.evaluation.rollout import fly_episodes
 
 
 def train(recipe: str, seeds: list[int]) -> None:
-    """Train a recipe on some seeds and keep what came of each."""
+    """Train a recipe on some seeds and keep the result of each."""
     from multilift_marl.agents.trainer import new_run
 
     for seed in seeds:
         trainer = new_run(load_config(recipe, {"seed": seed}), recipe)
         if not trainer.run():
             sys.exit(
-                f"stopped; go on with: python train.py resume={trainer.folder}, then keep it with: "
+                f"stopped; continue with: python train.py resume={trainer.folder}, then keep it with: "
                 f"python results/reproduce.py keep {recipe} {trainer.folder}"
             )
         keep(recipe, trainer.folder)
@@ -59,7 +59,8 @@ def keep(recipe: str, run: Path) -> None:
     from multilift_marl.agents.policy import strip_checkpoint
     from multilift_marl.evaluation.plots import plot_training
 
-    rows, last = read_metrics(run), load_checkpoint(run / "checkpoints" / "last.pt")
+    rows = read_metrics(run)
+    last = load_checkpoint(run / "checkpoints" / "last.pt")
     folder = HERE / recipe / f"seed{last['config']['seed']}"
     folder.mkdir(parents=True, exist_ok=True)
     names = ("frames", "return", *(name for name in rows[0] if name.startswith("eval/")))
@@ -67,14 +68,14 @@ def keep(recipe: str, run: Path) -> None:
         writer = csv.DictWriter(file, names, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(row for row in rows if row["eval/success_rate"] != "")
-    told = {"frames": last["frames"], "minutes": round(last["seconds"] / 60, 1)}
-    (folder / "training.json").write_text(json.dumps(told) + "\n", encoding="utf-8")
+    duration = {"frames": last["frames"], "minutes": round(last["seconds"] / 60, 1)}
+    (folder / "training.json").write_text(json.dumps(duration) + "\n", encoding="utf-8")
     plot_training(folder / "training.png", rows)
     strip_checkpoint(run / "checkpoints" / "best.pt", folder / "policy.pt")
 
 
 class Job(NamedTuple):
-    """A team and what it flies."""
+    """A team and the row of the table that it is evaluated for."""
 
     flight: str
     team: str
@@ -90,21 +91,21 @@ class Job(NamedTuple):
     @property
     def done(self) -> bool:
         """Whether both files are there, for as many episodes."""
-        told, episodes = self.files
-        return episodes.is_file() and told.is_file() and json.loads(told.read_text("utf-8"))["episodes"] == EPISODES
+        metrics, episodes = self.files
+        return episodes.is_file() and metrics.is_file() and json.loads(metrics.read_text())["episodes"] == EPISODES
 
 
-def judge(asked: list[str], workers: int) -> None:
-    """Fly what has not been flown yet, one team in each process at a time."""
-    jobs = [job for each in asked for job in list_jobs(*each.split("/", 1)) if not job.done]
+def evaluate(flights: list[str], workers: int) -> None:
+    """Evaluate the teams without results, one in each process at a time."""
+    jobs = [job for each in flights for job in list_jobs(*each.split("/", 1)) if not job.done]
     jobs = list(dict.fromkeys(jobs))
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for told in as_completed([pool.submit(fly, job) for job in jobs]):
-            print(told.result(), flush=True)
+        for done in as_completed([pool.submit(fly, job) for job in jobs]):
+            print(done.result(), flush=True)
 
 
 def list_jobs(flight: str, only: str = "") -> list[Job]:
-    """Return the teams that fly a flight, or the one called `only`."""
+    """Return the teams of a flight, or the one called `only`."""
     config = load_config(FLIGHTS[flight].config, FLIGHTS[flight].overrides)
     scripts = fitting_scripts(MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1})))
     weights = sorted((HERE / FLIGHTS[flight].recipe).glob("seed*/policy.pt"))
@@ -113,7 +114,7 @@ def list_jobs(flight: str, only: str = "") -> list[Job]:
 
 
 def fly(job: Job) -> str:
-    """Fly a team, write what it did, and return a line about it."""
+    """Simulate a team's episodes, write the results, and return a line about them."""
     import torch
 
     from multilift_marl.agents.policy import load_policy
@@ -125,15 +126,18 @@ def fly(job: Job) -> str:
     if job.weights:
         policy = load_policy(job.weights)
         scales = {f"control.{key}": getattr(policy.config.control, key) for key in ("max_offset", "max_yaw")}
-        maker, overrides = policy.bind, overrides | scales  # a full action means what it did in training
-    flown = fly_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
-    metrics, error = summarize(flown), flown[error_metric(flight)]
+        # the full scale of actions is that of training
+        maker = policy.bind
+        overrides = overrides | scales
+    results = fly_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
+    metrics = summarize(results)
+    error = results[error_metric(flight)]
     content = {"episodes": EPISODES, "seed": SEED, "config": flight.config, "overrides": flight.overrides}
-    told, episodes = job.files
-    told.parent.mkdir(parents=True, exist_ok=True)
+    report, episodes = job.files
+    report.parent.mkdir(parents=True, exist_ok=True)
     arrays = io.BytesIO()
-    np.savez_compressed(arrays, success=flown["success_rate"], error=error.astype(np.float32))
-    write_whole(told, f"{json.dumps(content | {'metrics': metrics}, indent=1)}\n".encode())
+    np.savez_compressed(arrays, success=results["success_rate"], error=error.astype(np.float32))
+    write_whole(report, f"{json.dumps(content | {'metrics': metrics}, indent=1)}\n".encode())
     write_whole(episodes, arrays.getbuffer())
     return f"{job.flight}, {job.team}: success {metrics['success_rate']['mean']:.1%}, {100 * error.mean():.2f} cm"
 
@@ -146,16 +150,16 @@ def ship(recipes: list[str]) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Do what is asked."""
+    """Run the named command."""
     what, *rest = arguments or ["help"]
     if what == "train" and rest:
         train(rest[0], [int(seed) for seed in rest[1:]] or [0])
     elif what == "keep" and len(rest) == 2:
         keep(rest[0], Path(rest[1]))
-    elif what == "judge":
+    elif what == "evaluate":
         workers = [int(each.partition("=")[2]) for each in rest if each.startswith("workers=")]
         flights = [each for each in rest if not each.startswith("workers=")]
-        judge(flights or list(FLIGHTS), workers[-1] if workers else len(os.sched_getaffinity(0)))
+        evaluate(flights or list(FLIGHTS), workers[-1] if workers else len(os.sched_getaffinity(0)))
     elif what == "ship" and rest:
         ship(rest)
     elif what == "table":

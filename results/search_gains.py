@@ -2,9 +2,9 @@
 
   python results/search_gains.py config=pose_wind [minutes=30] [script=formation_feedback] [spread=0.3] [key=value ...]
 
-It starts from the gains of `script`, with candidates that lie `spread` times the distances of `FREE` around them, flies
-the same `env.num_envs` episodes with all candidates of a generation, and prints the gains that it ends with, and how
-they do in episodes that the search did not see. Any configuration key changes the task.
+It starts from the gains of `script`, with candidates `spread` times the distances of `FREE` around them, simulates the
+same `env.num_envs` episodes with all candidates of a generation, and prints the final gains and their results in
+episodes that are not part of the search. Any configuration key changes the task.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ from multilift_marl.control.scripted import LINEAR, Formation, check_interface
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
 
-LEVEL, TANGENT, RADIAL, UP = ((0, 0), (1, 1)), ((2, 1),), ((1, 0),), ((2, 2),)
+LEVEL = ((0, 0), (1, 1))
+TANGENT = ((2, 1),)
+RADIAL = ((1, 0),)
+UP = ((2, 2),)
 LIFT = ((1, 2),)  # what a drone does up and down turns the payload about the tangent at its slot
 FREE: tuple[tuple[str, tuple[tuple[int, int], ...], float], ...] = (
     ("payload_error_integral", LEVEL, 0.2),
@@ -43,15 +46,15 @@ FREE: tuple[tuple[str, tuple[tuple[int, int], ...], float], ...] = (
     ("payload_rotation_error", RADIAL, 0.15),
     ("payload_angular_velocity", RADIAL, 0.05),
 )
-"""What is observed; axes in the slot frame, of it and of the slot's offset, that share a gain; how far to look."""
-TASKS = ("hover", "pose")  # succeed where distance and angle stay within bounds, and judge nothing else
-SCRIPTS = tuple(name for name in LINEAR if name != "formation_lead")  # those that are all gains
-POPULATION, RENEWED = 12, 3  # candidates of a generation; generations that fly the same episodes
-SOFT = 0.15  # over which an episode turns from held to lost, as a part of the bounds; at them it counts half
+"""Observation; axes in the slot frame, of it and of the slot's offset, that share a gain; scale of the search."""
+TASKS = ("hover", "pose")  # their success depends on bounds of distance and angle alone
+SCRIPTS = tuple(name for name in LINEAR if name != "formation_lead")  # those that consist of gains only
+POPULATION, RENEWED = 12, 3  # candidates of a generation; generations with the same episodes
+SOFT = 0.15  # width of the transition of the cost, relative to the bounds, at which it is 1/2
 
 
-class Flown(NamedTuple):
-    """How a script did."""
+class Score(NamedTuple):
+    """Results of a script."""
 
     cost: float
     """Share of the episodes that were lost, smoothed."""
@@ -79,25 +82,26 @@ def starting_gains(script: str) -> np.ndarray:
     return np.array([known.get((name, *axes[0]), 0.0) for name, axes, _ in FREE])
 
 
-def fly(config: Config, script: type[Formation], seed: int) -> Flown:
-    """Fly one episode in every environment of `config` and judge its worst moment among those that count."""
+def fly(config: Config, script: type[Formation], seed: int) -> Score:
+    """Simulate one episode in every environment of `config`; return the scores of its worst moment that counts."""
     vec = MultiliftVec(config, TRAINING_EVALUATION)
     bound = np.array([[vec.task.options.success_distance], [radians(vec.task.options.success_angle)]])
-    policy, worst = script(vec), np.zeros((2, vec.num_envs))
+    policy = script(vec)
+    worst = np.zeros((2, vec.num_envs))
     observation, _ = vec.reset(seed=seed)
     failed = np.zeros(vec.num_envs, bool)
     for step in range(vec.max_steps):
         observation, _, terminated, _, _ = vec.step(policy.act(observation))
         failed |= terminated
-        if vec.task.counts((step + 1) * vec.task.dt, vec.max_steps * vec.task.dt):
+        if vec.task.in_error_window((step + 1) * vec.task.dt, vec.max_steps * vec.task.dt):
             errors = np.stack([vec.task.errors.distance, vec.task.errors.angle])
             worst = np.maximum(worst, errors)
         if terminated.any() and step + 1 < vec.max_steps:
-            observation, _ = vec.reset(mask=terminated)  # flown on, but lost already
+            observation, _ = vec.reset(mask=terminated)  # the next episode does not count: this one is lost
     excess = np.where(failed, 10.0, (worst / bound).max(axis=0)) - 1
     cost = (1 / (1 + np.exp(-np.clip(excess / SOFT, -30, 30)))).mean()
     distance, angle = np.median(worst, axis=1)
-    return Flown(float(cost), float((excess <= 0).mean()), float(distance), float(np.rad2deg(angle)))
+    return Score(float(cost), float((excess <= 0).mean()), float(distance), float(np.rad2deg(angle)))
 
 
 def search(config: Config, start: np.ndarray, spread: float, minutes: float) -> np.ndarray:
@@ -110,19 +114,22 @@ def search(config: Config, start: np.ndarray, spread: float, minutes: float) -> 
         import cma
     except ModuleNotFoundError:
         raise ConfigError("the search needs the package cma; install it with: pip install cma") from None
-    scale = np.array([far for _, _, far in FREE])
+    scale = np.array([width for _, _, width in FREE])
     options = {"popsize": POPULATION, "seed": config.seed % (2**32 - 1) + 1, "verbose": -9}
-    strategy, end, generation = cma.CMAEvolutionStrategy(np.zeros(len(FREE)), spread, options), 60 * minutes, 0
+    strategy = cma.CMAEvolutionStrategy(np.zeros(len(FREE)), spread, options)
+    end = 60 * minutes
+    generation = 0
     begun = time.monotonic()
     try:
         while time.monotonic() - begun < end:
             candidates = strategy.ask()
             seed = config.seed + generation // RENEWED
-            flown = [fly(config, make_script(start + scale * np.array(each)), seed) for each in candidates]
-            strategy.tell(candidates, [each.cost for each in flown])
+            scores = [fly(config, make_script(start + scale * np.array(each)), seed) for each in candidates]
+            strategy.tell(candidates, [each.cost for each in scores])
             generation += 1
-            best, middle = min(each.cost for each in flown), np.median([each.cost for each in flown])
-            success = max(each.success for each in flown)
+            best = min(each.cost for each in scores)
+            middle = np.median([each.cost for each in scores])
+            success = max(each.success for each in scores)
             print(
                 f"{generation}: cost {best:.3f} at best, {middle:.3f} in the middle; success up to {success:.0%}; "
                 f"spread {strategy.sigma:.2f}",
@@ -134,7 +141,7 @@ def search(config: Config, start: np.ndarray, spread: float, minutes: float) -> 
 
 
 def main(values: dict[str, Any]) -> int:
-    """Search, print and test."""
+    """Search, print and evaluate."""
     own = {key: values.pop(key, default) for key, default in OWN.items()}
     for key in ("minutes", "spread"):
         if isinstance(own[key], bool) or not isinstance(own[key], int | float) or not 0 < own[key] < float("inf"):
@@ -146,7 +153,8 @@ def main(values: dict[str, Any]) -> int:
     check_interface(script, config.control.action)
     if config.task not in TASKS:
         raise ConfigError(f"task {config.task} cannot be searched; take hover or pose")
-    start, fresh = starting_gains(script), build_config(config.model_dump(), {"env.num_envs": 256})
+    start = starting_gains(script)
+    fresh = build_config(config.model_dump(), {"env.num_envs": 256})
     gains = search(config, start, own["spread"], own["minutes"])
     for (name, axes, _), gain in zip(FREE, gains, strict=True):
         for axis, moved in axes:

@@ -1,4 +1,4 @@
-"""The tables of the documents, from what `reproduce.py judge` has written beside each flight."""
+"""The tables of the documents, from the files that `reproduce.py evaluate` writes for each flight."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def summary() -> str:
 
 
 def _learned(flight: str) -> tuple[str, str]:
-    """Return what learned teams did, and how many."""
+    """Return success and error of the learned teams, and how many there are."""
     teams = learned_teams(flight)
     return _cell([HERE / flight / f"{team}.json" for team in teams], error_metric(FLIGHTS[flight])), str(len(teams))
 
 
 def learned_teams(flight: str) -> list[str]:
-    """Return the names of the learned teams that have flown, one for each training seed."""
+    """Return the names of the evaluated learned teams, one for each training seed."""
     return sorted(path.stem for path in (HERE / flight).glob("seed*.npz"))
 
 
@@ -63,22 +63,23 @@ def _markdown(columns: list[str], rows: list[list[str]]) -> str:
 
 
 def best_script(flight: str) -> str:
-    """Return the script with the most successes, of several the one with the least error; "" if none was flown."""
+    """Return the script with the most successes, of several the one with the least error; "" if none was evaluated."""
     scripts = {name: np.load(path) for name in SCRIPTED if (path := HERE / flight / f"{name}.npz").is_file()}
     return min(scripts, default="", key=lambda name: (-scripts[name]["success"].mean(), scripts[name]["error"].mean()))
 
 
 def gain(flight: str) -> str:
-    """Return what learned teams do better than the best script: success and error, paired by episode.
+    """Return the gain of learned teams over the best script: success and error, paired by episode.
 
-    Of several training seeds each episode counts by its mean. `is_gain` says whether learning gains.
+    Of several training seeds each episode counts by its mean. `is_gain` decides whether learning gains.
     """
     learned = [np.load(HERE / flight / f"{team}.npz") for team in learned_teams(flight)]
     best = best_script(flight)
     if not learned or not best:
         return "-"
     script = np.load(HERE / flight / f"{best}.npz")
-    parts, differences = [], []
+    parts = []
+    differences = []
     for key, unit, digits in (("success", "points", 1), ("error", "cm", 2)):
         mean = np.mean([each[key].astype(float) for each in learned], axis=0)
         difference = 100 * (mean - script[key].astype(float))
@@ -90,12 +91,12 @@ def gain(flight: str) -> str:
 
 def _cell(paths: list[Path], error: str) -> str:
     """Return "success %, error cm", means of these results, with the smallest and the largest where they differ."""
-    told = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in paths if path.is_file()]
-    if not told:
+    teams = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in paths if path.is_file()]
+    if not teams:
         return "-"
     parts = []
     for metric, unit, digits in (("success_rate", "%", 1), (error, "cm", 2)):
-        values = [100 * one[metric]["mean"] for one in told]
+        values = [100 * one[metric]["mean"] for one in teams]
         least, most = (f"{value:.{digits}f}" for value in (min(values), max(values)))
         spread = f" ({least} - {most})" if least != most else ""
         parts.append(f"{sum(values) / len(values):.{digits}f}{spread} {unit}")
@@ -103,7 +104,7 @@ def _cell(paths: list[Path], error: str) -> str:
 
 
 def details(flights: Sequence[str]) -> str:
-    """Return what every team of some flights did, as a Markdown table: means and 95 % intervals over its episodes."""
+    """Return the metrics of every team of some flights as a Markdown table: means and 95 % intervals over episodes."""
     rows = []
     for flight in flights:
         for team in (*SCRIPTED, *learned_teams(flight)):
@@ -124,7 +125,7 @@ def _interval(metric: dict[str, Any] | None, factor: float, digits: int) -> str:
 
 
 def write_tables() -> None:
-    """Replace what stands between the markers in the documents."""
+    """Replace the text between the markers in the documents."""
     marked = re.compile(r"(<!-- results(?: of ([\w ]+))? -->\n).*?(<!-- end of results -->)", re.DOTALL)
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         whole = summary if path.name == "README.md" else table

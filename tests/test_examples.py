@@ -14,8 +14,8 @@ check = load_script("examples/check")
 
 @pytest.mark.parametrize("name", HERE)
 def test_example_trains(name, tmp_path):
-    told = check.try_out(sys.executable, name, tmp_path, num_envs=2)
-    assert told["weights"] > 1000 and told["moved"] > 0
+    result = check.try_out(sys.executable, name, tmp_path, num_envs=2)
+    assert result["weights"] > 1000 and result["moved"] > 0
 
 
 @pytest.mark.parametrize(

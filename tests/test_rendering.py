@@ -12,7 +12,7 @@ from conftest import make, make_system, same
 
 import multilift_marl as ml
 from multilift_marl.errors import RenderingError
-from multilift_marl.rendering import CAMERAS, Renderer, opengl, write_video
+from multilift_marl.rendering import CAMERAS, Renderer, renderer, write_video
 from multilift_marl.sim.scene import build_model
 
 needs_gl = pytest.mark.skipif(
@@ -158,8 +158,10 @@ def test_a_machine_without_display_needs_no_settings_and_exits_quietly():
         "vec = ml.make_vec(num_envs=1, num_threads=1)\nvec.reset(seed=0)\nrenderer = Renderer(vec, 64, 36)\n"
         "print(renderer.frame().shape)"  # and never closed
     )
-    bare = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=bare)
+    without_display = {
+        key: value for key, value in os.environ.items() if key not in ("DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")
+    }
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=without_display)
     assert (done.stdout, done.stderr, done.returncode) == ("(36, 64, 3)\n", "", 0)
 
 
@@ -187,7 +189,7 @@ def test_opengl_that_does_not_work_is_named_with_its_cure(monkeypatch, chosen, m
     if chosen is not None:
         monkeypatch.setenv("MUJOCO_GL", chosen)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
-    monkeypatch.setattr(opengl.importlib, "import_module", broken)
+    monkeypatch.setattr(renderer.importlib, "import_module", broken)
     with pytest.raises(RenderingError, match=message):
         Renderer(make(num_envs=1))
 

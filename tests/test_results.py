@@ -27,13 +27,13 @@ import tables  # noqa: E402
 def test_tables_are_those_of_the_results():
     assert tables.summary() in (ROOT / "README.md").read_text(encoding="utf-8")
     assert tables.table() in (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
-    told = 0
+    reported = 0
     for document in sorted((ROOT / "docs").glob("*.md")):
         text = document.read_text(encoding="utf-8")
         for flights in re.findall(r"<!-- results of ([\w ]+) -->", text):
             assert tables.details(flights.split()) in text, (document.name, flights)
-            told += 1
-    assert told > 3
+            reported += 1
+    assert reported > 3
 
 
 def test_tables_are_written_between_their_marks(tmp_path, monkeypatch):
@@ -56,12 +56,14 @@ def test_flights_are_flown_a_thousand_times_by_shipped_teams_and_scripts():
     compared = 0
     for name, flight in reproduce.FLIGHTS.items():
         fitting = fitting_scripts(ml.make_vec(flight.config, num_envs=1, num_threads=1))
-        flown, told = ({path.stem for path in (ROOT / "results" / name).glob(kind)} for kind in ("*.npz", "*.json"))
-        assert flown == told >= set(fitting)
-        compared += "seed0" in flown and bool(flown & set(fitting))
-        for team in flown:
-            told = json.loads((ROOT / "results" / name / f"{team}.json").read_text(encoding="utf-8"))
-            assert (told["episodes"], told["seed"]) == (reproduce.EPISODES, reproduce.SEED)
+        evaluated, reported = (
+            {path.stem for path in (ROOT / "results" / name).glob(kind)} for kind in ("*.npz", "*.json")
+        )
+        assert evaluated == reported >= set(fitting)
+        compared += "seed0" in evaluated and bool(evaluated & set(fitting))
+        for team in evaluated:
+            reported = json.loads((ROOT / "results" / name / f"{team}.json").read_text(encoding="utf-8"))
+            assert (reported["episodes"], reported["seed"]) == (reproduce.EPISODES, reproduce.SEED)
     assert compared == len(reproduce.FLIGHTS)
 
 
@@ -78,9 +80,9 @@ def test_episodes_are_kept_beside_their_mean():
     found = 0
     for name, flight in reproduce.FLIGHTS.items():
         for path in (ROOT / "results" / name).glob("*.npz"):
-            told = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-            episodes, metrics = np.load(path), told["metrics"]
-            assert len(episodes["success"]) == told["episodes"]
+            reported = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+            episodes, metrics = np.load(path), reported["metrics"]
+            assert len(episodes["success"]) == reported["episodes"]
             assert episodes["success"].mean() == pytest.approx(metrics["success_rate"]["mean"])
             error = metrics[reproduce.error_metric(flight)]["mean"]
             assert episodes["error"].mean(dtype=float) == pytest.approx(error, rel=1e-5)
@@ -119,7 +121,7 @@ def test_judging_can_be_stopped_and_started_again(tmp_path, monkeypatch):
     assert reproduce.fly(job).startswith("land, formation: success ")
     assert job.done and {path.name for path in (tmp_path / "land").iterdir()} == {"formation.json", "formation.npz"}
     monkeypatch.setattr(reproduce, "fly", None)  # would be called for what is left
-    reproduce.judge(["land/formation"], 1)
+    reproduce.evaluate(["land/formation"], 1)
     job.files[1].unlink()
     assert not job.done
 
@@ -169,11 +171,11 @@ def test_the_search_begins_with_the_gains_of_its_script(script):
 )
 def test_the_search_counts_as_success_what_the_task_does(name, script):
     config = ml.load_config(name, {"env.num_envs": 16})
-    flown = search_gains.fly(config, LINEAR[script], seed=3)
-    told = fly_episodes(config, LINEAR[script], 16, 3, TRAINING_EVALUATION)
-    assert flown.success == told["success_rate"].mean() and 0 < flown.success < 1
-    assert flown.distance > np.median(told["payload_position_error_m"])
-    assert flown.angle > np.median(told["payload_attitude_error_deg"])
+    evaluated = search_gains.fly(config, LINEAR[script], seed=3)
+    reported = fly_episodes(config, LINEAR[script], 16, 3, TRAINING_EVALUATION)
+    assert evaluated.success == reported["success_rate"].mean() and 0 < evaluated.success < 1
+    assert evaluated.distance > np.median(reported["payload_position_error_m"])
+    assert evaluated.angle > np.median(reported["payload_attitude_error_deg"])
 
 
 def test_the_search_prints_gains_that_a_script_can_have(capsys):
@@ -183,13 +185,13 @@ def test_the_search_prints_gains_that_a_script_can_have(capsys):
     rows = [eval(line.strip().rstrip(",")) for line in lines if line.startswith("        (")]
     assert len(rows) == sum(len(axes) for _, axes, _ in search_gains.FREE)
     assert lines[0].startswith("1: cost") and lines[-1].startswith("searched: ")
-    told = [(name, axis, moved) for name, axes, _ in search_gains.FREE for axis, moved in axes]
-    assert [row[:3] for row in rows] == told
+    reported = [(name, axis, moved) for name, axes, _ in search_gains.FREE for axis, moved in axes]
+    assert [row[:3] for row in rows] == reported
 
 
 def test_the_search_finds_gains_that_cost_less(monkeypatch):
     def bowl(config, script, seed):
-        return search_gains.Flown(sum((gain - 0.3) ** 2 for *_, gain in script.GAINS), 0.0, 0.0, 0.0)
+        return search_gains.Score(sum((gain - 0.3) ** 2 for *_, gain in script.GAINS), 0.0, 0.0, 0.0)
 
     clock = count()  # a second from one generation to the next
     monkeypatch.setattr(search_gains, "fly", bowl)

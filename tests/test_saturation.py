@@ -8,7 +8,7 @@ from conftest import floats, make, zeros
 
 from multilift_marl.control.allocation import allocate
 from multilift_marl.rig.vehicles import PRESETS
-from multilift_marl.validation.release import attitudes, release_drones
+from multilift_marl.validation.bodies import attitudes, release_drones
 
 
 def best_by_search(vehicle, thrust, torque, low, high):

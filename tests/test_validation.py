@@ -10,9 +10,9 @@ import pytest
 
 from multilift_marl.sim import scene, world
 from multilift_marl.validation import __main__ as command
-from multilift_marl.validation import bodies, cables, momentum, trajectory
+from multilift_marl.validation import bodies, cables, conservation, flight
 from multilift_marl.validation.__main__ import EXPERIMENTS, main
-from multilift_marl.validation.experiment import Row, order_row
+from multilift_marl.validation.experiment import Result, Row
 
 KEYS = {"experiment", "quantity", "theory", "simulated", "error", "limit", "pass"}
 DOCUMENT = Path(__file__).parents[1] / "docs" / "validation.md"
@@ -115,15 +115,15 @@ def test_wrong_gravity_is_noticed(monkeypatch):
 
 
 def test_loads_left_out_of_the_balance_are_noticed(monkeypatch):
-    right = momentum.loads
-    monkeypatch.setattr(momentum, "loads", lambda world: tuple(1.0001 * part for part in right(world)))
-    team = momentum.make_team("massless")
-    assert min(momentum.massless_balance(team, 0.1)) > 1e-9
-    assert momentum.momentum_drift(momentum.make_team("chain"), 0.1)[0] > 1e-9
+    right = conservation.loads
+    monkeypatch.setattr(conservation, "loads", lambda world: tuple(1.0001 * part for part in right(world)))
+    team = conservation.make_team("massless")
+    assert min(conservation.massless_balance(team, 0.1)) > 1e-9
+    assert conservation.momentum_drift(conservation.make_team("chain"), 0.1)[0] > 1e-9
 
 
 def test_a_flight_without_feed_forward_is_not_good_enough(monkeypatch):
-    monkeypatch.setattr(trajectory, "carrying_forces", lambda system, acceleration, velocity: 0.0)
+    monkeypatch.setattr(flight, "carrying_forces", lambda system, acceleration, velocity: 0.0)
     assert any(row.quantity.startswith("mean payload") for row in EXPERIMENTS["flight"](True).rows if not row.passed)
 
 
@@ -198,6 +198,8 @@ def test_rows_beyond_their_limit_fail(error):
 
 def test_order_of_convergence_is_measured():
     steps = [4e-3, 2e-3, 1e-3]
-    assert order_row("a", "b", [3 * step for step in steps], steps).simulated == pytest.approx(1.0)
-    assert order_row("a", "b", [step**2 for step in steps], steps).passed
-    assert not order_row("a", "b", [0.1, 0.1, 0.1], steps).passed
+    result = Result()
+    for errors in ([3 * step for step in steps], [step**2 for step in steps], [0.1, 0.1, 0.1]):
+        result.order("a", "b", errors, steps)
+    assert result.rows[0].simulated == pytest.approx(1.0)
+    assert [row.passed for row in result.rows] == [True, True, False]

@@ -7,12 +7,12 @@ import pytest
 
 from multilift_marl.config.load import load_config
 from multilift_marl.sim.air import AIR_DENSITY
-from multilift_marl.validation import symmetry, team_cables, trajectory
-from multilift_marl.validation.asymmetric_team import make_team
-from multilift_marl.validation.bodies import make_config
-from multilift_marl.validation.cables import second_order
+from multilift_marl.validation import flight, symmetry
+from multilift_marl.validation.cables import bounce, second_order
+from multilift_marl.validation.experiment import make_config
+from multilift_marl.validation.symmetry import make_team
 
-PLAN = trajectory.make_plan((0.1, 0.1))
+PLAN = flight.make_plan((0.1, 0.1))
 
 
 @pytest.fixture(params=["report4", "falcon4"])
@@ -37,59 +37,59 @@ def test_bounce_solves_its_equation():
     while k * x + c * v > 0:
         middle = x + 0.5 * h * v, v - 0.5 * h * (k * x + c * v) / mass
         x, v = x + h * middle[1], v - h * (k * middle[0] + c * middle[1]) / mass
-    assert team_cables.bounce(system, 2.0) == pytest.approx(v, rel=1e-4)
+    assert bounce(system, 2.0) == pytest.approx(v, rel=1e-4)
 
 
 def test_load_path_is_smooth_and_consistent(system):
-    h, time = 1e-4, np.linspace(0.5, PLAN.end - 0.5, 200)
-    p, v, a = trajectory.load_path(system, PLAN, time)
-    before, after = (trajectory.load_path(system, PLAN, time + side * h) for side in (-1, 1))
+    h, time = 1e-4, np.linspace(0.5, PLAN.edges[-1] - 0.5, 200)
+    p, v, a = flight.load_path(system, PLAN, time)
+    before, after = (flight.load_path(system, PLAN, time + side * h) for side in (-1, 1))
     np.testing.assert_allclose((after[0] - before[0]) / (2 * h), v, atol=1e-5)
     np.testing.assert_allclose((after[1] - before[1]) / (2 * h), a, atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(p[:, :2], axis=1), trajectory.RADIUS, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(p[:, :2], axis=1), flight.RADIUS, rtol=1e-12)
 
 
-def test_circles_are_flown_at_their_rates_with_yaw_along_them(system):
+def test_circles_have_their_rates_with_yaw_along_them(system):
     for name, rate in (("slow circle", 0.2), ("fast circle", 0.4)):
-        time = np.linspace(0, PLAN.end, 3000)
+        time = np.linspace(0, PLAN.edges[-1], 3000)
         time = time[PLAN.during(name, time)]
-        way = trajectory.make_trajectory(system, PLAN, time)
-        velocity = trajectory.load_path(system, PLAN, time)[1]
+        planned = flight.make_trajectory(system, PLAN, time)
+        velocity = flight.load_path(system, PLAN, time)[1]
         np.testing.assert_allclose(np.linalg.norm(velocity, axis=1), 5.0 * rate, rtol=1e-9)
-        np.testing.assert_allclose(way.yaw_rate, rate, rtol=1e-9)
-        heading = np.stack([np.cos(way.yaw), np.sin(way.yaw), 0 * way.yaw], axis=1)
+        np.testing.assert_allclose(planned.yaw_rate, rate, rtol=1e-9)
+        heading = np.stack([np.cos(planned.yaw), np.sin(planned.yaw), 0 * planned.yaw], axis=1)
         np.testing.assert_allclose(heading, velocity / (5.0 * rate), atol=1e-9)
 
 
 def test_references_are_derivatives_of_each_other(system):
-    h, time = 1e-3, np.linspace(2.5, PLAN.end - 0.5, 300)
-    way = trajectory.make_trajectory(system, PLAN, time)
-    before, after = (trajectory.make_trajectory(system, PLAN, time + side * h) for side in (-1, 1))
+    h, time = 1e-3, np.linspace(2.5, PLAN.edges[-1] - 0.5, 300)
+    planned = flight.make_trajectory(system, PLAN, time)
+    before, after = (flight.make_trajectory(system, PLAN, time + side * h) for side in (-1, 1))
     for name, rate in (("position", "velocity"), ("velocity", "acceleration"), ("acceleration", "jerk")):
         slope = (getattr(after, name) - getattr(before, name)) / (2 * h)
-        np.testing.assert_allclose(slope, getattr(way, rate), atol=2e-3)
+        np.testing.assert_allclose(slope, getattr(planned, rate), atol=2e-3)
 
 
 def test_cables_are_slack_until_they_are_to_tighten(system):
-    time = np.linspace(0, PLAN.start[PLAN.names.index("tighten")], 500)[:-1]
-    way = trajectory.make_trajectory(system, PLAN, time)
-    distance = np.linalg.norm(way.position - way.payload[:, None] - system.anchors, axis=2)
-    assert np.all(distance < system.cable_length + 1e-12) and np.all(way.cable_force == 0)
-    ground, places = trajectory.on_the_ground(system)
+    time = np.linspace(0, PLAN.start("tighten"), 500)[:-1]
+    planned = flight.make_trajectory(system, PLAN, time)
+    distance = np.linalg.norm(planned.position - planned.payload[:, None] - system.anchors, axis=2)
+    assert np.all(distance < system.cable_length + 1e-12) and np.all(planned.cable_force == 0)
+    ground, places = flight.on_the_ground(system)
     assert ground == pytest.approx(system.payload_size[2] / 2) and np.all(places[:, 2] > 0)
-    np.testing.assert_allclose(way.position[0], places)
+    np.testing.assert_allclose(planned.position[0], places)
 
 
-def test_pulls_carry_the_load_against_its_drag(system):
-    time = np.array([PLAN.start[-1] + 0.5])
-    way = trajectory.make_trajectory(system, PLAN, time)
-    _, v, a = (part[0] for part in trajectory.load_path(system, PLAN, time))
+def test_cable_forces_carry_the_load_against_its_drag(system):
+    time = np.array([PLAN.start("fast circle") + 0.5])
+    planned = flight.make_trajectory(system, PLAN, time)
+    _, v, a = (part[0] for part in flight.load_path(system, PLAN, time))
     drag = 0.5 * AIR_DENSITY * system.payload_drag_area * np.linalg.norm(v) * v
     total = system.payload_mass * (a + [0, 0, 9.81]) + drag
-    np.testing.assert_allclose(way.cable_force[0].sum(axis=0), total, atol=1e-9)
-    np.testing.assert_allclose(np.cross(system.anchors, way.cable_force[0]).sum(axis=0), 0, atol=1e-9)
-    cable = way.position[0] - way.payload[0] - system.anchors
-    np.testing.assert_allclose(np.cross(cable, way.cable_force[0]), 0, atol=1e-9)
+    np.testing.assert_allclose(planned.cable_force[0].sum(axis=0), total, atol=1e-9)
+    np.testing.assert_allclose(np.cross(system.anchors, planned.cable_force[0]).sum(axis=0), 0, atol=1e-9)
+    cable = planned.position[0] - planned.payload[0] - system.anchors
+    np.testing.assert_allclose(np.cross(cable, planned.cable_force[0]), 0, atol=1e-9)
 
 
 def test_maps_of_teams_undo_themselves():

@@ -30,9 +30,9 @@ def test_time_passes_at_the_speed_chosen():
     flight = session()
     for speed in (1.0, 0.5, 4.0):
         before, flight.speed = flight.vec.steps[0], speed
-        flown = sum(flight.advance(0.03) for _ in range(10))
-        assert abs(flown - 0.3 * speed / flight.vec.task.dt) <= 1
-        assert flight.vec.steps[0] - before == flown
+        steps = sum(flight.advance(0.03) for _ in range(10))
+        assert abs(steps - 0.3 * speed / flight.vec.task.dt) <= 1
+        assert flight.vec.steps[0] - before == steps
 
 
 def test_a_pause_holds_everything_and_a_step_goes_on_by_one():
@@ -46,20 +46,20 @@ def test_a_pause_holds_everything_and_a_step_goes_on_by_one():
     assert flight.advance(0.1) == 5  # the second of the pause is not made up for
 
 
-def test_a_slow_machine_falls_behind_in_place_of_choking():
+def test_a_slow_machine_falls_behind_the_clock():
     flight = session()
     assert flight.advance(60.0) == 20
 
 
-def test_reset_flies_the_same_episode_again_and_next_another():
+def test_reset_repeats_the_episode_and_next_starts_another():
     flight = session()
     start = positions(flight)
     flight.advance(0.2)
-    flown = positions(flight)
+    steps = positions(flight)
     flight.reset()
     assert (positions(flight) == start).all() and flight.vec.steps[0] == 0 and flight.vec.episodes[0] == 0
     flight.advance(0.2)
-    assert (positions(flight) == flown).all()
+    assert (positions(flight) == steps).all()
     flight.skip()
     assert flight.vec.episodes[0] == 1 and (positions(flight) != start).any()
 
@@ -76,7 +76,7 @@ def test_the_episodes_are_those_of_evaluation():
         assert (flight.vec.world.state.payload_position[0] == place).all()
 
 
-def test_an_episode_that_ends_is_told_and_the_next_one_begins():
+def test_the_outcome_of_an_episode_is_shown_and_the_next_one_begins():
     flight = session(**{"env.episode_seconds": 0.1})
     for _ in range(5):
         flight.step()
@@ -130,7 +130,7 @@ def test_policies_change_in_flight():
     flight.advance(0.2)
 
 
-def test_a_trained_policy_flies_first_and_one_that_does_not_fit_is_refused():
+def test_a_trained_policy_is_the_first_and_one_that_does_not_fit_is_refused():
     pytest.importorskip("torch")
     flight = make_session({"run": "hover"} | SMALL)[0]
     assert flight.policy == "run" and flight.vec.task.name == "hover" and "formation" in flight.policies

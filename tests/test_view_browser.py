@@ -71,10 +71,10 @@ class Tab:
         return iio.imread(base64.b64decode(self.call("Page.captureScreenshot")["data"]))[..., :3]
 
 
-def first(look, process, seconds):
-    """Return what `look` finds, as soon as it does, while a process runs."""
+def first(find, process, seconds):
+    """Return what `find` finds, as soon as it does, while a process runs."""
     deadline = time.time() + seconds
-    while not (found := look()):
+    while not (found := find()):
         assert process.poll() is None and time.time() < deadline
         time.sleep(0.05)
     return found

@@ -1,4 +1,4 @@
-"""The window of render_mode="human": what is said without a display, and that it shows what is flown."""
+"""The window of render_mode="human": its error without a display, and the states that it shows."""
 
 import os
 import shutil
@@ -36,33 +36,33 @@ env.close()
 """
 
 
-def bare(**more):
+def without_display(**more):
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR")
     return {key: value for key, value in os.environ.items() if key not in hidden} | more
 
 
-@pytest.mark.parametrize("face", ["multilift_v0.parallel_env", "MultiliftGymnasiumEnv"])
-def test_without_a_display_one_sentence_names_the_ways_out(face):
+@pytest.mark.parametrize("api", ["multilift_v0.parallel_env", "MultiliftGymnasiumEnv"])
+def test_without_a_display_one_sentence_names_the_alternatives(api):
     code = (
         "from multilift_marl.envs import multilift_v0\n"
         "from multilift_marl.envs.gymnasium_env import MultiliftGymnasiumEnv\n"
         "from multilift_marl.errors import RenderingError\n"
-        f"env = {face}(render_mode='human')\n"
+        f"env = {api}(render_mode='human')\n"
         "try:\n    env.reset(seed=0)\nexcept RenderingError as error:\n    print(error)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=bare())
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=without_display())
     assert done.stdout.startswith("there is no display to open a window on; use render_mode"), done.stderr
     assert "python -m multilift_marl.view" in done.stdout and done.stdout.count("\n") == 1 and not done.stderr
 
 
-def test_both_faces_of_one_team_offer_it():
-    for face in (multilift_v0.MultiliftParallelEnv, MultiliftGymnasiumEnv):
-        assert face.metadata["render_modes"] == ["rgb_array", "human"]
+def test_both_single_team_apis_offer_it():
+    for api in (multilift_v0.MultiliftParallelEnv, MultiliftGymnasiumEnv):
+        assert api.metadata["render_modes"] == ["rgb_array", "human"]
 
 
 @pytest.mark.skipif(not shutil.which("xvfb-run"), reason="no virtual display on this machine")
 def test_a_window_shows_every_step():
     command = ["xvfb-run", "-a", "-s", "-screen 0 1280x720x24", sys.executable, "-c", WATCH]
-    done = subprocess.run(command, capture_output=True, text=True, env=bare())
-    told = ["in step with the clock True", "drawn True True", "turned True", "closed True True"]
-    assert done.stdout.splitlines() == told, done.stderr
+    done = subprocess.run(command, capture_output=True, text=True, env=without_display())
+    expected = ["in step with the clock True", "drawn True True", "turned True", "closed True True"]
+    assert done.stdout.splitlines() == expected, done.stderr

@@ -1,9 +1,8 @@
 """Pictures and videos of a team, drawn off-screen without a display, and windows."""
 
 from multilift_marl.rendering.cameras import CAMERAS
-from multilift_marl.rendering.renderer import Renderer
+from multilift_marl.rendering.renderer import Renderer, VideoWriter, write_video
 from multilift_marl.rendering.scene import Stage
-from multilift_marl.rendering.video import VideoWriter, write_video
 from multilift_marl.rendering.window import Window
 
 __all__ = ["CAMERAS", "Renderer", "Stage", "VideoWriter", "Window", "write_video"]

@@ -1,4 +1,4 @@
-"""Where a picture is taken from: beside, above or behind the team, as far away as its size asks for."""
+"""Cameras beside, above or behind the team, at a distance that follows from its size."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 CAMERAS = ("side", "top", "chase")
-_ROOM = 0.35  # [m] of the payload from its target that the picture holds; beyond it the camera goes along
+_ROOM = 0.35  # [m] of the payload from its target that the picture holds; beyond it the camera follows
 _CHASE_ELEVATION = -22.0  # [deg]
 _CHASE_TURN = 1.5  # [m] of flight in which a chasing camera turns most of the way to the direction of flight
 
 
 class Camera:
-    """Looks at a team from a fixed direction, "side" or "top", or from behind, "chase".
+    """A camera in a fixed direction from the team, "side" or "top", or behind it, "chase".
 
-    The side looks at the target, and goes along with a payload that is farther away. So does the top, but where the
-    target has a path, it looks at the whole path. Chase looks at the payload along its flight.
+    "side" points at the target, and follows a payload that is farther away. "top" does the same, but shows the whole
+    path of a target that has one. "chase" points at the payload, along its direction of flight.
 
     Args:
         vec: the environments.
@@ -31,7 +31,7 @@ class Camera:
         aspect: width over height of the picture.
 
     Attributes:
-        view: the camera, as MuJoCo has it.
+        view: MuJoCo's camera.
 
     Raises:
         RenderingError: an unknown name.
@@ -40,22 +40,27 @@ class Camera:
     def __init__(self, vec: MultiliftVec, model: mujoco.MjModel, name: str, aspect: float):
         if name not in CAMERAS:
             raise RenderingError(f"unknown camera '{name}'{nearest(name, CAMERAS)}")
-        self._vec, self._name, self._aspect = vec, name, aspect
+        self._vec = vec
+        self._name = name
+        self._aspect = aspect
         self._fov = np.deg2rad(model.vis.global_.fovy)
         self.view = mujoco.MjvCamera()
         self.view.type = mujoco.mjtCamera.mjCAMERA_FREE
         self.view.azimuth, self.view.elevation = _direction(model, name)
-        self._heading, self._last = np.array([1.0, 0.0]), np.zeros(3)
+        self._heading = np.array([1.0, 0.0])
+        self._last = np.zeros(3)
         self._frame(np.zeros((0, 3)))
 
     def start(self, env: int) -> None:
-        """Look at a new episode."""
-        yaw, self._last = self._vec.task.goal.yaw[env], self._vec.world.state.payload_position[env].copy()
+        """Point at a new episode."""
+        yaw = self._vec.task.goal.yaw[env]
+        self._last = self._vec.world.state.payload_position[env].copy()
         self._heading = np.array([np.cos(yaw), np.sin(yaw)])
 
     def aim(self, env: int, path: np.ndarray) -> None:
-        """Look at the team of an environment; `path` (P, 3) is its target's, P = 0 for none."""
-        target, payload = self._vec.task.goal.position[env], self._vec.world.state.payload_position[env]
+        """Point at the team of an environment; `path` (P, 3) is its target's, P = 0 for none."""
+        target = self._vec.task.goal.position[env]
+        payload = self._vec.world.state.payload_position[env]
         if self._name == "chase":
             self._turn(payload)
             self.view.lookat[:] = payload
@@ -69,27 +74,33 @@ class Camera:
         self.view.lookat[2] += self._lift
 
     def _turn(self, payload: np.ndarray) -> None:
-        """Turn towards the direction of flight, by the way flown since the last picture."""
-        way = (payload - self._last)[:2]
-        flown = float(np.hypot(*way))
-        if flown > 0.0:
-            self._heading += (1.0 - np.exp(-flown / _CHASE_TURN)) * (way / flown - self._heading)
+        """Turn towards the direction of flight, by the distance covered since the last picture."""
+        step = (payload - self._last)[:2]
+        distance = float(np.hypot(*step))
+        if distance > 0.0:
+            self._heading += (1.0 - np.exp(-distance / _CHASE_TURN)) * (step / distance - self._heading)
         self._last = payload.copy()
         self.view.azimuth = np.rad2deg(np.arctan2(self._heading[1], self._heading[0]))
 
     def _frame(self, path: np.ndarray) -> None:
-        """Set the distance and how far above the target to look, so that the picture holds a team there.
+        """Set the distance, and how far above the target to point, so that the picture holds a team there.
 
         For the camera above, a team anywhere on `path` (P, 3).
         """
-        system, tilt = self._vec.world.system, np.deg2rad(self.view.elevation)
+        system = self._vec.world.system
+        tilt = np.deg2rad(self.view.elevation)
         drone = 2 * max(vehicle.arm for vehicle in system.vehicles)
         half_payload = system.payload_size / 2 + np.abs(system.payload_center)
         reach = max(np.hypot(*system.slots[:, :2].T).max() + drone, np.hypot(*half_payload[:2]))
-        top, bottom = max(system.slots[:, 2].max() + drone, half_payload[2]), -half_payload[2]
-        self._lift, height = (top + bottom) / 2, (top - bottom) / 2
-        across, along = abs(np.cos(tilt)), abs(np.sin(tilt))  # how much of the height, of the floor a picture shows
-        vertical, depth = height * across + reach * along, height * along + reach * across
+        top = max(system.slots[:, 2].max() + drone, half_payload[2])
+        bottom = -half_payload[2]
+        self._lift = (top + bottom) / 2
+        height = (top - bottom) / 2
+        # shares of the height and of the floor in the direction of the picture's vertical
+        across = abs(np.cos(tilt))
+        along = abs(np.sin(tilt))
+        vertical = height * across + reach * along
+        depth = height * along + reach * across
         wide, high = np.ptp(path[:, :2], axis=0) / 2 if len(path) else (0.0, 0.0)
         view = max(vertical + high + _ROOM, (reach + wide + _ROOM) / self._aspect)
         self.view.distance = depth + view / np.tan(self._fov / 2)

@@ -1,4 +1,4 @@
-"""What is drawn beside the bodies: trails, the path of the target, scenery."""
+"""What is drawn beside the bodies: trails, the path of the target, scenery; and the colours of cables."""
 
 from __future__ import annotations
 
@@ -9,8 +9,29 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _GEOM = mujoco.mjtGeom
+# sRGB of cables at 0, 1/4, ... 2 times the resting tension: light grey, blue, red, in perceptually equal steps (equal
+# distances in OKLab; B. Ottosson, 2020). Grey, blue and red differ for every kind of colour blindness.
+TENSION_COLOURS = np.array(
+    [
+        [0.66, 0.66, 0.66], [0.5133, 0.5873, 0.7225], [0.3667, 0.5071, 0.773], [0.2156, 0.415, 0.8148],
+        [0.02, 0.3, 0.85], [0.3302, 0.3316, 0.69], [0.5033, 0.3208, 0.5263], [0.6561, 0.2628, 0.3473],
+        [0.8, 0.08, 0.05],
+    ]
+)  # fmt: skip
 _TRAIL_POINTS = 40  # of one trail
 _MAX_DASHES = 300
+
+
+def tension_colours(tension: np.ndarray, resting: np.ndarray) -> np.ndarray:
+    """Return the colours (N, 3) of cables in [0, 1].
+
+    Args:
+        tension: (N,) [N].
+        resting: tension of the resting team (N,) [N]; twice that and more is red.
+    """
+    ratio = np.clip(np.nan_to_num(tension / np.maximum(resting, 1e-9)), 0.0, 2.0)
+    at = np.linspace(0.0, 2.0, len(TENSION_COLOURS))
+    return np.stack([np.interp(ratio, at, channel) for channel in TENSION_COLOURS.T], axis=1)
 
 
 def add_box(scene: mujoco.MjvScene, size: ArrayLike, position: ArrayLike, rgba: ArrayLike) -> None:
@@ -37,8 +58,12 @@ def _add(
         return None
     geom = scene.geoms[scene.ngeom]
     mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), rgba)
-    geom.objtype, geom.objid, geom.segid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1, -1  # left as they were by mjv_initGeom
-    geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, False
+    # mjv_initGeom leaves these unchanged
+    geom.objtype = mujoco.mjtObj.mjOBJ_UNKNOWN
+    geom.objid = -1
+    geom.segid = -1
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+    geom.castshadow = False
     scene.ngeom += 1
     return geom
 

@@ -1,19 +1,26 @@
-"""Pictures of a team, drawn off-screen."""
+"""Pictures of a team, drawn off-screen without a display, and videos of them."""
 
 from __future__ import annotations
 
+import ctypes.util
+import importlib
+import os
 import weakref
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
-from multilift_marl.errors import RenderingError
-from multilift_marl.rendering.opengl import free_contexts, make_contexts
+from multilift_marl.errors import RenderingError, pip_install
 from multilift_marl.rendering.scene import Stage
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
+
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in the order of preference: EGL can use a graphics card
+_INSTALL = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libosmesa6"
 
 
 class Renderer:
@@ -27,7 +34,7 @@ class Renderer:
         width, height: size of a frame [pixels].
         camera: "side", "top" or "chase"; see `cameras.Camera`.
         trail: seconds of flight that payload and drones draw behind them, as far as frames were drawn of it; 0 for
-            none. Without trails, what side and top show depends on the current state alone.
+            none. Without trails, "side" and "top" depend on the current state alone.
 
     Attributes:
         scene: what MuJoCo drew last, and from where.
@@ -39,9 +46,12 @@ class Renderer:
     def __init__(
         self, vec: MultiliftVec, width: int = 960, height: int = 540, camera: str = "side", trail: float = 0.0
     ):
-        self._vec, self._stage = vec, Stage(vec, camera, width / height, trail)
-        self.scene, size = self._stage.scene, self._stage.model.vis.global_
-        size.offwidth, size.offheight = width, height
+        self._vec = vec
+        self._stage = Stage(vec, camera, width / height, trail)
+        self.scene = self._stage.scene
+        size = self._stage.model.vis.global_
+        size.offwidth = width
+        size.offheight = height
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._gl, self._context = make_contexts(self._stage.model)
         self._free = weakref.finalize(self, free_contexts, self._gl, self._context)  # at the latest when Python exits
@@ -73,3 +83,83 @@ class Renderer:
 
     def __exit__(self, *_: Any) -> None:
         self.close()
+
+
+def make_contexts(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
+    """Return an OpenGL context, of the kind named by MUJOCO_GL or else the first one installed, and MuJoCo's in it."""
+    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if asked in ("disable", "disabled", "off", "false", "0"):
+        raise RenderingError(f"MUJOCO_GL={asked} forbids drawing; unset it")
+    installed = [kind for kind, library in _LIBRARIES.items() if ctypes.util.find_library(library)]
+    kind = asked if asked in (*_LIBRARIES, "glfw") else next(iter(installed), None)
+    if kind is None:
+        raise RenderingError(f"drawing needs OpenGL libraries that are not installed; run '{_INSTALL}'")
+    size = model.vis.global_
+    try:
+        gl = importlib.import_module(f"mujoco.{kind}").GLContext(size.offwidth, size.offheight)
+        gl.make_current()
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    except Exception as error:  # the kinds raise different errors: import, attribute, OpenGL and runtime errors
+        cure = f"unset MUJOCO_GL={asked}" if asked else f"run '{_INSTALL}'"
+        raise RenderingError(f"drawing by {kind} does not work ({' '.join(str(error).split())}); {cure}") from error
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+    return gl, context
+
+
+def free_contexts(gl: Any, context: mujoco.MjrContext) -> None:
+    """Free what `make_contexts` returned."""
+    with gl.as_current():
+        context.free()
+    gl.free()
+
+
+class VideoWriter:
+    """Writes an mp4 (H.264, yuv420p) that browsers and slides play, frame by frame.
+
+    Args:
+        path: of the file; its folder is made.
+        fps: pictures each second.
+
+    Raises:
+        RenderingError: imageio or av is not installed.
+    """
+
+    def __init__(self, path: str | Path, fps: float):
+        try:
+            import av  # noqa: F401  (imageio's plugin needs it; its own message is less clear)
+            import imageio.v3 as iio
+        except ImportError as error:
+            raise RenderingError(f"writing {path} needs {error.name}: {pip_install('train')}") from error
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        self._file = iio.imopen(path, "w", plugin="pyav")
+        self._file.init_video_stream("libx264", fps=float(fps), pixel_format="yuv420p")
+
+    def append(self, frame: np.ndarray) -> None:
+        """Add a picture (H, W, 3) uint8, the same size every time; an odd last row or column is cut off."""
+        self._file.write_frame(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._file.close()
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+
+def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Write pictures (H, W, 3) uint8, taken one at a time, as an mp4; see VideoWriter.
+
+    Raises:
+        RenderingError: imageio or av is not installed, or there are no frames.
+    """
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise RenderingError(f"there are no frames to write to {path}")
+    with VideoWriter(path, fps) as video:
+        video.append(first)
+        for frame in frames:
+            video.append(frame)

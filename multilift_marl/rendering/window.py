@@ -1,4 +1,4 @@
-"""A window that shows a flight as it goes on; needs a display."""
+"""A window that shows the simulation in step with the clock; it needs a display."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from multilift_marl.rendering.scene import Stage
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
-_WIDTH, _HEIGHT = 1280, 720
+_WIDTH = 1280
+_HEIGHT = 720
 _TRAIL = 2.0  # [s]
 _CURE = (
     "use render_mode=\"rgb_array\" for pictures, or watch in a browser by 'python -m multilift_marl.view', both of "
@@ -25,7 +26,7 @@ _CURE = (
 class Window:
     """Shows one environment in a window, in step with the clock. Drag to turn it, scroll to zoom.
 
-    Closing the window ends the show, not the flight: nothing is drawn or waited for from then on.
+    Closing the window does not end the simulation; after it nothing is drawn or waited for.
 
     Args:
         vec: the environments; they are only read.
@@ -39,12 +40,15 @@ class Window:
     """
 
     def __init__(self, vec: MultiliftVec, camera: str = "side"):
-        self.stage, self._vec = Stage(vec, camera, _WIDTH / _HEIGHT, _TRAIL), vec
+        self._vec = vec
+        self.stage = Stage(vec, camera, _WIDTH / _HEIGHT, _TRAIL)
         self._glfw, self._window = _open(vec.task.name)
         self._glfw.make_context_current(self._window)
         self._context = mujoco.MjrContext(self.stage.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         self._due = time.perf_counter()
-        self._turned, self._zoom, self._cursor = [0.0, 0.0], 1.0, (0.0, 0.0)
+        self._turned = [0.0, 0.0]
+        self._zoom = 1.0
+        self._cursor = (0.0, 0.0)
         self._glfw.set_cursor_pos_callback(self._window, self._drag)
         self._glfw.set_scroll_callback(self._window, self._scroll)
 
@@ -60,7 +64,7 @@ class Window:
         if self._glfw.window_should_close(self._window):
             return self.close()
         self._glfw.make_context_current(self._window)
-        self.stage.update(env, self._look)
+        self.stage.update(env, self._move_camera)
         width, height = self._glfw.get_framebuffer_size(self._window)
         mujoco.mjr_render(mujoco.MjrRect(0, 0, width, height), self.stage.scene, self._context)
         self._glfw.swap_buffers(self._window)
@@ -76,8 +80,8 @@ class Window:
             self._glfw.destroy_window(self._window)
             self._window = None
 
-    def _look(self, camera: mujoco.MjvCamera) -> None:
-        """Turn and zoom as the mouse said."""
+    def _move_camera(self, camera: mujoco.MjvCamera) -> None:
+        """Turn and zoom by what the mouse has done."""
         camera.azimuth += self._turned[0]
         camera.elevation = min(max(camera.elevation + self._turned[1], -90.0), 20.0)
         camera.distance *= self._zoom

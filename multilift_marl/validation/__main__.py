@@ -4,25 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from multilift_marl.errors import nearest, pip_install
-from multilift_marl.validation import (
-    air,
-    bodies,
-    cables,
-    conservation,
-    flight,
-    momentum,
-    release,
-    symmetry,
-    team_cables,
-)
-from multilift_marl.validation.document import describe, format_table, write_document
-from multilift_marl.validation.draw import draw
+from multilift_marl.validation import air, bodies, cables, conservation, flight, symmetry
 from multilift_marl.validation.experiment import Experiment, Result
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -30,17 +19,17 @@ EXPERIMENTS: dict[str, Experiment] = {
     "six_cables": cables.six_cables,
     "stiff_cables": cables.stiff_cables,
     "integrators": cables.integrators,
-    "slack_taut": team_cables.slack_taut,
-    "static_teams": team_cables.static_teams,
+    "slack_taut": cables.slack_taut,
+    "static_teams": cables.static_teams,
     "swing": bodies.swing,
     "free_fall": bodies.free_fall,
     "spin": bodies.spin,
     "ground": bodies.ground,
     "motor_lag": bodies.motor_lag,
-    "momentum": momentum.momentum,
+    "momentum": conservation.momentum,
     "conservation": conservation.conservation,
     "symmetry": symmetry.symmetry,
-    "release": release.release,
+    "release": bodies.release,
     "turbulence": air.turbulence_spectra,
     "gust": air.gust,
     "wash": air.wash,
@@ -48,6 +37,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "flight": flight.flight,
     "flight_in_wind": flight.flight_in_wind,
 }
+MARKER = "<!-- results -->\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,9 +57,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: there is no {given.document}; give a Markdown file that exists", file=sys.stderr)
         return 2
     try:
+        import matplotlib  # noqa: F401  (the experiments draw with it)
         from tqdm import tqdm
-    except ModuleNotFoundError:
-        print(f"error: tqdm is missing; {pip_install('train')}", file=sys.stderr)
+    except ModuleNotFoundError as error:
+        print(f"error: {error.name} is missing; {pip_install('train')}", file=sys.stderr)
         return 2
     results: dict[str, Result] = {}
     interrupted = False
@@ -88,20 +79,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"interrupted: {len(results)} experiments were complete", file=sys.stderr)
         return 130
     if given.document is not None:
-        write_document(given.document, given.out)
+        write_document(given.document, results, given.out)
     return 1 if failed else 0
 
 
 def write(results: dict[str, Result], out: Path) -> list[dict[str, Any]]:
-    """Write validation.json, experiments.json and the plots into a folder, and return the rows."""
+    """Write validation.json and the plots into a folder, and return the rows."""
     out.mkdir(parents=True, exist_ok=True)
     rows = [row.as_dict() for result in results.values() for row in result.rows]
-    index = [describe(name, EXPERIMENTS[name], result) for name, result in results.items()]
-    for file, content in (("validation.json", rows), ("experiments.json", index)):
-        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
-        (out / file).write_text(text + "\n", encoding="utf-8")
-    draw([plot for result in results.values() for plot in result.plots], out)
+    text = json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False)
+    (out / "validation.json").write_text(text + "\n", encoding="utf-8")
+    for result in results.values():
+        for plot in result.plots:
+            plot.save(out)
     return rows
+
+
+def format_table(rows: list[dict[str, Any]]) -> str:
+    """Return the rows of validation.json as a Markdown table."""
+    lines = ["| experiment | quantity | theory | simulated | error | limit | pass |", "|---|---|---|---|---|---|---|"]
+    for row in rows:
+        numbers = ("-" if row[key] is None else f"{row[key]:.6g}" for key in ("theory", "simulated", "error", "limit"))
+        cells = [row["experiment"], row["quantity"], *numbers, "yes" if row["pass"] else "NO"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def write_document(path: Path, results: dict[str, Result], out: Path) -> None:
+    """Replace everything after the line "<!-- results -->" of a Markdown file by tables and pictures.
+
+    Pictures are copied from the folder `out` to images/<name of the file> beside it.
+    """
+    images = path.parent / "images" / path.stem
+    images.mkdir(parents=True, exist_ok=True)
+    passed = [row.passed for result in results.values() for row in result.rows]
+    parts = [f"{sum(passed)} of {len(passed)} rows pass."]
+    for name, result in results.items():
+        about = " ".join((EXPERIMENTS[name].__doc__ or "").split("\n\n")[0].split())
+        command = f"python -m multilift_marl.validation --only {name}"
+        parts += [f"### {name}", about, f"```\n{command}\n```", format_table([row.as_dict() for row in result.rows])]
+        for plot in result.plots:
+            shutil.copyfile(out / f"{plot.name}.png", images / f"{plot.name}.png")
+            parts.append(f"![{plot.caption}](images/{path.stem}/{plot.name}.png)\\\n*{plot.caption}*")
+    head = path.read_text(encoding="utf-8").partition(MARKER)[0]
+    path.write_text(head + MARKER + "\n" + "\n\n".join(parts) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

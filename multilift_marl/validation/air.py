@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.config.load import load_config
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import AIR_DENSITY, GRAVITY
 from multilift_marl.sim.air import GROWTH, SPREADING, ground_gain, make_air, wash_at
 from multilift_marl.sim.gusts import advance_turbulence, dryden, start_turbulence, turbulence
 from multilift_marl.sim.state import Air
 from multilift_marl.sim.world import World
-from multilift_marl.validation.experiment import Curve, Plot, Result, Row, relative
+from multilift_marl.validation.experiment import Plot, Result, Row, make_config, ms
 
 WIND = 5.0  # [m/s] along x; also the airspeed
 COMPONENTS = ("u", "v", "w")
@@ -32,8 +31,7 @@ def sample_turbulence(height: float, timestep: float, steps: int, series: int, e
         every: time steps between those kept.
     """
     air = Air.zeros(series, 0)
-    seeds = np.random.SeedSequence(1).generate_state(series, np.uint64)
-    air.generator[:] = seeds
+    air.generator[:] = np.random.SeedSequence(1).generate_state(series, np.uint64)
     out = np.zeros((series, steps, 3))
     _sample(air, float(height), float(timestep), every, out)
     return out
@@ -50,21 +48,25 @@ def _sample(air, height, timestep, every, out):
                 advance_turbulence(e, air, timestep * WIND / long, timestep * WIND / high)
 
 
+def _scale(component: str, height: float) -> tuple[float, float]:
+    """Return intensity [m/s] and time scale L/V [s] of a component."""
+    across, upward, long, high = dryden(height, WIND)
+    return (upward, high / WIND) if component == "w" else (across, long / WIND)
+
+
 def correlation(component: str, height: float, lag: float | np.ndarray) -> np.ndarray:
     """Return the closed form of a component's autocorrelation [m²/s²] at a time lag [s]: that of its spectrum."""
-    across, upward, long, high = dryden(height, WIND)
-    sigma, length = (upward, high) if component == "w" else (across, long)
-    a = np.abs(lag) * WIND / length
+    sigma, seconds = _scale(component, height)
+    a = np.abs(lag) / seconds
     return sigma**2 * np.exp(-a) * (1.0 if component == "u" else 1 - a / 2)
 
 
 def spectrum(component: str, height: float, frequency: np.ndarray) -> np.ndarray:
     """Return MIL-F-8785C's one-sided spectral density of a component [m²/s² per Hz] at a frequency [Hz]."""
-    across, upward, long, high = dryden(height, WIND)
-    sigma, length = (upward, high) if component == "w" else (across, long)
-    x = (2 * np.pi * frequency * length / WIND) ** 2
+    sigma, seconds = _scale(component, height)
+    x = (2 * np.pi * frequency * seconds) ** 2
     shape = 2 / (1 + x) if component == "u" else (1 + 3 * x) / (1 + x) ** 2
-    return 2 * sigma**2 * length / WIND * shape
+    return 2 * sigma**2 * seconds * shape
 
 
 def turbulence_spectra(fast: bool) -> Result:
@@ -79,53 +81,60 @@ def turbulence_spectra(fast: bool) -> Result:
                     found = float((samples[:, 1 if lag == 0.0 else 0, i] * samples[:, 1, i]).mean())
                     error = abs(found - theory) / float(correlation(name, height, 0.0))
                     quantity = f"autocorrelation of {name} at {lag:g} s [m²/s²], error over the variance"
-                    label = f"turbulence, {height:g} m, {1e3 * timestep:g} ms"
+                    label = f"turbulence, {height:g} m, {ms(timestep)}"
                     result.rows.append(Row(label, quantity, theory, found, error, 0.1 if fast else 0.045))
-        result.plots.append(_spectrum_rows(height, fast, result.rows))
+        _add_spectra(result, height, fast)
     series = sample_turbulence(3.0, 0.004, 5000, 1)[0]
     plot = Plot("turbulence", "turbulence at 3 m in a wind of 5 m/s", "time [s]", "velocity [m/s]")
-    plot.curves = [Curve(name, 0.004 * np.arange(len(series)), series[:, i]) for i, name in enumerate(COMPONENTS)]
+    for i, name in enumerate(COMPONENTS):
+        plot.add(name, 0.004 * np.arange(len(series)), series[:, i])
     result.plots.append(plot)
     return result
 
 
-def _spectrum_rows(height: float, fast: bool, rows: list[Row]) -> Plot:
-    """Add rows for the spectra at a height, averaged over third-octave bands, and return their plot."""
-    every, timestep, steps = 5, 0.004, 8192
+def _add_spectra(result: Result, height: float, fast: bool) -> None:
+    """Add the spectra at a height, averaged over third-octave bands, and their plot."""
+    every = 5
+    timestep = 0.004
+    steps = 8192
     samples = sample_turbulence(height, timestep, steps, 40 if fast else 200, every)
-    window, interval = np.hanning(steps)[:, None], every * timestep
+    window = np.hanning(steps)[:, None]
+    interval = every * timestep
     power = np.abs(np.fft.rfft(samples * window, axis=1)) ** 2
     density = 2 * interval * power.mean(axis=0) / (window**2).sum()
     frequency = np.fft.rfftfreq(steps, interval)
     edges = np.geomspace(0.02, 5.0, 25)
     band = np.digitize(frequency, edges)
-    centre = np.array([frequency[band == i].mean() for i in range(1, len(edges))])
-    plot = Plot(f"turbulence_spectrum_{height:g}_m", f"turbulence at {height:g} m in a wind of 5 m/s", "", "", log=True)
-    plot.x_label, plot.y_label = "frequency [Hz]", "spectral density [m²/s² per Hz]"
-    rate = 1 / interval
+
+    def average(values: np.ndarray) -> np.ndarray:
+        return np.array([values[band == j].mean() for j in range(1, len(edges))])
+
+    title = f"turbulence at {height:g} m in a wind of 5 m/s"
+    plot = Plot(
+        f"turbulence_spectrum_{height:g}_m", title, "frequency [Hz]", "spectral density [m²/s² per Hz]", log="xy"
+    )
     for i, name in enumerate(COMPONENTS):
-        aliases = (spectrum(name, height, np.abs(frequency + k * rate)) for k in range(-20, 21))
-        folded = sum(aliases, np.zeros_like(frequency))  # as sampled
-        found, theory = (
-            np.array([values[band == j].mean() for j in range(1, len(edges))]) for values in (density[:, i], folded)
-        )
+        aliases = (spectrum(name, height, np.abs(frequency + k / interval)) for k in range(-20, 21))
+        theory = average(sum(aliases, np.zeros_like(frequency)))  # as sampled
+        found = average(density[:, i])
         error = float(np.abs(np.log(found / theory)).max())
         quantity = f"spectral density of {name}, 0.02-5 Hz, largest |log| of the ratio"
-        rows.append(Row(f"turbulence, {height:g} m", quantity, 0.0, error, error, 0.4 if fast else 0.2))
-        plot.curves.append(Curve(name, centre, found))
-        label = "MIL-F-8785C, as sampled" if i == 0 else "_"
-        plot.curves.append(Curve(label, centre, theory, theory=True))
-    return plot
+        result.check(f"turbulence, {height:g} m", quantity, error, 0.4 if fast else 0.2)
+        plot.add(name, average(frequency), found)
+        plot.add("" if i else "MIL-F-8785C, as sampled", average(frequency), theory, theory=True)
+    result.plots.append(plot)
 
 
-def _system(values: dict[str, Any]) -> System:
-    return load_config("hover", {"env.num_drones": 1} | values).system
+def _system(**values: Any) -> System:
+    """Return a team of one drone on a long cable; values as wind__wash."""
+    return make_config(1, cable__length=20.0, **values).system
 
 
 def _apart(system: System) -> World:
     """Return a world of one drone at 102 m and its payload at 100 m on a long, slack cable, at rest."""
     world = World(system, 1, 1)
-    world.state.payload_position[:], world.state.drone_position[:] = [0, 0, 100], [0, 0, 102]
+    world.state.payload_position[:] = [0, 0, 100]
+    world.state.drone_position[:] = [0, 0, 102]
     world.state.drone_rotation[:] = np.eye(3)
     world.state.rotor_speed[:] = np.sqrt(system.vehicle.mass * GRAVITY / 4 / system.vehicle.thrust_coefficient)
     world.load(np.ones(1, bool))
@@ -134,111 +143,110 @@ def _apart(system: System) -> World:
 
 def gust(fast: bool) -> Result:
     """A "1 - cosine" gust: its profile, and what it does to a drone with linear drag."""
-    settings = {"wind.gust": [2.0, -1.0, 0.5], "wind.gust_start": 0.2, "wind.gust_rise": 0.5, "wind.gust_hold": 0.3}
-    system = _system({"cable.length": 20.0} | settings)
-    world, vehicle = _apart(system), system.vehicle
-    amplitude, h, steps = np.array([2.0, -1.0, 0.5]), system.timestep, round(2.0 / system.timestep)
-    t = h * np.arange(steps)
-    phase = np.clip(t - 0.2, 0, 0.5) - np.clip(t - 0.2 - 0.5 - 0.3, 0, 0.5)
-    share = 0.5 - 0.5 * np.cos(np.pi * phase / 0.5)
+    amplitude = np.array([2.0, -1.0, 0.5])
+    start = 0.2
+    rise = 0.5
+    hold = 0.3
+    seconds = 2.0
+    system = _system(wind__gust=amplitude.tolist(), wind__gust_start=start, wind__gust_rise=rise, wind__gust_hold=hold)
+    world = _apart(system)
+    vehicle = system.vehicle
+    h = system.timestep
+
+    def profile(t: np.ndarray) -> np.ndarray:
+        phase = np.clip(t - start, 0, rise) - np.clip(t - start - rise - hold, 0, rise)
+        return 0.5 - 0.5 * np.cos(np.pi * phase / rise)
+
+    t = h * np.arange(round(seconds / h))
     thrust = np.full((1, 1, 4), vehicle.mass * GRAVITY / 4)
-    found, speed = [], []
-    for _ in range(steps):
+    found = []
+    speed = []
+    for _ in t:
         world.step(thrust)
         found.append(world.air.gust[0].copy())
-        speed.append(world.state.drone_velocity[0, 0, 0])
-    error = float(np.abs(np.array(found) - share[:, None] * amplitude).max())
-    result = Result([Row("gust", "largest error of its profile [m/s]", 0.0, error, error, 1e-12)])
+        speed.append(float(world.state.drone_velocity[0, 0, 0]))
+    error = float(np.abs(np.array(found) - profile(t)[:, None] * amplitude).max())
+    result = Result()
+    result.check("gust", "largest error of its profile [m/s]", error, 1e-12)
     rate = vehicle.drag[0] / vehicle.mass
-    fine = np.linspace(0, 2.0, 200001)
-    phase = np.clip(fine - 0.2, 0, 0.5) - np.clip(fine - 1.0, 0, 0.5)
-    blown = amplitude[0] * (0.5 - 0.5 * np.cos(np.pi * phase / 0.5))
-    theory = rate * np.trapezoid(blown * np.exp(-rate * (2.0 - fine)), fine)
-    quantity = "speed of a drone after 2 s [m/s], relative error"
-    result.rows.append(Row("gust", quantity, theory, speed[-1], relative(speed[-1], theory), 0.005))
+    fine = np.linspace(0, seconds, 200001)
+    theory = rate * float(np.trapezoid(amplitude[0] * profile(fine) * np.exp(-rate * (seconds - fine)), fine))
+    result.compare("gust", "speed of a drone after 2 s [m/s], relative error", theory, speed[-1], 0.005)
     plot = Plot("gust", "gust and what it does to a drone, along x", "time [s]", "velocity [m/s]")
-    plot.curves = [Curve("air", t, np.array(found)[:, 0]), Curve("drone", t + h, np.array(speed))]
-    plot.curves.append(Curve("1 - cosine", t, share * amplitude[0], theory=True))
+    plot.add("air", t, np.array(found)[:, 0])
+    plot.add("drone", t + h, np.array(speed))
+    plot.add("1 - cosine", t, profile(t) * amplitude[0], theory=True)
     result.plots.append(plot)
     return result
 
 
 def wash(fast: bool) -> Result:
     """The wash below a hovering drone: momentum theory at the rotors, momentum at any distance, nothing above."""
-    system = _system({"cable.length": 20.0, "wind.wash": True})
-    world, c, vehicle = _apart(system), make_air(system), system.vehicle
-    thrust, result = vehicle.mass * GRAVITY, Result()
+    system = _system(wind__wash=True)
+    world = _apart(system)
+    c = make_air(system)
+    vehicle = system.vehicle
+    thrust = vehicle.mass * GRAVITY
+    result = Result()
 
-    def speed(x: float, depth: float) -> float:
-        return -wash_at(0, (x, 0.0, 102.0 - depth), 0.0, world.state, c)[2]
+    def velocity(x: float, y: float, depth: float) -> np.ndarray:
+        return np.array(wash_at(0, (x, y, 102.0 - depth), 0.0, world.state, c))
 
-    rotor = vehicle.rotor_positions[0]
-    induced = np.sqrt(thrust / 4 / (2 * AIR_DENSITY * np.pi * vehicle.rotor_radius**2))
-    below = wash_at(0, (rotor[0], rotor[1], 102.0 - 1e-6), 0.0, world.state, c)
+    x, y = vehicle.rotor_positions[0][:2]
+    induced = float(np.sqrt(thrust / 4 / (2 * AIR_DENSITY * np.pi * vehicle.rotor_radius**2)))
     quantity = "under a rotor, 2 v_i of momentum theory [m/s], relative error"
-    result.rows.append(Row("wash", quantity, 2 * induced, -below[2], relative(-below[2], 2 * induced), 1e-4))
-    above = wash_at(0, (rotor[0], rotor[1], 102.5), 0.0, world.state, c)
-    size = float(np.linalg.norm(above))
-    result.rows.append(Row("wash", "speed above the rotors [m/s]", 0.0, size, size, 0.0))
+    result.compare("wash", quantity, 2 * induced, -velocity(x, y, 1e-6)[2], 1e-4)
+    result.check("wash", "speed above the rotors [m/s]", float(np.linalg.norm(velocity(x, y, -0.5))), 0.0)
     for depth in (0.1, 0.5, 2.0, 8.0):
         half = vehicle.arm + 5 * max(vehicle.rotor_radius, SPREADING * depth)
         grid = np.linspace(-half, half, 101)
-        squares = [wash_at(0, (x, y, 102 - depth), 0.0, world.state, c)[2] ** 2 for x in grid for y in grid]
-        flux = AIR_DENSITY * sum(squares) * (grid[1] - grid[0]) ** 2
-        quantity = f"momentum flux {depth:g} m below = thrust [N], relative error"
-        result.rows.append(Row("wash", quantity, thrust, flux, relative(flux, thrust), 2e-3))
-    far = np.sqrt(thrust / (np.pi * AIR_DENSITY)) / (GROWTH * 20.0)
+        flux = AIR_DENSITY * sum(velocity(x, y, depth)[2] ** 2 for x in grid for y in grid) * (grid[1] - grid[0]) ** 2
+        result.compare("wash", f"momentum flux {depth:g} m below = thrust [N], relative error", thrust, flux, 2e-3)
+    far = float(np.sqrt(thrust / (np.pi * AIR_DENSITY)) / (GROWTH * 20.0))
     quantity = "20 m below, one jet √(T/πρ)/b [m/s], relative error"
-    result.rows.append(Row("wash", quantity, far, speed(0.0, 20.0), relative(speed(0.0, 20.0), far), 0.01))
+    result.compare("wash", quantity, far, -velocity(0.0, 0.0, 20.0)[2], 0.01)
     world.step(np.full((1, 1, 4), thrust / 4))
     square = (2.0 * GROWTH) ** 2 + system.payload_drag_area / np.pi  # of a Gaussian jet, averaged over the payload
     squared = thrust / (AIR_DENSITY * np.pi * square) * np.exp(-(vehicle.arm**2) / square)
     pushed = 0.5 * AIR_DENSITY * system.payload_drag_area * squared / system.payload_mass
     found = -world.state.payload_velocity[0, 2] / system.timestep - GRAVITY
-    quantity = "acceleration of a payload 2 m below [m/s²], relative error"
-    result.rows.append(Row("wash", quantity, pushed, found, relative(found, pushed), 1e-3))
+    result.compare("wash", "acceleration of a payload 2 m below [m/s²], relative error", pushed, found, 1e-3)
+    title = "wash of a falcon that carries itself, through two opposite rotors"
+    plot = Plot("wash", title, "distance from the middle [m]", "down [m/s]")
     across = np.linspace(-0.8, 0.8, 401)
-    plot = Plot("wash", "wash of a falcon that carries itself, through two opposite rotors", "", "down [m/s]")
-    plot.x_label = "distance from the middle [m]"
     for depth in (0.3, 1.0, 2.0, 4.0):
-        line = [wash_at(0, (x / 2**0.5, x / 2**0.5, 102 - depth), 0.0, world.state, c)[2] for x in across]
-        plot.curves.append(Curve(f"{depth:g} m below", across, -np.array(line)))
+        line = [-velocity(x / 2**0.5, x / 2**0.5, depth)[2] for x in across]
+        plot.add(f"{depth:g} m below", across, np.array(line))
     result.plots.append(plot)
     return result
 
 
 def ground_effect(fast: bool) -> Result:
     """Thrust near the ground, from a drone's acceleration at constant rotor speed."""
-    system = _system({"cable.length": 20.0, "wind.ground_effect": True})
-    vehicle, result, radius = system.vehicle, Result(), system.vehicle.rotor_radius
+    system = _system(wind__ground_effect=True)
+    result = Result()
+    vehicle, radius = system.vehicle, system.vehicle.rotor_radius
     squares = ((vehicle.rotor_positions - vehicle.rotor_positions[0]) ** 2).sum(axis=1)
-    thrust = vehicle.mass * GRAVITY
-
-    def theory(z: float) -> float:
-        return float(1 / (1 - radius**2 / 2 * (z / (squares + 4 * z**2) ** 1.5).sum()))
-
     for ratio in (1.0, 2.0, 4.0, 8.0, 1000.0):
-        world, height = _apart(system), ratio * radius
+        world = _apart(system)
+        height = ratio * radius
         world.state.payload_position[0] = [3.0, 0, 0.5]
         world.state.drone_position[0, 0] = [0, 0, height]
         world.load(np.ones(1, bool))
-        world.step(np.full((1, 1, 4), thrust / 4))
+        world.step(np.full((1, 1, 4), vehicle.mass * GRAVITY / 4))
         gain = 1 + world.state.drone_velocity[0, 0, 2] / system.timestep / GRAVITY
-        expected = theory(height)
+        expected = float(1 / (1 - radius**2 / 2 * (height / (squares + 4 * height**2) ** 1.5).sum()))
         quantity = f"thrust over thrust far away at {ratio:g} rotor radii, relative error"
-        result.rows.append(Row("ground effect", quantity, expected, gain, relative(gain, expected), 1e-6))
-    single = 1 / (1 - (1 / 4) ** 2)
+        result.compare("ground effect", quantity, expected, gain, 1e-6)
     lone = ground_gain(radius, 0, make_air(replace(system, vehicles=(replace(vehicle, arm=1e3),))))
     quantity = "one rotor alone at one radius, Cheeseman and Bennett, relative error"
-    result.rows.append(Row("ground effect", quantity, single, lone, relative(lone, single), 1e-9))
+    result.compare("ground effect", quantity, 1 / (1 - (1 / 4) ** 2), lone, 1e-9)
     heights = np.linspace(0.5, 8, 200)
     c = make_air(system)
-    plot = Plot(
-        "ground_effect", "thrust of a falcon near the ground", "height over rotor radius", "thrust over far thrust"
-    )
-    plot.curves = [
-        Curve("four rotors", heights, np.array([ground_gain(z * radius, 0, c) for z in heights])),
-        Curve("one rotor, Cheeseman and Bennett 1955", heights, 1 / (1 - (1 / (4 * heights)) ** 2), theory=True),
-    ]
+    title = "thrust of a falcon near the ground"
+    plot = Plot("ground_effect", title, "height over rotor radius", "thrust over far thrust")
+    plot.add("four rotors", heights, np.array([ground_gain(z * radius, 0, c) for z in heights]))
+    single = 1 / (1 - (1 / (4 * heights)) ** 2)
+    plot.add("one rotor, Cheeseman and Bennett 1955", heights, single, theory=True)
     result.plots.append(plot)
     return result

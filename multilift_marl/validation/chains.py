@@ -59,9 +59,10 @@ def tested_stiffness(world: World) -> float:
     """Return the stiffness [N/m] of the first cable of a load at rest: its tensions over its stretches.
 
     The tensions are what statics says: the load's share below, one node's weight more with every segment, and the
-    horizontal pull that goes with the direction of the lowest link.
+    horizontal force that goes with the direction of the lowest link.
     """
-    system, links = world.system, np.diff(world.cable_points(0, 0), axis=0)
+    system = world.system
+    links = np.diff(world.cable_points(0, 0), axis=0)
     n = len(links)
     size = np.linalg.norm(links, axis=1)
     lowest = links[0] / size[0]
@@ -103,7 +104,9 @@ def straight_chain(mass: float, stiffness: float, damping: float, gravity: float
     flow = np.block(
         [[np.zeros((n, n)), np.eye(n)], [-n * stiffness * springs * inverse, -n * damping * springs * inverse]]
     )
-    propagator, state, depth = exponential(flow * t[0]), np.r_[-rest, np.zeros(n)], []
+    propagator = exponential(flow * t[0])
+    state = np.r_[-rest, np.zeros(n)]
+    depth = []
     for _ in t:
         state = propagator @ state
         depth.append(state[n - 1] + rest[-1])
@@ -125,20 +128,25 @@ def inclined_chains(
         t: times (T,) [s], multiples of `step`.
         step: of the midpoint rule [s]; its error is of second order in it.
     """
-    n, link = SEGMENTS, 1.0 / SEGMENTS
+    n = SEGMENTS
+    link = 1.0 / SEGMENTS
     along = np.array([np.sin(angle), np.cos(angle)])
     place = link * np.arange(n)[:, None] * along  # the load and the n - 1 free nodes; horizontal, vertical
-    velocity, top = np.zeros_like(place), along
+    velocity = np.zeros_like(place)
+    top = along
     masses = np.full((n, 2), ROPE / (n - 1))
     masses[0] = mass / cables
     free = np.ones(2 * n, bool)
     free[0] = False  # by symmetry the load moves vertically
-    times, depth, kept = np.round(t / step).astype(int), [], 0
+    times = np.round(t / step).astype(int)
+    depth = []
+    kept = 0
     for i in range(1, times[-1] + 1):
         change = np.zeros_like(velocity)
         for _ in range(20):  # Newton's method for the change of velocity
-            middle, speed = place + 0.5 * step * (velocity + 0.5 * change), velocity + 0.5 * change
-            force, by_place, by_speed = _pulls(middle, speed, top, link, n * stiffness, n * damping)
+            middle = place + 0.5 * step * (velocity + 0.5 * change)
+            speed = velocity + 0.5 * change
+            force, by_place, by_speed = _cable_forces(middle, speed, top, link, n * stiffness, n * damping)
             gap = (masses * change - step * (force - masses * [0, GRAVITY])).ravel()
             slope = np.diag(masses.ravel()) + step * (0.25 * step * by_place + 0.5 * by_speed)
             correction = np.zeros(2 * n)
@@ -154,7 +162,7 @@ def inclined_chains(
     return np.array(depth)
 
 
-def _pulls(
+def _cable_forces(
     place: np.ndarray, velocity: np.ndarray, top: np.ndarray, length: float, stiffness: float, damping: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return forces (n, 2) of eqs 14-15 on the nodes, and minus their derivatives by place and velocity (2n, 2n)."""

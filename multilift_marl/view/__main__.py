@@ -20,12 +20,12 @@ _USAGE = f"""Watch a team in the browser, at an address of this machine alone ({
   python -m multilift_marl.view task=hover run=hover [key=value ...]
 
   task    a configuration's name or path                      (the run's own, or hover)
-  config  a rig or other configuration for that task; its vehicles, payload, cables and control count, see
+  config  a rig or other configuration for that task; its vehicles, payload, cables and control are used, see
           python train.py --help
   run     a run folder, "latest", or the name of a shipped policy ("hover"); none: scripts only
-  policy  which flies first: run, a script, module:Class, an exported policy (.onnx), a checkpoint (.pt)
+  policy  which controls first: run, a script, module:Class, an exported policy (.onnx), a checkpoint (.pt)
                                                               (run, or formation)
-  import  a module of one's own with tasks or vehicles (docs/plugins.md)
+  import  a module of yours with tasks or vehicles (docs/plugins.md)
   seed    evaluation seed: the episodes are those of evaluate.py        (1000)
   port    of the address; 0 for any free one                  (8080)
 
@@ -51,7 +51,7 @@ def _view(values: dict[str, Any]) -> int:
 
 
 def make_session(values: dict[str, Any]) -> tuple[Session, int]:
-    """Return the session that key=value arguments ask for, and the port.
+    """Return the session and the port of key=value arguments.
 
     Raises:
         ConfigError, CheckpointError: a wrong value, or there is no such task, run or policy.
@@ -70,7 +70,8 @@ def make_session(values: dict[str, Any]) -> tuple[Session, int]:
 
 
 def _find_config(own: dict[str, Any], learned: dict[str, NamedPolicy], overrides: dict[str, Any]) -> Config:
-    task, config = own["task"], own["config"]
+    task = own["task"]
+    config = own["config"]
     if config is not None:
         return load_config(str(config), overrides if task is None else {**overrides, "task": task})
     trained = [policy.config for policy in learned.values() if policy.config is not None]

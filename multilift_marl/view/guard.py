@@ -1,4 +1,4 @@
-"""Who may open the page: who holds the token of its printed address, from this machine's own names alone."""
+"""Access control of the page: only requests to this machine's own names, with the token of the printed address."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 class Guard:
-    """Answers requests of those who may not open the page.
+    """Refuses requests that do not come from the page.
 
-    A page of another site can make a browser send requests here, but it knows no token. Nor does its name, should it
-    stand for this machine, pass for one of this machine's own (DNS rebinding).
+    A page of another site can make a browser send requests here, but it has no token. A name of another site that
+    resolves to this machine (DNS rebinding) is refused too.
 
     Attributes:
         token: of the address; the browser keeps it as a cookie, since the page's websocket comes without it.
@@ -32,13 +32,13 @@ class Guard:
         if len(hosts) != 1 or _hostname(f"//{hosts[0]}") not in _LOOPBACK:
             return "the viewer answers to 127.0.0.1 and localhost alone"
         if origins not in ([], [f"http://{hosts[0]}"]):
-            return "the viewer takes no orders from other sites' pages"
+            return "the viewer refuses requests of other sites' pages"
         if not any(hmac.compare_digest(given.encode(), self.token.encode()) for given in self._tokens(request)):
             return "open the whole address that the viewer has printed, with its token"
         return ""
 
     def cookie(self, request: Any) -> str:
-        """Return the cookie that holds the token; its name has the port, which cookies do not tell apart."""
+        """Return the cookie that holds the token; its name has the port, as cookies are shared between ports."""
         return f"{_cookie_name(request)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
     def _tokens(self, request: Any) -> Iterator[str]:
@@ -52,9 +52,9 @@ class Guard:
 
 @contextmanager
 def guarded_servers(guard: Guard) -> Iterator[None]:
-    """Have the websocket servers that are started here ask `guard` first.
+    """Let the websocket servers that are started in this context ask `guard` first.
 
-    viser hands no such check on to the library that serves it, so that library's function is replaced for a moment.
+    viser has no option for such a check, so the function of the library that serves it is replaced for a moment.
     """
     from websockets.asyncio import server
     from websockets.datastructures import Headers
@@ -64,8 +64,8 @@ def guarded_servers(guard: Guard) -> Iterator[None]:
 
     def serve_guarded(*arguments: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
-            if told := guard.refuse(request):
-                body = f"{told}\n".encode()
+            if reason := guard.refuse(request):
+                body = f"{reason}\n".encode()
                 headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
                 return Response(http.HTTPStatus.FORBIDDEN.value, "Forbidden", headers, body)
             answer = process_request(connection, request)

@@ -20,22 +20,22 @@ HOST = "127.0.0.1"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _FRAME = 1 / 25  # [s]
 _TRAIL = 2.0  # [s]
-_GAMMA = 2.2  # browsers take the colours of many meshes at once for light, not for sRGB
+_GAMMA = 2.2  # browsers take the colours of batched meshes for linear light, not for sRGB
 _AMBIENT = 1.5  # light from all around
 _GEOM = mujoco.mjtGeom
 _SLOTS = 64  # geoms of one shape that are sent at first; doubled as needed
 
 
 class Page:
-    """Serves a session on 127.0.0.1, to who has its address.
+    """Serves a session on 127.0.0.1, to those who have its address.
 
     Args:
-        session: what is watched.
+        session: the simulation to watch.
         port: on which; 0 for any free one.
 
     Attributes:
         port: on which it is served.
-        address: to be opened in a browser; its token is known to who started the viewer alone.
+        address: to be opened in a browser, with a token that is printed only here.
         controls: buttons and fields by name, viser's handles.
 
     Raises:
@@ -48,7 +48,8 @@ class Page:
             import viser
         except ImportError as error:
             raise RenderingError(f"the browser viewer needs {error.name}: {pip_install('view')}") from error
-        self._session, self._shapes = session, trimesh.creation
+        self._session = session
+        self._shapes = trimesh.creation
         self._stage = Stage(session.vec, trail=_TRAIL)
         _check_port(port)
         guard = Guard()
@@ -60,14 +61,15 @@ class Page:
             self.close()
             raise _taken(port)
         self._batches: dict[tuple[int, int, bool], _Batch] = {}
-        self._follow, self._middle = True, session.vec.world.state.payload_position[0].copy()
+        self._follow = True
+        self._middle = session.vec.world.state.payload_position[0].copy()
         self._stage.update(0)
         self._build()
         self.draw()
         self.controls = self._add_controls()
 
     def run(self) -> None:
-        """Fly and show until interrupted."""
+        """Simulate and show until interrupted."""
         last = time.perf_counter()
         while True:
             now = time.perf_counter()
@@ -102,7 +104,8 @@ class Page:
             self._server.stop()
 
     def _build(self) -> None:
-        server, camera = self._server, self._stage.camera.view
+        server = self._server
+        camera = self._stage.camera.view
         server.gui.configure_theme(show_share_button=False, show_logo=False)
         server.scene.configure_environment_map(None)  # its reflections wash the colours out
         server.scene.add_light_ambient("/light", intensity=_AMBIENT)
@@ -118,7 +121,8 @@ class Page:
 
     def _add_controls(self) -> dict[str, Any]:
         """Add buttons and fields, and tie them to the session."""
-        gui, session = self._server.gui, self._session
+        gui = self._server.gui
+        session = self._session
         weight = session.vec.world.system.payload_mass * 9.81
         made: dict[str, Any] = {"status": gui.add_markdown(session.status())}
         made["pause"] = gui.add_button("Pause")
@@ -142,8 +146,8 @@ class Page:
         return made
 
     def press(self, name: str) -> None:
-        """Do what the control `name` stands for, with the values that the fields have now."""
-        session, value = self._session, lambda field: self.controls[field].value
+        """Execute the control `name` with the present values of the fields."""
+        session = self._session
         if name == "pause":
             session.paused = not session.paused
             self.controls["pause"].label = "Go on" if session.paused else "Pause"
@@ -154,19 +158,25 @@ class Page:
         elif name == "next":
             session.skip()
         elif name == "push":
-            session.push(value("heading"), value("elevation"), value("force"))
+            session.push(self._value("heading"), self._value("elevation"), self._value("force"))
         elif name == "speed":
-            session.speed = float(value("speed"))
+            session.speed = float(self._value("speed"))
         elif name == "policy":
-            session.choose(value("policy"))
+            session.choose(self._value("policy"))
         else:
-            self._follow = value("follow")
+            self._follow = self._value("follow")
+
+    def _value(self, field: str) -> Any:
+        return self.controls[field].value
 
     def _mesh(self, kind: int, dataid: int) -> tuple[np.ndarray, np.ndarray]:
         """Return vertices and faces of a geom of unit size; `dataid` says which mesh."""
         if kind == _GEOM.mjGEOM_MESH:
-            model, mesh = self._stage.model, dataid // 2  # MuJoCo numbers each mesh and its hull
-            points, faces = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+            # MuJoCo numbers each mesh and its hull
+            model = self._stage.model
+            mesh = dataid // 2
+            points = int(model.mesh_vertadr[mesh])
+            faces = int(model.mesh_faceadr[mesh])
             ends = points + int(model.mesh_vertnum[mesh]), faces + int(model.mesh_facenum[mesh])
             return model.mesh_vert[points : ends[0]], model.mesh_face[faces : ends[1]]
         if kind == _GEOM.mjGEOM_BOX:
@@ -179,10 +189,13 @@ class Page:
 
 
 class _Batch:
-    """All geoms of one shape, solid ones or clear ones, drawn by the browser in one go."""
+    """All geoms of one shape, solid or translucent, as one batch of viser."""
 
     def __init__(self, server: Any, name: str, mesh: tuple[np.ndarray, np.ndarray], clear: bool):
-        self._server, self._name, self._mesh, self._clear = server, name, mesh, clear
+        self._server = server
+        self._name = name
+        self._mesh = mesh
+        self._clear = clear
         self._slots = 0
         self._handle: Any = None
         self._shown: dict[str, np.ndarray] | None = None
@@ -202,7 +215,8 @@ class _Batch:
         spare = self._slots - count  # of no size
         place, turn, size, colour = (np.pad(array, ((0, spare), (0, 0))) for array in geoms)
         turn[count:, 0] = 1.0
-        colours, opacity = np.rint(255 * np.clip(colour[:, :3], 0, 1) ** _GAMMA).astype(np.uint8), colour[:, 3]
+        colours = np.rint(255 * np.clip(colour[:, :3], 0, 1) ** _GAMMA).astype(np.uint8)
+        opacity = colour[:, 3]
         values = {"positions": place, "wxyzs": turn, "scales": size, "colors": colours}
         if self._clear:
             values["opacities"] = opacity
@@ -227,9 +241,11 @@ def _group(scene: mujoco.MjvScene) -> dict[tuple[int, int, bool], tuple[np.ndarr
         if kind == _GEOM.mjGEOM_PLANE or geom.rgba[3] == 0.0:
             continue
         clear = bool(geom.rgba[3] < 1.0)
-        key, size = (int(_GEOM.mjGEOM_CYLINDER) if kind == _GEOM.mjGEOM_CAPSULE else kind, -1, clear), geom.size
+        key = (int(_GEOM.mjGEOM_CYLINDER) if kind == _GEOM.mjGEOM_CAPSULE else kind, -1, clear)
+        size = geom.size
         if kind == _GEOM.mjGEOM_MESH:
-            key, size = (kind, geom.dataid, clear), np.ones(3)
+            key = (kind, geom.dataid, clear)
+            size = np.ones(3)
         mujoco.mju_mat2Quat(quat, np.asarray(geom.mat, float).ravel())
         rows.setdefault(key, []).append(np.concatenate([geom.pos, quat, size, geom.rgba]))
     tables = {key: np.array(lines, np.float32) for key, lines in rows.items()}

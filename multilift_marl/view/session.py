@@ -1,4 +1,4 @@
-"""A flight to watch: one environment, a policy, and what a spectator may do to them."""
+"""A simulation to watch: one environment, a policy, and what a spectator may do to them."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
 
-_MOST_STEPS = 20  # at once: a machine that is too slow falls behind in place of choking
+_MOST_STEPS = 20  # at once: on a machine that is too slow the simulation falls behind the clock
 PUSH_SECONDS = 0.5
 
 
 class Session:
-    """Episodes of one environment, one after the other, flown in step with the clock.
+    """Episodes of one environment, one after the other, simulated in step with the clock.
 
     Every method may be called from any thread.
 
     Args:
         config: the environment.
-        learned: trained policies by name, in place of their makers for scripts.
-        policy: name of the one that flies first; None for the first that fits.
+        learned: trained policies by name, beside the scripted ones.
+        policy: name of the first one; None for the first that fits.
         seed: of the episodes, those of `evaluate.py`.
 
     Attributes:
         vec: the environment.
         policies: names of the policies that fit it.
-        policy: name of the one that flies.
-        paused: whether the clock stands still.
+        policy: name of the present one.
+        paused: whether the clock is stopped.
         speed: simulated seconds in a second.
         outcome: how the last episode ended, in words.
 
@@ -48,32 +48,36 @@ class Session:
         self._makers = _fitting(vec, learned)
         self.policies = tuple(self._makers)
         self.policy = self._checked(policy if policy is not None else next(iter(self._makers), "none"), learned)
-        self._pilot = self._makers[self.policy](vec)
-        self.paused, self.speed, self.outcome = False, 1.0, ""
-        self._behind, self._calm, self._push_left = 0.0, np.zeros(3), 0
+        self._policy = self._makers[self.policy](vec)
+        self.paused = False
+        self.speed = 1.0
+        self.outcome = ""
+        self._behind = 0.0  # [s] of simulated time that the clock is ahead
+        self._calm = np.zeros(3)  # [N] on the payload without a push
+        self._push_left = 0  # policy steps
         self._observation, _ = vec.reset(seed=seed)
 
     def advance(self, seconds: float) -> int:
-        """Let the clock run on by `seconds` of the spectator's time; return how many policy steps were flown."""
+        """Let the clock run on by `seconds` of the spectator's time; return how many policy steps were taken."""
         with self._lock:
             if self.paused:
                 return 0
             self._behind = min(self._behind + seconds * self.speed, _MOST_STEPS * self.vec.task.dt)
-            flown = int(self._behind / self.vec.task.dt)
-            for _ in range(flown):
+            steps = int(self._behind / self.vec.task.dt)
+            for _ in range(steps):
                 self.step()
-            self._behind -= flown * self.vec.task.dt
-            return flown
+            self._behind -= steps * self.vec.task.dt
+            return steps
 
     def step(self) -> None:
-        """Fly one policy step; after the end of an episode, start the next."""
+        """Take one policy step; after the end of an episode, start the next."""
         with self._lock:
             vec = self.vec
             if vec.ended[0]:
                 self._observation, _ = vec.reset()
                 self._start()
                 return
-            self._observation, _, terminated, _, info = vec.step(self._pilot.act(self._observation))
+            self._observation, _, terminated, _, info = vec.step(self._policy.act(self._observation))
             if self._push_left:
                 self._push_left -= 1
                 if not self._push_left:
@@ -98,15 +102,15 @@ class Session:
             self._start()
 
     def choose(self, policy: str) -> None:
-        """Hand the team over to another policy, in flight.
+        """Let another policy control the team from now on.
 
         Raises:
             ConfigError: there is no such policy here.
         """
         with self._lock:
             self.policy = self._checked(policy, {})
-            self._pilot = self._makers[policy](self.vec)
-            self._pilot.reset()
+            self._policy = self._makers[policy](self.vec)
+            self._policy.reset()
 
     def push(self, heading: float, elevation: float, force: float) -> None:
         """Push the payload for PUSH_SECONDS.
@@ -117,8 +121,9 @@ class Session:
             force: its strength [N].
         """
         with self._lock:
-            heading, elevation = np.deg2rad(heading), np.deg2rad(elevation)
-            direction = [np.cos(elevation) * np.cos(heading), np.cos(elevation) * np.sin(heading), np.sin(elevation)]
+            azimuth = np.deg2rad(heading)
+            up = np.deg2rad(elevation)
+            direction = [np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)]
             hidden_loads = self.vec.world.hidden_loads
             if not self._push_left:
                 self._calm = hidden_loads.payload_force[0].copy()
@@ -130,7 +135,7 @@ class Session:
         return self._lock
 
     def status(self) -> str:
-        """Return in words (Markdown) where the flight stands."""
+        """Return the state of the episode in words (Markdown)."""
         with self._lock:
             vec, errors = self.vec, self.vec.task.errors
             tension = vec.world.state.cable_tension[0]
@@ -144,8 +149,9 @@ class Session:
             return "  \n".join(line for line in lines if line)
 
     def _start(self) -> None:
-        self._push_left, self._behind = 0, 0.0
-        self._pilot.reset()
+        self._push_left = 0
+        self._behind = 0.0
+        self._policy.reset()
 
     def _checked(self, policy: str, learned: dict[str, Any]) -> str:
         if policy in learned and policy not in self._makers:
