@@ -12,6 +12,8 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
 
 def triple(vector: np.ndarray) -> tuple[float, float, float]:
     """Return a vector (3,) as kernels take it."""

@@ -7,7 +7,7 @@ import pytest
 from conftest import GRAVITY, hover_thrust, load, make_system, same, steady, without_drag
 
 from multilift_marl.sim import World
-from multilift_marl.sim.catenary import SLACK, hang
+from multilift_marl.sim.cables.catenary import SLACK, hang
 from multilift_marl.validation.chains import exponential
 from multilift_marl.validation.conservation import totals
 

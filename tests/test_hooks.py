@@ -15,7 +15,7 @@ from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import hook_moment
 from multilift_marl.math3d import axis_angle, rot_z
 from multilift_marl.sim import World
-from multilift_marl.sim.hover import hook_position
+from multilift_marl.sim.state import hook_position
 
 BELOW = [0.0, 0.0, -0.05]
 ASIDE = [[0.03, 0.02, -0.05], [0.0, 0.03, 0.02], [-0.02, 0.0, -0.04], [0.0, 0.0, 0.0]]

@@ -18,7 +18,7 @@ from multilift_marl import _kernel_cache
 WEIGHTS = """
 from multilift_marl.rig.vehicles import GRAVITY
 import numpy as np
-from multilift_marl.sim.hover import Drones, hover_drone
+from multilift_marl.sim.state import Drones, hover_drone
 from multilift_marl.sim.state import SystemState
 state = SystemState.zeros(1, 1)
 one = np.ones(1)

@@ -26,7 +26,7 @@ from multilift_marl.math3d import (
 from multilift_marl.rig.resolve import MIN_SEPARATION
 from multilift_marl.rig.system import System
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.sim.hover import hook_position
+from multilift_marl.sim.state import hook_position
 
 CAUSES = (
     "none",

@@ -15,7 +15,7 @@ from multilift_marl.config.values import Float, Int, Section
 from multilift_marl.control.formation import Reference, place_formation
 from multilift_marl.math3d import add, ease, mat, matrow, mul, norm, put, putmat, rot_z, row, sub, triple, turn, vec
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.sim.hover import hook_position
+from multilift_marl.sim.state import hook_position
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Box, Task
 from multilift_marl.tasks.failures import WALL

@@ -31,8 +31,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.catenary import SLACK
-from multilift_marl.sim.hover import hook_position, place_at_hook
+from multilift_marl.sim.state import hook_position, place_at_hook
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
@@ -76,7 +75,7 @@ class Recover(Task):
     def __init__(self, config: Config, world: World, reference: Reference):
         super().__init__(config, world, reference)
         check_heights(self.options)
-        taut = SLACK if world.system.cable_model == "chain" else 1.0  # chains that hang straighter pull at once
+        taut = world.cable_model.SLACK
         self._slack = min(self.options.start_slack, taut), taut
         self._early = ignore(TILT, CABLE)
         if self.options.start == "crazymarl":  # a quarter of its teams start on the ground

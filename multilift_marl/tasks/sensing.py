@@ -14,7 +14,7 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import RandomizationConfig
 from multilift_marl.math3d import add, axis_angle, mat, matmul, matrow, norm, put, putmat, row, scale, vec
-from multilift_marl.sim.rng import normal_pair
+from multilift_marl.sim.gusts import normal_pair
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks.rewards import Errors
 

@@ -110,12 +110,12 @@ def without_contact(world: World) -> World:
 
 def free_flight(world: World, seconds: float) -> tuple[Drift, np.ndarray, np.ndarray]:
     """Let a team fall; return its drift, times (T,) [s] and energies (T, 2) over the first: left, and with dampers."""
-    start, shard, h = totals(world), world.shards[0], world.system.timestep
+    start, h = totals(world), world.system.timestep
     thrust, taken, times, energies = np.zeros((1, world.num_drones, 4)), 0.0, [], []
     steps = round(seconds / h)
     for i in range(1, steps + 1):
         world.step(thrust)
-        taken += float(shard.motion.dissipated[0]) if shard.motion is not None else 0.0
+        taken += float(world.cables.motion.dissipated[0]) if world.nodes is not None else 0.0
         if i % round(0.1 / h) == 0:
             energy = totals(world).energy
             times.append(i * h)

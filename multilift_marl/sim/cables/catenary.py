@@ -1,4 +1,4 @@
-"""How a chain hangs between two points: the elastic catenary of its links, and an arc where it is slack."""
+"""How cables hang at rest: the end of one by its tension; a chain between two points, an arc where it is slack."""
 
 from __future__ import annotations
 
@@ -9,14 +9,34 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.math3d import add, cross, dot, norm, put, row, scale, sub, unit
 
-SLACK = 0.98  # of its length: a cable whose ends are closer is laid in an arc, one that sags less hangs by its weight
+SLACK = 0.98  # [-] of its length: a chain whose ends are closer is laid in an arc, else it hangs by its weight
+
+
+@kernel
+def cable_end(direction, tension, length, stiffness, segments, weight):
+    """Return the drone's end of a hanging cable at rest, from its anchor [m].
+
+    Args:
+        direction, tension: unit vector and magnitude [N] of the force in its middle.
+        length, stiffness: of the whole cable [m], [N/m].
+        segments: of a chain, whose mass is that of the nodes between them.
+        weight: of the whole cable [N]; 0 if massless.
+    """
+    if weight == 0.0:
+        return scale(length + tension / stiffness, direction)
+    end = (0.0, 0.0, 0.0)
+    for j in range(segments):
+        force = add(scale(tension, direction), (0.0, 0.0, weight * (j / (segments - 1) - 0.5)))
+        size = norm(force)
+        end = add(end, scale((length / size + 1.0 / stiffness) / segments, force))
+    return end
 
 
 @kernel
 def hang(chord, opening, length, stiffness, weight, links):
     """Write direction, stretch [m] and velocity [m/s] of each link (n, 7) of a chain that hangs between two points.
 
-    Segment j pulls with F_j = F_0 + j w e_z. The F_0 whose links reach to the other end minimises the complementary
+    The force of segment j is F_j = F_0 + j w e_z. The F_0 whose links reach the other end minimises the complementary
     energy, Σ (l |F_j| + |F_j|²/2k) - F_0 · chord, which is convex: Newton's method with halved steps finds it.
     Velocities, of a link's upper end relative to its lower one, are all alike; those of an arc do not stretch it.
 
@@ -38,13 +58,13 @@ def hang(chord, opening, length, stiffness, weight, links):
     for _ in range(50):
         if norm(gap) < 1e-14 * distance:
             break
-        share = 1.0
+        fraction = 1.0
         for _ in range(30):
-            trial = add(force, scale(share, step))
+            trial = add(force, scale(fraction, step))
             found = _complementary(chord, trial, length, stiffness, weight, n)
             if found[0] <= energy + 1e-14 * abs(energy):
                 break
-            share *= 0.5
+            fraction *= 0.5
         force = trial
         energy, gap, step = found
     straight = not norm(gap) < 1e-9 * distance

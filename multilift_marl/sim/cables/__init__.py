@@ -1,0 +1,79 @@
+"""Cable models by name: modules with the same functions, those of `CableModel`.
+
+A model of one's own is a module here, a line in `CABLE_MODELS` and its name in `config/schema.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from multilift_marl.rig.system import System
+from multilift_marl.sim.cables import chain, massless
+from multilift_marl.sim.parameters import Inertias, Parameters
+from multilift_marl.sim.state import SimData
+from multilift_marl.sim.state_io import StateLayout
+
+
+class CableModel(Protocol):
+    """What a cable model does.
+
+    `cables` is what its `make_cables` returns: a named tuple for compiled functions. Its field `nodes` is the model's
+    own state, a named tuple of arrays, environment first, or None.
+    """
+
+    SLACK: float
+    """Distance of its ends over its length below which a cable starts slack [-]."""
+
+    def add_cable(self, spec: mujoco.MjSpec, system: System, index: int) -> None:
+        """Add what MuJoCo is to know of a cable to a specification that holds payload and drone."""
+
+    def set_constants(self, model: mujoco.MjModel, system: System) -> None:
+        """Set what follows from the compiled model."""
+
+    def make_cables(self, system: System, parameters: Parameters, inertias: Inertias) -> Any:
+        """Return the cables of all environments, which refer to parameters and inertias."""
+
+    def update_cables(self, cables: Any, system: System, parameters: Parameters) -> None:
+        """Bring cables into line with parameters that have changed."""
+
+    def update_models(
+        self, batch: Batch, system: System, parameters: Parameters, mask: np.ndarray, names: set[str],
+        broken: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Bring MuJoCo's models into line with parameters that have changed.
+
+        Args:
+            batch: of n simulations.
+            system: what they share.
+            parameters: of these n.
+            mask: (n,) bool, those with new parameters.
+            names: the new parameters, and "cable_broken" where that has changed.
+            broken: (n, N) bool, broken cables.
+        """
+
+    def bind_steps(
+        self, batch: Batch, lo: int, data: SimData, cables: Any, layout: StateLayout
+    ) -> tuple[Callable[[], None] | None, Callable[[], None]]:
+        """Return what to call before MuJoCo's step of a batch, if anything, and what reads the state after it.
+
+        Args:
+            batch: of the environments from `lo` on.
+            lo: the first of them.
+            data, cables, layout: of all environments.
+        """
+
+    def write_state(
+        self, rows: np.ndarray, lo: int, mask: np.ndarray, data: SimData, cables: Any, layout: StateLayout
+    ) -> None:
+        """Write the state of the environments in `mask` (E,) into `rows` of `batch.state`, their statistics anew."""
+
+
+CABLE_MODELS: dict[str, CableModel] = {
+    "massless": massless,
+    "chain": chain,
+}

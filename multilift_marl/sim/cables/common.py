@@ -1,0 +1,84 @@
+"""What cable models share: the numbers of a rig's cables, the law of a cable, bounds and statistics of tensions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.rig.system import System
+from multilift_marl.sim.parameters import Parameters
+
+MAX_SPEED = 100.0  # [m/s] beyond which a simulation has diverged: 1.7 times the fastest wind that is accepted
+MAX_RATE = 500.0  # [rad/s] likewise: ten times what a physics step may change
+MAX_STRETCH = 0.2  # [-] of a cable's length, likewise: twice what a resting cable may have
+
+
+class Cables(NamedTuple):
+    """The cables of a rig, the true ones of each environment."""
+
+    timestep: float
+    """[s]"""
+    anchors: np.ndarray
+    """(N, 3) on the payload, from the origin of its frame [m]."""
+    hooks: np.ndarray
+    """(N, 3) on the drones, from their centres of mass [m]."""
+    length: np.ndarray
+    """(E, N) [m], of `Parameters`."""
+    stiffness: np.ndarray
+    """(E, N) [N/m], of `Parameters`."""
+    damping: np.ndarray
+    """(N,) [N s/m]."""
+    breaking_load: np.ndarray
+    """(N,) [N]."""
+
+
+def make_common(system: System, parameters: Parameters) -> Cables:
+    """Return the cables of `system` with live parameters."""
+    return Cables(
+        timestep=system.timestep,
+        anchors=np.ascontiguousarray(system.anchors),
+        hooks=np.ascontiguousarray(system.hooks),
+        length=parameters.cable_length,
+        stiffness=parameters.cable_stiffness,
+        damping=np.ascontiguousarray(system.cable_damping),
+        breaking_load=system.breaking_load,
+    )
+
+
+@kernel
+def cable_tension(stiffness, damping, stretch, rate):
+    """Return the tension [N] of a spring and damper at a stretch [m] and its rate [m/s]: it pulls and never pushes."""
+    return max(0.0, stiffness * stretch + damping * rate)
+
+
+@kernel
+def clear_stats(e, stats):
+    """Start the statistics of environment e anew."""
+    stats.energy[e] = 0.0
+    stats.slack_time[e] = 0.0
+    stats.tension_min[e] = 1e9  # above any tension
+    stats.tension_max[e] = 0.0
+    stats.tension_peak[e] = 0.0
+    stats.stretch_max[e] = 0.0
+
+
+@kernel
+def update_tension_stats(lo, hi, mask, value, data, cables):
+    """Add the tensions of environments lo to hi where `mask` (E,) is `value` to the statistics, and break cables.
+
+    One call serves all environments, because handing over a named tuple costs two atomic operations for each array.
+    """
+    state, stats = data.state, data.stats
+    for e in range(lo, hi):
+        if mask[e] != value:
+            continue
+        for n in range(cables.breaking_load.shape[0]):
+            tension = state.cable_tension[e, n]
+            if tension > cables.breaking_load[n]:
+                state.cable_broken[e, n] = True
+            stats.tension_min[e] = min(stats.tension_min[e], tension)
+            stats.tension_max[e] = max(stats.tension_max[e], tension)
+            stats.tension_peak[e] = max(stats.tension_peak[e], tension)
+            stats.stretch_max[e] = max(stats.stretch_max[e], tension / (cables.stiffness[e, n] * cables.length[e, n]))
