@@ -27,7 +27,7 @@ class Drones(NamedTuple):
 
 
 class RigConstants(NamedTuple):
-    """Rotors and drag of the drones, and drag of the payload."""
+    """Rotors and drag of the drones, and drag of the payload, all nominal."""
 
     timestep: float
     """[s]."""
@@ -49,12 +49,6 @@ class RigConstants(NamedTuple):
     """(N, 2, 3) `lag_shares` of a time step, of rotors that speed up and of those that slow down."""
     drag: np.ndarray
     """(N, 3) linear drag of a drone along its axes [kg/s]."""
-    rotor_radius: np.ndarray
-    """(N,) [m]."""
-    arm: np.ndarray
-    """(N,) [m]."""
-    rolling_moment: np.ndarray
-    """(N,) of a rotor, over its speed and that of the air across it [kg m]."""
 
 
 def make_drones(system: System) -> Drones:
@@ -85,9 +79,6 @@ def make_constants(system: System) -> RigConstants:
         rotor_speed=np.stack([column("rotor_speed_min"), column("rotor_speed_max")], axis=1),
         lag=np.array([rotor_lag(vehicle, system.timestep) for vehicle in system.vehicles]),
         drag=column("drag"),
-        rotor_radius=column("rotor_radius"),
-        arm=column("arm"),
-        rolling_moment=column("rolling_moment"),
     )
 
 

@@ -42,6 +42,12 @@ class AirConstants(NamedTuple):
     """Whether the air turns drones about their horizontal axes."""
     roll_moment: float
     """[N s] about body x, for each m/s through the air along body y."""
+    rotor_radius: np.ndarray
+    """(N,) [m]."""
+    arm: np.ndarray
+    """(N,) [m]."""
+    rolling_moment: np.ndarray
+    """(N,) of a rotor, over its speed and that of the air across it [kg m]."""
     rig: RigConstants
 
     @property
@@ -67,6 +73,9 @@ def make_air(system: System) -> AirConstants:
         images=_images(system),
         moments=bool(air.roll_moment or any(vehicle.rolling_moment for vehicle in vehicles)),
         roll_moment=float(air.roll_moment),
+        rotor_radius=np.array([vehicle.rotor_radius for vehicle in vehicles]),
+        arm=np.array([vehicle.arm for vehicle in vehicles]),
+        rolling_moment=np.array([vehicle.rolling_moment for vehicle in vehicles], float),
         rig=make_constants(system),
     )
 
@@ -101,7 +110,7 @@ def update_downwash(e, state, air, c):
             if i == n:
                 continue
             away = sub(vec(state.drone_position, e, i) if i < count else payload, here)
-            breadth = c.rig.arm[i] if i < count else c.payload_breadth
+            breadth = c.arm[i] if i < count else c.payload_breadth
             flux = jet_flux(n, away, breadth, attitude, speed, c)
             if flux > 0.0:
                 put(wash[i], sub(row(wash, i), scale(flux, column(attitude, 2))))
@@ -156,8 +165,8 @@ def jet_flux(n, away, breadth, attitude, speed, c):
     if z >= 0.0:
         return 0.0
     # Width of the jet there, and whether any of it reaches the body.
-    square = max(c.rig.rotor_radius[n] / sqrt(2.0), -GROWTH * z) ** 2 + breadth * breadth
-    if x * x + y * y > (c.rig.arm[n] + _REACH * sqrt(square)) ** 2:
+    square = max(c.rotor_radius[n] / sqrt(2.0), -GROWTH * z) ** 2 + breadth * breadth
+    if x * x + y * y > (c.arm[n] + _REACH * sqrt(square)) ** 2:
         return 0.0
     # Thrusts of the four rotors, each weighted by the distance from its axis.
     thrust = 0.0
@@ -181,7 +190,7 @@ def ground_gain(height, n, c):
         n: the drone.
         c: AirConstants.
     """
-    radius = c.rig.rotor_radius[n]
+    radius = c.rotor_radius[n]
     total = 0.0
     z = max(height, 0.5 * radius)
     for i in range(c.images.shape[1]):
@@ -206,5 +215,5 @@ def air_moment(e, n, through, state, c):
     turning = 0.0
     for k in range(4):
         turning += c.rig.rotor_spin[n, k] * state.rotor_speed[e, n, k]
-    turning *= c.rig.rolling_moment[n]
+    turning *= c.rolling_moment[n]
     return turning * through[0] + c.roll_moment * through[1], turning * through[1]

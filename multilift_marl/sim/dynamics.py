@@ -16,7 +16,7 @@ from multilift_marl.sim.state_io import body_dof
 
 
 @kernel
-def apply_loads(rows, lo, data, constants, layout, air_model, varied):
+def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
     """Advance the rotors by one physics step and write the loads of that step into `batch.state`.
 
     The rotor speed follows its command with a first-order lag, one for rising and one for falling. The thrust applied
@@ -26,23 +26,23 @@ def apply_loads(rows, lo, data, constants, layout, air_model, varied):
     Gusts, downwash, ground effect and moments of the air are in `gusts.py` and `air.py`.
 
     Args:
-        rows: `batch.state` of environments from `lo` on.
-        lo: the first of them.
+        rows: Rows of the environments.
+        thrust: commanded thrust of each rotor (E, N, 4) [N].
+        hidden_loads: HiddenLoads.
         data: SimData of all environments.
         constants: RigConstants.
-        layout: StateLayout.
         air_model: Air of all environments and AirConstants; None where all of it is off, for which Numba compiles
             a version without it.
         varied: RotorVariation of all environments; None where the payload's centre of mass, rotors and drag are
             nominal.
     """
-    thrust, state, hidden_loads = data.thrust, data.state, data.hidden_loads
+    state = data.state
     timestep = constants.timestep
     if air_model is not None:
         air, flow = air_model
-    for i in range(rows.shape[0]):
-        e = lo + i
-        line = rows[i]
+    for i in range(rows.state.shape[0]):
+        e = rows.first + i
+        line = rows.state[i]
 
         # Air that all bodies share, and the downwash at each.
         wind = row(hidden_loads.wind, e)
@@ -112,7 +112,7 @@ def apply_loads(rows, lo, data, constants, layout, air_model, varied):
             p, q, _ = vec(state.drone_body_rates, e, n)
             spin = constants.rotor_inertia[n] * turning
             torque = (mx + spin * q, my - spin * p, mz + constants.rotor_inertia[n] * change / timestep)
-            at = layout.force + body_dof(1 + n, layout)
+            at = rows.force + body_dof(1 + n, rows)
             put(line[at : at + 3], mul(attitude, body))
             put(line[at + 3 : at + 6], torque)
             data.stats.energy[e] += timestep * power
@@ -132,9 +132,9 @@ def apply_loads(rows, lo, data, constants, layout, air_model, varied):
         if varied is not None:
             drag = scale(varied.payload_drag[e], drag)
         force = add(drag, row(hidden_loads.payload_force, e))
-        at = layout.force
+        at = rows.force
         put(line[at : at + 3], force)
         if varied is not None and varied.center_varies:
             put(line[at + 3 : at + 6], cross(center, tmul(attitude, force)))
-        elif layout.payload_nv == 6:  # chains add to it
+        elif rows.payload_nv == 6:  # chains add to it
             put(line[at + 3 : at + 6], (0.0, 0.0, 0.0))

@@ -109,12 +109,9 @@ class EpisodeStats(NamedTuple):
 
 
 class SimData(NamedTuple):
-    """The arrays of all environments that the compiled functions of a physics step read and write."""
+    """The arrays of all environments that the compiled functions of a physics step write."""
 
-    thrust: np.ndarray
-    """(E, N, 4) commanded thrust of each rotor [N]."""
     state: SystemState
-    hidden_loads: HiddenLoads
     stats: EpisodeStats
     diverged: np.ndarray
     """(E,) bool, environments that are left as they are."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 from mujoco.batch import Batch
 
 from multilift_marl._jit import kernel
@@ -26,9 +27,13 @@ class Layout(NamedTuple):
     """Indices of the drones among bodies."""
 
 
-class StateLayout(NamedTuple):
-    """Where fields start in a row of `batch.state`, and the size of the payload's part of them."""
+class Rows(NamedTuple):
+    """Rows of `batch.state`, one for each environment of a shard, and where fields start in them."""
 
+    state: np.ndarray
+    """(environments, fields)."""
+    first: int
+    """The first environment."""
     qpos: int
     qvel: int
     force: int
@@ -37,52 +42,53 @@ class StateLayout(NamedTuple):
     payload_nv: int
 
 
-def make_state_layout(layout: Layout, batch: Batch) -> StateLayout:
-    """Return where fields are in the rows of a batch."""
+def make_rows(layout: Layout, batch: Batch, first: int) -> Rows:
+    """Return the rows of a batch whose first environment is `first`."""
     start = batch.state.__array_interface__["data"][0]
 
     def offset(field: str) -> int:
         place: int = batch.bind(field).__array_interface__["data"][0]
         return (place - start) // batch.state.itemsize
 
-    return StateLayout(offset("qpos"), offset("qvel"), offset("qfrc_applied"), layout.payload_nq, layout.payload_nv)
+    fields = offset("qpos"), offset("qvel"), offset("qfrc_applied")
+    return Rows(batch.state, first, *fields, layout.payload_nq, layout.payload_nv)
 
 
 @kernel
-def body_dof(b, layout):
+def body_dof(b, rows):
     """Return where body b's velocities and forces are among those of all bodies; body 0 is the payload."""
-    return 0 if b == 0 else layout.payload_nv + 6 * (b - 1)
+    return 0 if b == 0 else rows.payload_nv + 6 * (b - 1)
 
 
 @kernel
-def read_payload(e, line, state, layout):
+def read_payload(e, line, state, rows):
     """Read the payload's state out of a row of `batch.state`."""
-    at = layout.qpos
-    v = layout.qvel
+    at = rows.qpos
+    v = rows.qvel
     for j in range(3):
         state.payload_position[e, j] = line[at + j]
         state.payload_velocity[e, j] = line[v + j]
-    if layout.payload_nv == 6:
+    if rows.payload_nv == 6:
         putmat(state.payload_rotation[e], quat_to_mat(line[at + 3], line[at + 4], line[at + 5], line[at + 6]))
         for j in range(3):
             state.payload_body_rates[e, j] = line[v + 3 + j]
 
 
 @kernel
-def write_bodies(e, line, state, layout):
+def write_bodies(e, line, state, rows):
     """Write the state of payload and drones into a row of `batch.state`."""
     # The payload, of which a point has no attitude.
-    at = layout.qpos
-    v = layout.qvel
+    at = rows.qpos
+    v = rows.qvel
     put(line[at : at + 3], row(state.payload_position, e))
     put(line[v : v + 3], row(state.payload_velocity, e))
-    if layout.payload_nv == 6:
+    if rows.payload_nv == 6:
         line[at + 3], line[at + 4], line[at + 5], line[at + 6] = mat_to_quat(matrow(state.payload_rotation, e))
         put(line[v + 3 : v + 6], row(state.payload_body_rates, e))
 
     # The drones.
-    at += layout.payload_nq
-    v += layout.payload_nv
+    at += rows.payload_nq
+    v += rows.payload_nv
     for n in range(state.drone_position.shape[1]):
         put(line[at : at + 3], vec(state.drone_position, e, n))
         line[at + 3], line[at + 4], line[at + 5], line[at + 6] = mat_to_quat(mat(state.drone_rotation, e, n))

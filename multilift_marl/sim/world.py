@@ -14,7 +14,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
-from multilift_marl.rig.constants import make_constants, make_drones
+from multilift_marl.rig.constants import make_drones
 from multilift_marl.rig.system import System
 from multilift_marl.sim.air import make_air
 from multilift_marl.sim.cables import CABLE_MODELS
@@ -35,7 +35,7 @@ from multilift_marl.sim.parameters import (
 from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.state import Air, EpisodeStats, HiddenLoads, SimData, SystemState, hover_drone
-from multilift_marl.sim.state_io import make_state_layout
+from multilift_marl.sim.state_io import Rows, make_rows
 
 _log = logging.getLogger("multilift_marl.mujoco")
 REST_HEIGHT = 1.5  # [m] of the payload after World.reset
@@ -48,6 +48,7 @@ class Shard:
     lo: int
     hi: int
     batch: Batch
+    rows: Rows
     apply: Callable[[], None]
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
     advance_cables: Callable[[], None] | None
@@ -114,7 +115,7 @@ class World:
         self._inertias = make_inertias(system, self.parameters)
         self.cables = self.cable_model.make_cables(system, self.parameters, self._inertias)
         self.nodes: Nodes | None = self.cables.nodes
-        self._data = SimData(self.thrust, self.state, self.hidden_loads, self.stats, self.diverged)
+        self._data = SimData(self.state, self.stats, self.diverged)
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool: tuple[int, ThreadPoolExecutor] | None = None  # with its process
         self.reset()
@@ -238,8 +239,7 @@ class World:
             if local.any():
                 self._sync_broken(shard)
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
-                rows, layout = shard.batch.state, make_state_layout(self.layout, shard.batch)
-                self.cable_model.write_state(rows, shard.lo, mask, self._data, self.cables, layout)
+                self.cable_model.write_state(shard.rows, mask, self._data, self.cables)
         self.diverged[mask] = False
 
     def check_warnings(self) -> None:
@@ -317,13 +317,14 @@ class World:
         air = None if flow.still else (self.air, flow)
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
             batch = Batch(self.model, hi - lo, nthread=1)
-            layout = make_state_layout(self.layout, batch)
-            constants, fast = make_constants(self.system), np.zeros(hi - lo, bool)
-            apply = bind(apply_loads, batch.state, lo, self._data, constants, layout, air, self._varied)
-            advance, read = self.cable_model.bind_steps(batch, lo, self._data, self.cables, layout)
+            rows = make_rows(self.layout, batch, lo)
+            loads = self.thrust, self.hidden_loads
+            apply = bind(apply_loads, rows, *loads, self._data, flow.rig, air, self._varied)
+            advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
+            fast = np.zeros(hi - lo, bool)
             find = bind(find_fast, lo, self.state, fast, radii, self.system.timestep)
             broken = np.zeros((hi - lo, self.num_drones), bool)
-            shards.append(Shard(lo, hi, batch, apply, advance, read, broken, find, fast))
+            shards.append(Shard(lo, hi, batch, rows, apply, advance, read, broken, find, fast))
         return shards
 
 

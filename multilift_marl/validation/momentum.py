@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.state_io import body_dof, make_state_layout
+from multilift_marl.sim.state_io import body_dof
 from multilift_marl.sim.world import World
 from multilift_marl.validation.asymmetric_team import Team, make_team, poses, take_off, velocities
 from multilift_marl.validation.conservation import totals
@@ -105,9 +105,8 @@ def loads(world: World) -> tuple[np.ndarray, np.ndarray]:
     The torques are in the frames of the bodies. What chains add for MuJoCo is taken off again.
     """
     shard = world.shards[0]
-    layout = make_state_layout(world.layout, shard.batch)
-    first = layout.force + np.array([body_dof(b, layout) for b in range(1 + world.num_drones)])
-    applied = shard.batch.state[0][first[:, None] + np.arange(6)]
+    first = shard.rows.force + np.array([body_dof(b, shard.rows) for b in range(1 + world.num_drones)])
+    applied = shard.rows.state[0][first[:, None] + np.arange(6)]
     if world.nodes is not None:
         applied = applied - world.cables.motion.impulse[0] / world.system.timestep
     return applied[:, :3], applied[:, 3:]

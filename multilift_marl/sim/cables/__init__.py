@@ -16,7 +16,7 @@ from multilift_marl.rig.system import System
 from multilift_marl.sim.cables import chain, massless
 from multilift_marl.sim.parameters import Inertias, Parameters
 from multilift_marl.sim.state import SimData
-from multilift_marl.sim.state_io import StateLayout
+from multilift_marl.sim.state_io import Rows
 
 
 class CableModel(Protocol):
@@ -57,20 +57,12 @@ class CableModel(Protocol):
         """
 
     def bind_steps(
-        self, batch: Batch, lo: int, data: SimData, cables: Any, layout: StateLayout
+        self, batch: Batch, rows: Rows, data: SimData, cables: Any
     ) -> tuple[Callable[[], None] | None, Callable[[], None]]:
-        """Return what to call before MuJoCo's step of a batch, if anything, and what reads the state after it.
+        """Return what to call before MuJoCo's step of a batch, if anything, and what reads the state after it."""
 
-        Args:
-            batch: of the environments from `lo` on.
-            lo: the first of them.
-            data, cables, layout: of all environments.
-        """
-
-    def write_state(
-        self, rows: np.ndarray, lo: int, mask: np.ndarray, data: SimData, cables: Any, layout: StateLayout
-    ) -> None:
-        """Write the state of the environments in `mask` (E,) into `rows` of `batch.state`, their statistics anew."""
+    def write_state(self, rows: Rows, mask: np.ndarray, data: SimData, cables: Any) -> None:
+        """Write the state of the environments in `mask` (E,) into rows, and start their statistics anew."""
 
 
 CABLE_MODELS: dict[str, CableModel] = {

@@ -52,7 +52,7 @@ from multilift_marl.sim.cables.common import (
 )
 from multilift_marl.sim.parameters import Inertias, Parameters
 from multilift_marl.sim.state import SimData
-from multilift_marl.sim.state_io import StateLayout, body_dof, read_payload, write_bodies
+from multilift_marl.sim.state_io import Rows, body_dof, read_payload, write_bodies
 
 SLACK = catenary.SLACK
 
@@ -101,39 +101,35 @@ def update_models(
     """Do nothing: chains are no part of MuJoCo's models."""
 
 
-def bind_steps(
-    batch: Batch, lo: int, data: SimData, cables: Chain, layout: StateLayout
-) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return what to call before and after MuJoCo's step of a batch, whose first environment is `lo`."""
-    advance = bind(advance_chains, batch.state, lo, data, cables, layout, Workspace.zeros(cables.segments))
-    return advance, bind(read_state, batch.state, lo, batch.bind("qfrc_constraint"), data, cables, layout)
+def bind_steps(batch: Batch, rows: Rows, data: SimData, cables: Chain) -> tuple[Callable[[], None], Callable[[], None]]:
+    """Return what to call before and after MuJoCo's step of a batch."""
+    advance = bind(advance_chains, rows, data, cables, Workspace.zeros(cables.segments))
+    return advance, bind(read_state, rows, batch.bind("qfrc_constraint"), data, cables)
 
 
 @kernel
-def read_state(rows, lo, contact, data, cables, layout):
+def read_state(rows, contact, data, cables):
     """Read the physical state after MuJoCo's step, and write the bodies' into `batch.state`.
 
     Args:
-        rows: `batch.state` of environments from `lo` on, written.
-        lo: the first of them.
-        contact: `qfrc_constraint` of the step (rows, nv), which is contact alone.
+        rows: Rows of the environments, written.
+        contact: `qfrc_constraint` of the step (environments, nv), which is contact alone.
         data: SimData, written.
         cables: Chain with the motion that `advance_chains` left; its nodes' contact is written.
-        layout: StateLayout.
     """
     state, stats, motion = data.state, data.stats, cables.motion
-    for i in range(rows.shape[0]):
-        e = lo + i
+    for i in range(rows.state.shape[0]):
+        e = rows.first + i
         if data.diverged[e]:
             continue
-        _add_contact(e, rows[i], contact[i], cables, layout)
+        _add_contact(e, rows.state[i], contact[i], cables, rows)
         if not _is_sound(e, state.cable_broken[e], cables):
             data.diverged[e] = True
             continue
 
         # Bodies: MuJoCo's row, from which the payload is read, and the drones.
-        _write_motion(e, rows[i], motion, layout)
-        read_payload(e, rows[i], state, layout)
+        _write_motion(e, rows.state[i], motion, rows)
+        read_payload(e, rows.state[i], state, rows)
         for n in range(cables.segments.shape[0]):
             for j in range(3):
                 state.drone_position[e, n, j] = motion.position[e, 1 + n, j]
@@ -151,11 +147,11 @@ def read_state(rows, lo, contact, data, cables, layout):
             slack = slack or tension <= GRAVITY * cables.node_mass[e, n] * (cables.segments[n] - 1)
         if slack:
             stats.slack_time[e] += cables.cables.timestep
-    update_tension_stats(lo, lo + rows.shape[0], data.diverged, False, data, cables.cables)
+    update_tension_stats(rows, data.diverged, False, data, cables.cables)
 
 
 @kernel
-def _add_contact(e, line, contact, chain, layout):
+def _add_contact(e, line, contact, chain, rows):
     """Bring the bodies of environment e from their centres of mass to their frames' origins, and let contact act.
 
     MuJoCo stepped with the same loads and the cables' mean forces. Where it found contact, velocities are its own, and
@@ -165,7 +161,7 @@ def _add_contact(e, line, contact, chain, layout):
     h = chain.cables.timestep
     for b in range(motion.position.shape[1]):
         # From the centre of mass to the origin of the body's frame.
-        turns = b > 0 or layout.payload_nv == 6
+        turns = b > 0 or rows.payload_nv == 6
         attitude = matrow(motion.rotation[e], b)
         center = row(chain.bodies.center[e], b)
         rates = row(motion.rates[e], b)
@@ -173,7 +169,7 @@ def _add_contact(e, line, contact, chain, layout):
         velocity = sub(row(motion.velocity[e], b), mul(attitude, cross(rates, center)))
 
         # Contact forces of this step and of the one before.
-        first = body_dof(b, layout)
+        first = body_dof(b, rows)
         touched = False
         for j in range(6 if turns else 3):
             chain.nodes.contact[e, b, 1, j] = chain.nodes.contact[e, b, 0, j]
@@ -182,7 +178,7 @@ def _add_contact(e, line, contact, chain, layout):
 
         # MuJoCo's velocities where there is contact.
         if touched:
-            v = layout.qvel + first
+            v = rows.qvel + first
             changed = (line[v], line[v + 1], line[v + 2])
             position = add(position, scale(h, sub(changed, velocity)))
             velocity = changed
@@ -219,12 +215,12 @@ def _is_sound(e, broken, chain):
 
 
 @kernel
-def _write_motion(e, line, motion, layout):
+def _write_motion(e, line, motion, rows):
     """Write the bodies' motion into a row of `batch.state`."""
-    at = layout.qpos
-    v = layout.qvel
+    at = rows.qpos
+    v = rows.qvel
     for b in range(motion.position.shape[1]):
-        turns = b > 0 or layout.payload_nv == 6
+        turns = b > 0 or rows.payload_nv == 6
         put(line[at : at + 3], row(motion.position[e], b))
         put(line[v : v + 3], row(motion.velocity[e], b))
         if turns:
@@ -235,7 +231,7 @@ def _write_motion(e, line, motion, layout):
 
 
 @kernel
-def write_state(rows, lo, mask, data, cables, layout):
+def write_state(rows, mask, data, cables):
     """Write the state of the environments in `mask` into `batch.state` and the nodes.
 
     A cable hangs between payload and drone as it would at rest, a slack one in an arc; its nodes move as if it were
@@ -243,16 +239,16 @@ def write_state(rows, lo, mask, data, cables, layout):
     """
     state, nodes, common = data.state, cables.nodes, cables.cables
     links = np.zeros((cables.segments.max(), 7))
-    for i in range(rows.shape[0]):
-        e = lo + i
+    for i in range(rows.state.shape[0]):
+        e = rows.first + i
         if not mask[e]:
             continue
         clear_stats(e, data.stats)
-        write_bodies(e, rows[i], state, layout)
+        write_bodies(e, rows.state[i], state, rows)
         nodes.contact[e] = 0.0
         attitude = matrow(state.payload_rotation, e)
         spin = row(state.payload_body_rates, e)
-        if layout.payload_nv == 3:
+        if rows.payload_nv == 3:
             attitude = IDENTITY
             spin = (0.0, 0.0, 0.0)
         for n in range(cables.segments.shape[0]):
@@ -279,4 +275,4 @@ def write_state(rows, lo, mask, data, cables, layout):
             # Tension of the link next to the drone.
             rate = dot(row(links, count - 1), row(links[:, 4:], count - 1))
             state.cable_tension[e, n] = cable_tension(stiffness, cables.damping[n], links[count - 1, 3], rate)
-    update_tension_stats(lo, lo + rows.shape[0], mask, True, data, common)
+    update_tension_stats(rows, mask, True, data, common)

@@ -48,24 +48,22 @@ _MARGIN = 0.3  # [-] T h²/(m l) of a substep that may be taken
 
 
 @kernel
-def advance_chains(rows, lo, data, chain, layout, work):
+def advance_chains(rows, data, chain, work):
     """Advance nodes and bodies by one physics step, and load MuJoCo's bodies with the cables.
 
     Args:
-        rows: `batch.state` of environments from `lo` on, with the loads of the step; the cables' mean forces are added.
-        lo: the first of them.
+        rows: Rows of the environments, with the loads of the step; the cables' mean forces are added.
         data: SimData at the start of the step; `cable_broken` is written.
         chain: Chain; nodes and motion are written.
-        layout: StateLayout.
         work: Workspace.
     """
     state, motion = data.state, chain.motion
     timestep = chain.cables.timestep
-    for i in range(rows.shape[0]):
-        e = lo + i
+    for i in range(rows.state.shape[0]):
+        e = rows.first + i
         if data.diverged[e]:
             continue
-        _gather_bodies(e, rows[i], state, chain, layout, work)
+        _gather_bodies(e, rows.state[i], state, chain, rows, work)
         motion.dissipated[e] = 0.0
         for n in range(chain.segments.shape[0]):
             motion.peak[e, n] = 0.0
@@ -93,13 +91,13 @@ def advance_chains(rows, lo, data, chain, layout, work):
 
         # The cables' mean forces, for MuJoCo.
         for b in range(motion.position.shape[1]):
-            at = layout.force + body_dof(b, layout)
-            for j in range(6 if b > 0 or layout.payload_nv == 6 else 3):
-                rows[i, at + j] += motion.impulse[e, b, j] / timestep
+            at = rows.force + body_dof(b, rows)
+            for j in range(6 if b > 0 or rows.payload_nv == 6 else 3):
+                rows.state[i, at + j] += motion.impulse[e, b, j] / timestep
 
 
 @kernel
-def _gather_bodies(e, line, state, chain, layout, work):
+def _gather_bodies(e, line, state, chain, rows, work):
     """Take the bodies at the start of a physics step and the forces on them: gravity, loads, lasting contact.
 
     Contact is there so that cables do not have to hold for a moment what rests on the ground: as much of it as the
@@ -108,7 +106,7 @@ def _gather_bodies(e, line, state, chain, layout, work):
     bodies, motion = chain.bodies, chain.motion
     for b in range(motion.position.shape[1]):
         # Motion of the centre of mass. A point payload does not turn.
-        turns = b > 0 or layout.payload_nv == 6
+        turns = b > 0 or rows.payload_nv == 6
         if b == 0:
             position = row(state.payload_position, e)
             velocity = row(state.payload_velocity, e)
@@ -127,7 +125,7 @@ def _gather_bodies(e, line, state, chain, layout, work):
         put(work.momentum[b], mul(attitude, mul(matrow(bodies.inertia[e], b), rates)))
 
         # Force and torque about the centre of mass.
-        at = layout.force + body_dof(b, layout)
+        at = rows.force + body_dof(b, rows)
         touch = chain.nodes.contact[e, b]
         force = (line[at], line[at + 1], line[at + 2])
         force = add(force, (_common(touch, 0), _common(touch, 1), _common(touch, 2)))

@@ -65,13 +65,13 @@ def clear_stats(e, stats):
 
 
 @kernel
-def update_tension_stats(lo, hi, mask, value, data, cables):
-    """Add the tensions of environments lo to hi where `mask` (E,) is `value` to the statistics, and break cables.
+def update_tension_stats(rows, mask, value, data, cables):
+    """Add the tensions of the environments of `rows` where `mask` (E,) is `value` to the statistics; break cables.
 
     One call serves all environments, because handing over a named tuple costs two atomic operations for each array.
     """
     state, stats = data.state, data.stats
-    for e in range(lo, hi):
+    for e in range(rows.first, rows.first + rows.state.shape[0]):
         if mask[e] != value:
             continue
         for n in range(cables.breaking_load.shape[0]):

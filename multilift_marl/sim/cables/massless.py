@@ -53,7 +53,7 @@ from multilift_marl.sim.cables.common import (
 )
 from multilift_marl.sim.parameters import MASSES, Inertias, Parameters
 from multilift_marl.sim.state import SimData, hook_position
-from multilift_marl.sim.state_io import StateLayout, read_payload, write_bodies
+from multilift_marl.sim.state_io import Rows, read_payload, write_bodies
 
 SLACK = 1.0  # [-] of its length: a cable whose ends are closer pulls with nothing
 IMPEDANCE = 0.01  # [-] I: large enough for the solver's scaling, small enough for a softening of 1 %
@@ -125,41 +125,37 @@ def update_models(
         batch.expand("tendon_solref_lim")[mask] = solref
 
 
-def bind_steps(
-    batch: Batch, lo: int, data: SimData, cables: MasslessCables, layout: StateLayout
-) -> tuple[None, Callable[[], None]]:
-    """Return what to call before and after MuJoCo's step of a batch, whose first environment is `lo`."""
-    return None, bind(read_state, batch.state, lo, batch.bind("sensordata"), data, cables, layout)
+def bind_steps(batch: Batch, rows: Rows, data: SimData, cables: MasslessCables) -> tuple[None, Callable[[], None]]:
+    """Return what to call before and after MuJoCo's step of a batch."""
+    return None, bind(read_state, rows, batch.bind("sensordata"), data, cables)
 
 
 @kernel
-def read_state(rows, lo, tension, data, cables, layout):
+def read_state(rows, tension, data, cables):
     """Read the physical state out of `batch.state` and mark environments that have diverged.
 
     A diverged environment keeps its last sound state.
 
     Args:
-        rows: `batch.state` of environments from `lo` on.
-        lo: the first of them.
-        tension: cable tensions of the last physics step (rows, N) [N].
+        rows: Rows of the environments.
+        tension: cable tensions of the last physics step (environments, N) [N].
         data: SimData, written.
         cables: MasslessCables.
-        layout: StateLayout.
     """
     state, stats, diverged = data.state, data.stats, data.diverged
-    for i in range(rows.shape[0]):
-        e = lo + i
-        line = rows[i]
-        if diverged[e] or not _is_sound(e, line, tension[i], cables, layout):
+    for i in range(rows.state.shape[0]):
+        e = rows.first + i
+        line = rows.state[i]
+        if diverged[e] or not _is_sound(e, line, tension[i], cables, rows):
             diverged[e] = True
             continue
-        at = layout.qpos + layout.payload_nq
-        v = layout.qvel + layout.payload_nv
+        at = rows.qpos + rows.payload_nq
+        v = rows.qvel + rows.payload_nv
         slack = False
         for n in range(tension.shape[1]):
             # A cable that has gone taut in this step: its peak, from the state before the step.
             if tension[i, n] > 0.0 and state.cable_tension[e, n] == 0.0:
-                peak = _step_peak(e, n, line, tension[i, n], state, cables, layout)
+                peak = _step_peak(e, n, line, tension[i, n], state, cables, rows)
                 stats.tension_peak[e] = max(stats.tension_peak[e], peak)
                 state.cable_broken[e, n] = state.cable_broken[e, n] or peak > cables.cables.breaking_load[n]
             # Its drone.
@@ -172,35 +168,35 @@ def read_state(rows, lo, tension, data, cables, layout):
             v += 6
             state.cable_tension[e, n] = tension[i, n]
             slack = slack or tension[i, n] <= 0.0
-        read_payload(e, line, state, layout)
+        read_payload(e, line, state, rows)
         if slack:
             stats.slack_time[e] += cables.cables.timestep
-    update_tension_stats(lo, lo + rows.shape[0], diverged, False, data, cables.cables)
+    update_tension_stats(rows, diverged, False, data, cables.cables)
 
 
 @kernel
-def _is_sound(e, line, tension, cables, layout):
+def _is_sound(e, line, tension, cables, rows):
     """Return whether a simulation's numbers are finite and within physical bounds."""
-    v = layout.qvel
-    for j in range(layout.payload_nv):
+    v = rows.qvel
+    for j in range(rows.payload_nv):
         bound = MAX_SPEED if j < 3 else MAX_RATE
         if not abs(line[v + j]) < bound:
             return False
-    v += layout.payload_nv
+    v += rows.payload_nv
     for n in range(tension.shape[0]):
         for j in range(6):
             if not abs(line[v + 6 * n + j]) < (MAX_SPEED if j < 3 else MAX_RATE):
                 return False
         if not tension[n] < MAX_STRETCH * cables.cables.stiffness[e, n] * cables.cables.length[e, n]:
             return False
-    for j in range(layout.payload_nq + 7 * tension.shape[0]):
-        if not isfinite(line[layout.qpos + j]):
+    for j in range(rows.payload_nq + 7 * tension.shape[0]):
+        if not isfinite(line[rows.qpos + j]):
             return False
     return True
 
 
 @kernel
-def _step_peak(e, n, line, tension, state, cables, layout):
+def _step_peak(e, n, line, tension, state, cables, rows):
     """Return the peak of the snatch of cable n, which went taut before the step that has just been made [N].
 
     The state is that before the step, `line` that after it. The ends parted freely until the cable was taut.
@@ -208,7 +204,7 @@ def _step_peak(e, n, line, tension, state, cables, layout):
     # Distance of the ends, and the speed at which they part, before the step.
     anchor = row(cables.cables.anchors, n)
     hook = row(cables.cables.hooks, n)
-    payload = matrow(state.payload_rotation, e) if layout.payload_nv == 6 else IDENTITY
+    payload = matrow(state.payload_rotation, e) if rows.payload_nv == 6 else IDENTITY
     drone = mat(state.drone_rotation, e, n)
     low = add(row(state.payload_position, e), mul(payload, anchor))
     low_velocity = row(state.payload_velocity, e)
@@ -223,11 +219,11 @@ def _step_peak(e, n, line, tension, state, cables, layout):
     stretch = length - cables.cables.length[e, n]
 
     # The other forces that part the ends follow from the velocities after the step.
-    v = layout.qvel
+    v = rows.qvel
     after = (line[v], line[v + 1], line[v + 2])
-    rates = (line[v + 3], line[v + 4], line[v + 5]) if layout.payload_nv == 6 else (0.0, 0.0, 0.0)
+    rates = (line[v + 3], line[v + 4], line[v + 5]) if rows.payload_nv == 6 else (0.0, 0.0, 0.0)
     after = add(after, mul(payload, cross(rates, anchor)))
-    v += layout.payload_nv + 6 * n
+    v += rows.payload_nv + 6 * n
     rates = (line[v + 3], line[v + 4], line[v + 5])
     ending = add((line[v], line[v + 1], line[v + 2]), mul(drone, cross(rates, hook)))
     inverse_mass = _mobility(e, 0, payload, anchor, direction, cables.bodies)
@@ -305,19 +301,19 @@ def snatch_peak(speed, acceleration, mass, stiffness, damping):
 
 
 @kernel
-def write_state(rows, lo, mask, data, cables, layout):
+def write_state(rows, mask, data, cables):
     """Write the state of the environments in `mask` into `batch.state`; tensions follow from the stretch."""
     state = data.state
-    for i in range(rows.shape[0]):
-        e = lo + i
+    for i in range(rows.state.shape[0]):
+        e = rows.first + i
         if not mask[e]:
             continue
         clear_stats(e, data.stats)
-        write_bodies(e, rows[i], state, layout)
+        write_bodies(e, rows.state[i], state, rows)
         attitude = matrow(state.payload_rotation, e)
         for n in range(cables.cables.anchors.shape[0]):
             anchor = add(row(state.payload_position, e), mul(attitude, row(cables.cables.anchors, n)))
             cable = sub(hook_position(e, n, state, cables.cables.hooks), anchor)
             stretch = sqrt(dot(cable, cable)) - cables.cables.length[e, n]
             state.cable_tension[e, n] = cable_tension(cables.cables.stiffness[e, n], 0.0, stretch, 0.0)
-    update_tension_stats(lo, lo + rows.shape[0], mask, True, data, cables.cables)
+    update_tension_stats(rows, mask, True, data, cables.cables)
