@@ -58,7 +58,8 @@ class AirConstants(NamedTuple):
 
 def make_air(system: System) -> AirConstants:
     """Return the air of `system`."""
-    air, vehicles = system.air, system.vehicles
+    air = system.air
+    vehicles = system.vehicles
     hold = float("inf") if air.gust_hold is None else air.gust_hold
     return AirConstants(
         gusts=bool(air.turbulence or any(air.gust)),

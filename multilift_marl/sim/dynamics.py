@@ -39,7 +39,7 @@ def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
     state = data.state
     timestep = constants.timestep
     if air_model is not None:
-        air, flow = air_model
+        air, air_constants = air_model
     for i in range(rows.state.shape[0]):
         e = rows.first + i
         line = rows.state[i]
@@ -47,16 +47,15 @@ def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
         # Air that all bodies share, and the downwash at each.
         wind = row(hidden_loads.wind, e)
         if air_model is not None:
-            if flow.gusts:
-                wind = add(wind, step_gusts(e, wind, state, air, timestep, flow))
-            if flow.downwash:
-                update_downwash(e, state, air, flow)
+            if air_constants.gusts:
+                wind = add(wind, step_gusts(e, wind, state, air, timestep, air_constants))
+            if air_constants.downwash:
+                update_downwash(e, state, air, air_constants)
 
         for n in range(thrust.shape[1]):
             # Rotors: speeds at the end of the step, mean thrust, torques and power. `turning` and `change` are sums
             # over the rotors, against body z: mean speed, and its growth in the step.
-            total, mx, my, mz, power = 0.0, 0.0, 0.0, 0.0, 0.0
-            turning, change = 0.0, 0.0
+            total = mx = my = mz = power = turning = change = 0.0
             b = constants.thrust_coefficient[n]
             kappa = constants.torque_ratio[n]
             slowest = constants.rotor_speed[n, 0]
@@ -93,15 +92,15 @@ def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
                 here = add(wind, vec(air.downwash, e, n))
             through = tmul(attitude, sub(vec(state.drone_velocity, e, n), here))
             if air_model is not None:
-                if flow.ground_effect:
-                    gain = ground_gain(state.drone_position[e, n, 2], n, flow)
+                if air_constants.ground_effect:
+                    gain = ground_gain(state.drone_position[e, n, 2], n, air_constants)
                     total *= gain
                     mx *= gain
                     my *= gain
-                if flow.moments:
-                    more = air_moment(e, n, through, state, flow)
-                    mx += more[0]
-                    my += more[1]
+                if air_constants.moments:
+                    roll, pitch = air_moment(e, n, through, state, air_constants)
+                    mx += roll
+                    my += pitch
             if varied is not None:
                 through = scale(varied.drag[e, n], through)
 

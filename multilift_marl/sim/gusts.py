@@ -20,7 +20,10 @@ MIN_AIRSPEED = 1.0  # [m/s] at which a team that drifts with the wind meets turb
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # constants of SplitMix64
 _FIRST = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND = np.uint64(0x94D049BB133111EB)
-_30, _27, _31, _11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+_30 = np.uint64(30)
+_27 = np.uint64(27)
+_31 = np.uint64(31)
+_11 = np.uint64(11)
 
 
 @kernel
@@ -124,8 +127,8 @@ def turbulence(e, air, across, upward, wind):
 
 
 @kernel
-def gust_share(t, start, rise, hold):
-    """Return the share of a "1 - cosine" gust's amplitude at time t (MIL-F-8785C, 3.7), held and taken back."""
+def gust_factor(t, start, rise, hold):
+    """Return a "1 - cosine" gust over its amplitude at time t (MIL-F-8785C, 3.7), held and taken back."""
     s = t - start
     if s <= 0.0:
         return 0.0
@@ -150,7 +153,7 @@ def step_gusts(e, wind, state, air, timestep, c):
         timestep: [s].
         c: AirConstants.
     """
-    gust = scale(gust_share(air.steps[e] * timestep, c.gust_start, c.gust_rise, c.gust_hold), c.gust)
+    gust = scale(gust_factor(air.steps[e] * timestep, c.gust_start, c.gust_rise, c.gust_hold), c.gust)
     if c.turbulence:
         across, upward, long, high = dryden(state.payload_position[e, 2], hypot(wind[0], wind[1]))
         gust = add(gust, turbulence(e, air, across, upward, wind))

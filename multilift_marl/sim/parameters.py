@@ -1,4 +1,4 @@
-"""True parameters that may differ between environments and from what the controller knows.
+"""True parameters that may differ between environments and from those of the controller.
 
 They are absolute, or factors on what the configuration says: setting them twice is the same as setting them once.
 """
@@ -173,9 +173,11 @@ def update_parameters(
         ValueError: see `check_parameters`.
     """
     check_parameters(system, parameters, mask, values)
-    changed, names = np.zeros(len(mask), bool), set()
+    changed = np.zeros(len(mask), bool)
+    names = set()
     for name, value in values.items():
-        old, new = getattr(parameters, name), np.asarray(value)
+        old = getattr(parameters, name)
+        new = np.asarray(value)
         differs = mask & (new != old).reshape(len(mask), -1).any(axis=1)
         if differs.any():
             changed |= differs
@@ -191,7 +193,7 @@ def write_masses(
 
     Args:
         batch: of n simulations.
-        layout, system: what they share.
+        layout, system: common to them.
         parameters: of these n.
         mask: (n,) bool, those with new parameters.
         names: the new parameters.

@@ -34,7 +34,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "multilift"
     set_options(spec, system.timestep)
-    # cables are limits of tendons or act as loads: there are no springs and dampers to look for
+    # cables are limits of tendons or act as loads: there are no springs and dampers to evaluate
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
     _add_world(spec, visuals)
     _add_payload(spec, system)
@@ -53,10 +53,14 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
 
 def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
     """Set integrator, gravity, flags, solver and Jacobian."""
-    option, disable = spec.option, mujoco.mjtDisableBit
-    option.timestep, option.gravity = timestep, [0, 0, -GRAVITY]
+    option = spec.option
+    disable = mujoco.mjtDisableBit
+    option.timestep = timestep
+    option.gravity = [0, 0, -GRAVITY]
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    option.solver, option.tolerance, option.iterations = mujoco.mjtSolver.mjSOL_CG, 1e-18, 300
+    option.solver = mujoco.mjtSolver.mjSOL_CG
+    option.tolerance = 1e-18
+    option.iterations = 300
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.disableflags |= disable.mjDSBL_REFSAFE | disable.mjDSBL_AUTORESET | disable.mjDSBL_ISLAND
 
@@ -88,8 +92,11 @@ def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
 def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
     point = system.payload_shape == "point"  # its slide joints count from the body's place, so that must be the origin
     body = spec.worldbody.add_body(name="payload", pos=[0, 0, 0 if point else 1.5])
-    body.mass, body.explicitinertial = system.payload_mass, True
-    body.inertia, body.ipos, body.iquat = system.payload_inertia, [0, 0, 0], system.payload_axes
+    body.mass = system.payload_mass
+    body.explicitinertial = True
+    body.inertia = system.payload_inertia
+    body.ipos = [0, 0, 0]
+    body.iquat = system.payload_axes
     if "payload_center_of_mass" in system.varied:
         body.simple = False  # or MuJoCo takes the centre of mass to be the origin for good
     colour = list(PAYLOAD_COLOUR)
@@ -111,7 +118,9 @@ def _payload_form(system: System, margin: float = 0.0) -> dict[str, Any]:
 
     A mesh has no margin; it collides as its convex hull.
     """
-    half, pos, mesh = system.payload_size / 2 + margin, system.payload_center, system.payload_mesh
+    half = system.payload_size / 2 + margin
+    pos = system.payload_center
+    mesh = system.payload_mesh
     if mesh is not None:
         return {"type": _GEOM.mjGEOM_MESH, "meshname": "payload", "pos": pos - mesh.middle}
     if system.payload_shape == "cylinder":
@@ -120,9 +129,12 @@ def _payload_form(system: System, margin: float = 0.0) -> dict[str, Any]:
 
 
 def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> None:
-    vehicle, name = system.vehicles[i], f"drone_{i}"
-    body.mass, body.explicitinertial = vehicle.mass, True
-    body.inertia, body.ipos = vehicle.inertia, [0, 0, 0]
+    vehicle = system.vehicles[i]
+    name = f"drone_{i}"
+    body.mass = vehicle.mass
+    body.explicitinertial = True
+    body.inertia = vehicle.inertia
+    body.ipos = [0, 0, 0]
     colour = DRONE_COLOURS[i % len(DRONE_COLOURS)]
     body.add_geom(
         name=name, type=_GEOM.mjGEOM_BOX, size=drone_half_size(vehicle),
@@ -137,13 +149,23 @@ def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> N
 
 def _add_surroundings(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
     """Add a pale sky, a floor of 1 m squares that fades into it, and soft light."""
-    visual, horizon = spec.visual, [0.88, 0.92, 0.96]
-    spec.stat.extent, spec.stat.center = 4.0, [0, 0, 1.5]  # fixed, so that every team is lit alike
-    visual.headlight.ambient, visual.headlight.diffuse, visual.headlight.specular = [0.42] * 3, [0.22] * 3, [0.05] * 3
-    visual.quality.shadowsize, visual.map.shadowclip = 2048, 1.2
-    visual.rgba.haze, visual.rgba.fog = [*horizon, 1], [*horizon, 1]
-    visual.map.fogstart, visual.map.fogend, visual.map.znear, visual.map.zfar = 2.5, 7.0, 0.01, 50
-    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
+    visual = spec.visual
+    horizon = [0.88, 0.92, 0.96]
+    spec.stat.extent = 4.0  # fixed, so that every team is lit alike
+    spec.stat.center = [0, 0, 1.5]
+    visual.headlight.ambient = [0.42] * 3
+    visual.headlight.diffuse = [0.22] * 3
+    visual.headlight.specular = [0.05] * 3
+    visual.quality.shadowsize = 2048
+    visual.map.shadowclip = 1.2
+    visual.rgba.haze = [*horizon, 1]
+    visual.rgba.fog = [*horizon, 1]
+    visual.map.fogstart = 2.5
+    visual.map.fogend = 7.0
+    visual.map.znear = 0.01
+    visual.map.zfar = 50
+    texture = mujoco.mjtTexture
+    builtin = mujoco.mjtBuiltin
     spec.add_texture(
         name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=builtin.mjBUILTIN_GRADIENT,
         rgb1=[0.30, 0.52, 0.82], rgb2=horizon, width=64, height=384,
@@ -167,12 +189,15 @@ def _add_light(payload: mujoco.MjsBody) -> None:
 
 def _add_rotorcraft(body: mujoco.MjsBody, vehicle: Vehicle, colour: tuple[float, ...]) -> None:
     """Draw hull, arms and rotor discs; the front ones in the drone's colour."""
-    arm, dark, pale = vehicle.arm, [0.13, 0.13, 0.15, 1], [0.30, 0.32, 0.36, 0.55]
+    arm = vehicle.arm
+    dark = [0.13, 0.13, 0.15, 1]
+    pale = [0.30, 0.32, 0.36, 0.55]
     plain = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP, "mass": 0}
     hull = np.array([0.50, 0.36, 0.26]) * arm
     body.add_geom(type=_GEOM.mjGEOM_ELLIPSOID, size=hull, rgba=colour, **plain)
     for position in vehicle.rotor_positions:
-        tip, disc = position + [0, 0, 0.22 * arm], [0.62 * arm, 0.02 * arm, 0]
+        tip = position + [0, 0, 0.22 * arm]
+        disc = [0.62 * arm, 0.02 * arm, 0]
         thick = [0.08 * arm, 0, 0]
         body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[0, 0, 0, *position], size=thick, rgba=dark, **plain)
         body.add_geom(type=_GEOM.mjGEOM_CYLINDER, fromto=[*position, *tip], size=thick, rgba=dark, **plain)
@@ -190,8 +215,10 @@ def _add_target(spec: mujoco.MjSpec, system: System, margin: float, form: dict[s
     """
     body = spec.worldbody.add_body(name="target", mocap=True, pos=[0, 0, -10])
     plain = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP}
-    faint, firm = [0.0, 0.75, 0.35, 0.18], [0.0, 0.60, 0.25, 1]
-    center, half = system.payload_center, system.payload_size / 2 + margin
+    faint = [0.0, 0.75, 0.35, 0.18]
+    firm = [0.0, 0.60, 0.25, 1]
+    center = system.payload_center
+    half = system.payload_size / 2 + margin
     if system.payload_shape == "point":
         body.add_geom(type=_GEOM.mjGEOM_SPHERE, size=[half[0], 0, 0], rgba=[*firm[:3], 0.5], **plain)
         return

@@ -95,7 +95,9 @@ class World:
             if value < least:
                 raise ValueError(f"{name}={value} must be at least {least}")
         _quiet_mujoco()
-        self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
+        self.system = system
+        self.num_envs = num_envs
+        self.num_drones = system.num_drones
         self.seed = seed
         self.model, self.layout = build_model(system)
         self.drones = make_drones(system)
@@ -123,7 +125,8 @@ class World:
     def reset(self, mask: np.ndarray | None = None) -> SystemState:
         """Put the environments in `mask` (E,) (None: all) at rest in formation, payload at 1.5 m; return the state."""
         mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool)
-        system, state = self.system, self.state
+        system = self.system
+        state = self.state
         state.payload_position[mask] = [0, 0, REST_HEIGHT]
         state.payload_rotation[mask] = np.eye(3)
         state.payload_velocity[mask] = state.payload_body_rates[mask] = 0
@@ -133,7 +136,8 @@ class World:
             for n, force in enumerate(system.hook_force):
                 hover_drone(e, n, state, tuple(force), 0.0, self.drones)
         self.set_parameters(mask, **nominal_parameters(system, self.num_envs)._asdict())
-        self.hidden_loads.payload_force[mask], self.hidden_loads.wind[mask] = 0, system.wind
+        self.hidden_loads.payload_force[mask] = 0
+        self.hidden_loads.wind[mask] = system.wind
         if system.air.turbulence:
             for e in np.flatnonzero(mask).tolist():
                 self.seed_turbulence(e, np.random.SeedSequence(self.seed, spawn_key=(e,)))
@@ -257,7 +261,8 @@ class World:
 
     def cable_points(self, env: int, cable: int) -> np.ndarray:
         """Return the points of a cable from its anchor to its hook (S + 1, 3) [m]; of a broken one without the hook."""
-        state, system = self.state, self.system
+        state = self.state
+        system = self.system
         anchor = state.payload_position[env] + state.payload_rotation[env] @ system.anchors[cable]
         hook = state.drone_position[env, cable] + state.drone_rotation[env, cable] @ system.hooks[cable]
         count = system.cable_segments[cable] - 1
@@ -303,7 +308,8 @@ class World:
         """Bring the shard's models into line with `state.cable_broken`."""
         broken = self.state.cable_broken[shard.lo : shard.hi]
         if (broken != shard.broken).any():
-            own, mask = self._shard_parameters(shard), np.ones(len(broken), bool)
+            own = self._shard_parameters(shard)
+            mask = np.ones(len(broken), bool)
             self.cable_model.update_models(shard.batch, self.system, own, mask, {"cable_broken"}, broken)
             shard.broken[:] = broken
 
@@ -313,13 +319,15 @@ class World:
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int).tolist()
-        shards, radii, flow = [], body_radii(self.system), make_air(self.system)
-        air = None if flow.still else (self.air, flow)
+        shards = []
+        radii = body_radii(self.system)
+        air_constants = make_air(self.system)
+        air = None if air_constants.still else (self.air, air_constants)
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
             batch = Batch(self.model, hi - lo, nthread=1)
             rows = make_rows(self.layout, batch, lo)
             loads = self.thrust, self.hidden_loads
-            apply = bind(apply_loads, rows, *loads, self._data, flow.rig, air, self._varied)
+            apply = bind(apply_loads, rows, *loads, self._data, air_constants.rig, air, self._varied)
             advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
             fast = np.zeros(hi - lo, bool)
             find = bind(find_fast, lo, self.state, fast, radii, self.system.timestep)

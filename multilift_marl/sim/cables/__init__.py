@@ -20,7 +20,7 @@ from multilift_marl.sim.state_io import Rows
 
 
 class CableModel(Protocol):
-    """What a cable model does.
+    """The functions of a cable model.
 
     `cables` is what its `make_cables` returns: a named tuple for compiled functions. Its field `nodes` is the model's
     own state, a named tuple of arrays, environment first, or None.
@@ -30,10 +30,10 @@ class CableModel(Protocol):
     """Distance of its ends over its length below which a cable starts slack [-]."""
 
     def add_cable(self, spec: mujoco.MjSpec, system: System, index: int) -> None:
-        """Add what MuJoCo is to know of a cable to a specification that holds payload and drone."""
+        """Add a cable to a specification that holds payload and drone, where MuJoCo simulates it."""
 
     def set_constants(self, model: mujoco.MjModel, system: System) -> None:
-        """Set what follows from the compiled model."""
+        """Set constants of the compiled model that depend on its masses."""
 
     def make_cables(self, system: System, parameters: Parameters, inertias: Inertias) -> Any:
         """Return the cables of all environments, which refer to parameters and inertias."""
@@ -49,7 +49,7 @@ class CableModel(Protocol):
 
         Args:
             batch: of n simulations.
-            system: what they share.
+            system: common to them.
             parameters: of these n.
             mask: (n,) bool, those with new parameters.
             names: the new parameters, and "cable_broken" where that has changed.

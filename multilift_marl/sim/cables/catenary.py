@@ -47,7 +47,8 @@ def hang(chord, opening, length, stiffness, weight, links):
         weight: of a node, w [N].
         links: written.
     """
-    n, distance = links.shape[0], norm(chord)
+    n = links.shape[0]
+    distance = norm(chord)
     if distance < SLACK * n * length:
         _hang_slack(chord, distance, length, links)
         _turn_links(opening, links)
@@ -82,14 +83,16 @@ def hang(chord, opening, length, stiffness, weight, links):
 @kernel
 def _complementary(chord, force, length, stiffness, weight, n):
     """Return the energy of `hang` at F_0, how far the links miss the other end, and Newton's step."""
-    energy, gap = -dot(force, chord), chord
-    xx, yy, zz, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    energy = -dot(force, chord)
+    gap = chord
+    xx = yy = zz = xy = xz = yz = 0.0
     for j in range(n):
         cable_force = add(force, (0.0, 0.0, j * weight))
         size = max(norm(cable_force), 1e-9)
         energy += length * size + 0.5 * size * size / stiffness
         gap = sub(gap, scale(length / size + 1.0 / stiffness, cable_force))
-        flat, bend = length / size + 1.0 / stiffness, length / size**3
+        flat = length / size + 1.0 / stiffness
+        bend = length / size**3
         xx += flat - bend * cable_force[0] * cable_force[0]
         yy += flat - bend * cable_force[1] * cable_force[1]
         zz += flat - bend * cable_force[2] * cable_force[2]
@@ -108,7 +111,8 @@ def _hang_slack(chord, distance, length, links):
     if norm(below) < 1e-3:
         below = sub((1.0, 0.0, 0.0), scale(along[0], along))
     below = unit(below)
-    low, high = 1e-9, 2.0 * np.pi / n
+    low = 1e-9
+    high = 2.0 * np.pi / n
     for _ in range(60):
         bend = 0.5 * (low + high)
         if length * sin(0.5 * n * bend) > distance * sin(0.5 * bend):
@@ -128,11 +132,16 @@ def _turn_links(opening, links):
     They are what is left of one vector λ across each link d, λ - d (d · λ), and add up to `opening`.
     """
     n = links.shape[0]
-    xx, yy, zz, xy, xz, yz = float(n), float(n), float(n), 0.0, 0.0, 0.0
+    xx = yy = zz = float(n)
+    xy = xz = yz = 0.0
     for j in range(n):
         x, y, z = row(links, j)
-        xx, yy, zz = xx - x * x, yy - y * y, zz - z * z
-        xy, xz, yz = xy - x * y, xz - x * z, yz - y * z
+        xx -= x * x
+        yy -= y * y
+        zz -= z * z
+        xy -= x * y
+        xz -= x * z
+        yz -= y * z
     common = _solve(xx, yy, zz, xy, xz, yz, opening)
     for j in range(n):
         link = row(links, j)
@@ -142,7 +151,9 @@ def _turn_links(opening, links):
 @kernel
 def _solve(xx, yy, zz, xy, xz, yz, right):
     """Return the solution of three linear equations with a symmetric matrix."""
-    first, second, third = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+    first = (xx, xy, xz)
+    second = (xy, yy, yz)
+    third = (xz, yz, zz)
     minor = cross(second, third)
     volume = dot(first, minor)
     return scale(1.0 / volume, (dot(minor, right), dot(cross(third, first), right), dot(cross(first, second), right)))

@@ -117,7 +117,9 @@ def read_state(rows, contact, data, cables):
         data: SimData, written.
         cables: Chain with the motion that `advance_chains` left; its nodes' contact is written.
     """
-    state, stats, motion = data.state, data.stats, cables.motion
+    state = data.state
+    stats = data.stats
+    motion = cables.motion
     for i in range(rows.state.shape[0]):
         e = rows.first + i
         if data.diverged[e]:
@@ -195,7 +197,8 @@ def _add_contact(e, line, contact, chain, rows):
 @kernel
 def _is_sound(e, broken, chain):
     """Return whether a simulation's numbers are finite and within physical bounds."""
-    motion, nodes = chain.motion, chain.nodes
+    motion = chain.motion
+    nodes = chain.nodes
     for b in range(motion.position.shape[1]):
         for j in range(3):
             if not abs(motion.velocity[e, b, j]) < MAX_SPEED or not abs(motion.rates[e, b, j]) < MAX_RATE:
@@ -237,7 +240,9 @@ def write_state(rows, mask, data, cables):
     A cable hangs between payload and drone as it would at rest, a slack one in an arc; its nodes move as if it were
     stretched evenly, those of an arc without stretch: its dampers would resist.
     """
-    state, nodes, common = data.state, cables.nodes, cables.cables
+    state = data.state
+    nodes = cables.nodes
+    common = cables.cables
     links = np.zeros((cables.segments.max(), 7))
     for i in range(rows.state.shape[0]):
         e = rows.first + i

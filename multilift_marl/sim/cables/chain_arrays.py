@@ -27,7 +27,9 @@ class Nodes(NamedTuple):
     @classmethod
     def zeros(cls, num_envs: int, system: System) -> Nodes:
         """Return chains at the origin."""
-        e, n, s = num_envs, system.num_drones, int(system.cable_segments.max())
+        e = num_envs
+        n = system.num_drones
+        s = int(system.cable_segments.max())
         return cls(np.zeros((e, n, s - 1, 3)), np.zeros((e, n, s - 1, 3)), np.zeros((e, 1 + n, 2, 6)))
 
 
@@ -56,7 +58,9 @@ class Motion(NamedTuple):
     @classmethod
     def zeros(cls, num_envs: int, system: System) -> Motion:
         """Return arrays for `num_envs` environments."""
-        e, n, s = num_envs, system.num_drones, int(system.cable_segments.max())
+        e = num_envs
+        n = system.num_drones
+        s = int(system.cable_segments.max())
         b = 1 + n
         bodies = (e, b, 3), (e, b, 3), (e, b, 3, 3), (e, b, 3)
         return cls(*(np.zeros(shape) for shape in (*bodies, (e, n, s), (e, n), (e, n), (e,), (e, b, 6))))
@@ -101,7 +105,7 @@ class Workspace(NamedTuple):
     free_velocity: np.ndarray
     """(B, 3) at the end of the substep, were it not for the cables [m/s]."""
     free_rates: np.ndarray
-    """(B, 3) likewise, world frame [rad/s]."""
+    """(B, 3) at the end of the substep, were it not for the cables, world frame [rad/s]."""
     ends: np.ndarray
     """(N, 2, 3) anchor and hook from their bodies' centres of mass, world frame [m]."""
     twist: np.ndarray
@@ -132,8 +136,10 @@ class Workspace(NamedTuple):
     @classmethod
     def zeros(cls, segments: np.ndarray) -> Workspace:
         """Return arrays for chains of `segments` (N,) links."""
-        n, s = len(segments), int(segments.max())
-        bodies, links = (1 + n, 3), (n, s)
+        n = len(segments)
+        s = int(segments.max())
+        bodies = (1 + n, 3)
+        links = (n, s)
         shapes = (
             bodies, bodies, bodies, bodies, bodies, (n, 2, 3), (n, 3), (n, s, 3), (n, s - 1, 3),
             bodies, bodies, (1,), links, links, links, links, links, (n, n),

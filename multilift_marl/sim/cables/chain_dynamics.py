@@ -57,7 +57,8 @@ def advance_chains(rows, data, chain, work):
         chain: Chain; nodes and motion are written.
         work: Workspace.
     """
-    state, motion = data.state, chain.motion
+    state = data.state
+    motion = chain.motion
     timestep = chain.cables.timestep
     for i in range(rows.state.shape[0]):
         e = rows.first + i
@@ -103,7 +104,8 @@ def _gather_bodies(e, line, state, chain, rows, work):
     Contact is there so that cables do not have to hold for a moment what rests on the ground: as much of it as the
     last two steps had in common, since the impulse of an impact is over.
     """
-    bodies, motion = chain.bodies, chain.motion
+    bodies = chain.bodies
+    motion = chain.motion
     for b in range(motion.position.shape[1]):
         # Motion of the centre of mass. A point payload does not turn.
         turns = b > 0 or rows.payload_nv == 6
@@ -151,7 +153,9 @@ def _common(touch, j):
 @kernel
 def _move(e, h, state, chain, work):
     """Give nodes and bodies the velocities that follow from the tensions, and move them."""
-    bodies, motion, nodes = chain.bodies, chain.motion, chain.nodes
+    bodies = chain.bodies
+    motion = chain.motion
+    nodes = chain.nodes
     # Bodies without cables, and bending.
     motion.dissipated[e] += h * work.bend_power[0]
     for b in range(motion.position.shape[1]):
@@ -235,7 +239,8 @@ def _find_bending(e, state, chain, work):
     The forces on the three points of a bend are the moment times the derivatives of θ by their places. They have
     neither a sum nor a moment. Anchor and hook are free pivots.
     """
-    motion, nodes = chain.motion, chain.nodes
+    motion = chain.motion
+    nodes = chain.nodes
     work.bend_power[0] = 0.0
     work.bend_force[:] = 0.0
     work.bend_moment[:] = 0.0

@@ -1,6 +1,6 @@
 """Tensions of the links of chains in a substep: a linear system, and what the links' turning adds to it.
 
-In a substep h, link j pulls along its direction d_j at the start of the substep, with the tension
+In a substep h, the force of link j is along its direction d_j at the start of the substep, with the tension
 
     T_j = k s_j' + c (s_j' - s_j)/h
 
@@ -29,10 +29,12 @@ _SETTLED = 1e-6  # [m/s] change of that which needs no further pass: of a subste
 def find_links(e, h, state, chain, work):
     """Find direction and stretch of every link, the bodies' motion without cables, and the linear system of a substep.
 
-    Row j of a cable, over h (k h + c): (1/(h (k h + c)) + 1/m_upper + 1/m_lower) T_j less what its neighbours do to the
-    nodes that they share, equals (k s_j/(k h + c) + rate of stretch without cables)/h.
+    Row j of a cable, over h (k h + c): (1/(h (k h + c)) + 1/m_upper + 1/m_lower) T_j less the effect of its neighbours
+    on the nodes between them equals (k s_j/(k h + c) + rate of stretch without cables)/h.
     """
-    bodies, motion, nodes = chain.bodies, chain.motion, chain.nodes
+    bodies = chain.bodies
+    motion = chain.motion
+    nodes = chain.nodes
     # Bodies without cables. The momentum is in the world frame, so the gyroscopic torque needs no term.
     for b in range(bodies.mass.shape[1]):
         attitude = matrow(motion.rotation[e], b)

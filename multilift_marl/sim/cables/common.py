@@ -1,4 +1,4 @@
-"""What cable models share: the numbers of a rig's cables, the law of a cable, bounds and statistics of tensions."""
+"""Common to cable models: the numbers of a rig's cables, the law of a cable, bounds and statistics of tensions."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from multilift_marl.rig.system import System
 from multilift_marl.sim.parameters import Parameters
 
 MAX_SPEED = 100.0  # [m/s] beyond which a simulation has diverged: 1.7 times the fastest wind that is accepted
-MAX_RATE = 500.0  # [rad/s] likewise: ten times what a physics step may change
-MAX_STRETCH = 0.2  # [-] of a cable's length, likewise: twice what a resting cable may have
+MAX_RATE = 500.0  # [rad/s] beyond which it has: ten times the change that a physics step may make
+MAX_STRETCH = 0.2  # [-] of a cable's length beyond which it has: twice that of any resting cable
 
 
 class Cables(NamedTuple):
@@ -49,7 +49,11 @@ def make_common(system: System, parameters: Parameters) -> Cables:
 
 @kernel
 def cable_tension(stiffness, damping, stretch, rate):
-    """Return the tension [N] of a spring and damper at a stretch [m] and its rate [m/s]: it pulls and never pushes."""
+    """Return the tension [N] of a spring and damper at a stretch [m] and its rate [m/s], never negative.
+
+    MuJoCo's tendon limits have the same law (`massless.limit_solref`); links of chains have it at the end of a substep,
+    implicitly and of both signs (`chain_solver.py`).
+    """
     return max(0.0, stiffness * stretch + damping * rate)
 
 
@@ -70,7 +74,8 @@ def update_tension_stats(rows, mask, value, data, cables):
 
     One call serves all environments, because handing over a named tuple costs two atomic operations for each array.
     """
-    state, stats = data.state, data.stats
+    state = data.state
+    stats = data.stats
     for e in range(rows.first, rows.first + rows.state.shape[0]):
         if mask[e] != value:
             continue

@@ -1,4 +1,4 @@
-"""Massless cables: a pull-only Kelvin-Voigt element on a MuJoCo tendon limit.
+"""Massless cables: a Kelvin-Voigt element without compression on a MuJoCo tendon limit.
 
 With direct solref (-A, -B) and constant impedance I, a stretched limit's row wants the acceleration
 -(A r + B v)/I for stretch r and stretch rate v, softened by the regulariser R = (1 - I)/I · tendon_invweight0. For
@@ -55,7 +55,7 @@ from multilift_marl.sim.parameters import MASSES, Inertias, Parameters
 from multilift_marl.sim.state import SimData, hook_position
 from multilift_marl.sim.state_io import Rows, read_payload, write_bodies
 
-SLACK = 1.0  # [-] of its length: a cable whose ends are closer pulls with nothing
+SLACK = 1.0  # [-] of its length: a cable whose ends are closer has no tension
 IMPEDANCE = 0.01  # [-] I: large enough for the solver's scaling, small enough for a softening of 1 %
 _FAR = 1e9  # [m] at which the limit of a broken cable's tendon begins
 
@@ -69,7 +69,8 @@ def add_cable(spec: mujoco.MjSpec, system: System, index: int) -> None:
     cable.solimp_limit = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2]
     cable.width = 0.006
     cable.rgba = [0.08, 0.08, 0.1, 1]
-    sensor, tendon = mujoco.mjtSensor.mjSENS_TENDONLIMITFRC, mujoco.mjtObj.mjOBJ_TENDON
+    sensor = mujoco.mjtSensor.mjSENS_TENDONLIMITFRC
+    tendon = mujoco.mjtObj.mjOBJ_TENDON
     spec.add_sensor(name=f"{name}/tension", type=sensor, objtype=tendon, objname=name)
 
 
@@ -142,7 +143,9 @@ def read_state(rows, tension, data, cables):
         data: SimData, written.
         cables: MasslessCables.
     """
-    state, stats, diverged = data.state, data.stats, data.diverged
+    state = data.state
+    stats = data.stats
+    diverged = data.diverged
     for i in range(rows.state.shape[0]):
         e = rows.first + i
         line = rows.state[i]
