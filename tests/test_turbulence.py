@@ -156,11 +156,11 @@ def test_an_episode_is_the_same_alone_in_a_batch_and_on_any_number_of_threads():
     batches = [make(num_envs=8, num_threads=threads, **WINDY) for threads in (1, 2)]
     for vec in (alone, *batches):
         vec.reset(seed=3)
-    flown = [fly(vec, 20) for vec in (alone, *batches)]
-    assert same(flown[1], flown[2])
-    for ((obs, reward), gust), ((obs_8, reward_8), gust_8) in zip(flown[0], flown[1], strict=True):
+    flights = [fly(vec, 20) for vec in (alone, *batches)]
+    assert same(flights[1], flights[2])
+    for ((obs, reward), gust), ((obs_8, reward_8), gust_8) in zip(flights[0], flights[1], strict=True):
         assert same(obs[0], obs_8[5]) and same(reward[0], reward_8[5]) and same(gust[0], gust_8[5])
-    assert flown[0][0][1].any()
+    assert flights[0][0][1].any()
 
 
 def test_turbulence_changes_no_other_draw_of_an_episode():
