@@ -56,7 +56,7 @@ from multilift_marl.sim.state import SimData, hook_position
 from multilift_marl.sim.state_io import Rows, read_payload, write_bodies
 
 SLACK = 1.0  # [-] of its length: a cable whose ends are closer has no tension
-IMPEDANCE = 0.01  # [-] I: large enough for the solver's scaling, small enough for a softening of 1 %
+IMPEDANCE = 0.01  # [-] I: in motion the cable is softer than its law by about this
 _FAR = 1e9  # [m] at which the limit of a broken cable's tendon begins
 
 
