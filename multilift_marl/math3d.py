@@ -1,4 +1,4 @@
-"""Vectors, rotations, quaternions and smooth ways on scalars, for compiled loops.
+"""Vectors, rotations, quaternions and smooth paths on scalars, for compiled loops.
 
 A vector is a tuple of 3, a matrix of 9 (rows). Quaternions are (w, x, y, z). Tuples live in registers, so that a loop
 over drones allocates nothing.
@@ -11,6 +11,8 @@ from math import atan2, cos, sin, sqrt
 import numpy as np
 
 from multilift_marl._jit import kernel
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def triple(vector: np.ndarray) -> tuple[float, float, float]:
@@ -265,12 +267,12 @@ def segment_distance(p1, q1, p2, q2):
 
 @kernel
 def ease(t, begin, seconds):
-    """Return the share of a smooth way done at time t [s], and its first three derivatives in time.
+    """Return the fraction of a smooth path covered at time t [s], and its first three derivatives in time.
 
     The polynomial of degree seven whose first three derivatives are zero at both ends.
     """
     s = min(max((t - begin) / seconds, 0.0), 1.0)
     u = s * (1.0 - s)
-    share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
+    fraction = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
     second = 420.0 * u**2 * (1.0 - 2.0 * s) / seconds**2
-    return share, 140.0 * u**3 / seconds, second, 840.0 * u * (1.0 - 5.0 * u) / seconds**3
+    return fraction, 140.0 * u**3 / seconds, second, 840.0 * u * (1.0 - 5.0 * u) / seconds**3

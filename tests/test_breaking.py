@@ -44,8 +44,8 @@ def test_drone_and_load_part_as_free_bodies(model):
     world.step(thrust, 100)
     system = world.system
     lift = thrust[0, 0].sum() / system.vehicle.mass - GRAVITY
-    rope = 0 if model == "massless" else system.cable_mass[0]
-    assert world.state.payload_velocity[0, 2] - load_speed[2] == pytest.approx(-0.4 * GRAVITY, rel=1e-2 + rope)
+    cable_mass = 0 if model == "massless" else system.cable_mass[0]
+    assert world.state.payload_velocity[0, 2] - load_speed[2] == pytest.approx(-0.4 * GRAVITY, rel=1e-2 + cable_mass)
     assert world.state.drone_velocity[0, 0, 2] - drone_speed[2] == pytest.approx(0.4 * lift, rel=1e-3)
     assert world.state.cable_tension[0, 0] == 0 and not world.diverged.any()
     assert not any(shard.batch.warning[:, :, 1].any() for shard in world.shards)

@@ -101,7 +101,7 @@ def test_a_cable_is_a_kelvin_voigt_element(damping, tolerance):
         assert actual == pytest.approx(expected, abs=tolerance * abs(start)), t
 
 
-def test_a_slack_cable_pulls_with_exactly_nothing():
+def test_a_slack_cable_has_no_tension_at_all():
     world = World(make_system(4), 1, 1)
     world.state.drone_position[..., 2] -= 0.5
     load(world)

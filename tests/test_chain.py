@@ -7,7 +7,7 @@ import pytest
 from conftest import GRAVITY, hover_thrust, load, make_system, same, steady, without_drag
 
 from multilift_marl.sim import World
-from multilift_marl.sim.catenary import SLACK, hang
+from multilift_marl.sim.cables.catenary import SLACK, hang
 from multilift_marl.validation.chains import exponential
 from multilift_marl.validation.conservation import totals
 
@@ -268,7 +268,7 @@ def test_a_bent_chain_pushes_its_ends_apart():
         load(world)
         world.step(hover_thrust(world), 50)
         speeds.append(world.state.payload_velocity[0, 2])
-    assert speeds[1] < speeds[0] - 0.05  # the bent rope pushes payload and drone apart
+    assert speeds[1] < speeds[0] - 0.05  # the bent chain pushes payload and drone apart
 
 
 def test_the_payload_comes_to_rest_on_the_ground():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import CABLES, TASKS, make, zeros
 
-from multilift_marl.sim.cables import limit_solref
+from multilift_marl.sim.cables.massless import limit_solref
 
 STARTS = list(product(CABLES, TASKS))
 MASSLESS = pytest.mark.parametrize("starts", STARTS[: len(TASKS)], indirect=True, ids="-".join)  # draws know no cables

@@ -1,4 +1,4 @@
-"""Cables tied off the drones' centres of mass: equilibrium, the moment they exert, what is told of them."""
+"""Cables tied off the drones' centres of mass: equilibrium, the moment they exert, observations of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import hook_moment
 from multilift_marl.math3d import axis_angle, rot_z
 from multilift_marl.sim import World
-from multilift_marl.sim.hover import hook_position
+from multilift_marl.sim.state import hook_position
 
 BELOW = [0.0, 0.0, -0.05]
 ASIDE = [[0.03, 0.02, -0.05], [0.0, 0.03, 0.02], [-0.02, 0.0, -0.04], [0.0, 0.0, 0.0]]
@@ -124,7 +124,7 @@ def test_the_controller_feeds_the_moment_of_the_pull_forward():
         np.testing.assert_allclose(found, expected, atol=1e-15)
 
 
-# What is told
+# Observations
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -133,8 +133,8 @@ def test_starts_and_observations_are_of_the_hooks(model):
     observation, _ = vec.reset(seed=0)
     world, at = vec.world, vec.observation_names.index("cable_0")
     span = np.linalg.norm(hooks_of(world) - anchors_of(world), axis=-1)
-    told = np.linalg.norm(observation[..., at : at + 3], axis=-1)
-    np.testing.assert_allclose(told, span / world.system.cable_length, rtol=1e-6)
+    observed = np.linalg.norm(observation[..., at : at + 3], axis=-1)
+    np.testing.assert_allclose(observed, span / world.system.cable_length, rtol=1e-6)
     stretch = 1 + world.state.cable_tension / world.system.cable_stiffness
     np.testing.assert_allclose(span, stretch, rtol=1e-9 if model == "massless" else 1e-4)
     place = hook_position(3, 1, world.state, world.system.hooks)

@@ -18,8 +18,8 @@ from multilift_marl import _kernel_cache
 WEIGHTS = """
 from multilift_marl.rig.vehicles import GRAVITY
 import numpy as np
-from multilift_marl.sim.hover import Drones, hover_drone
-from multilift_marl.sim.state import SystemState
+from multilift_marl.rig.constants import Drones
+from multilift_marl.sim.state import SystemState, hover_drone
 state = SystemState.zeros(1, 1)
 one = np.ones(1)
 hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, Drones(one, one, np.ones((1, 4, 4)), np.zeros((1, 3)), False))
@@ -82,7 +82,7 @@ def kernels(folder: Path) -> list[Path]:
 
 def test_no_compiled_kernel_outlives_a_constant_it_was_compiled_with(package, tmp_path):
     assert run(WEIGHTS, tmp_path)[0] == pytest.approx(1)
-    constants = package / "config" / "vehicles.py"
+    constants = package / "rig" / "vehicles.py"
     source = constants.read_text(encoding="utf-8")
     assert "GRAVITY = 9.81" in source
     constants.write_text(source.replace("GRAVITY = 9.81", "GRAVITY = 3.71"))

@@ -9,7 +9,7 @@ from conftest import make, zeros
 
 from multilift_marl.rendering import Stage
 from multilift_marl.rendering.overlays import TENSION_COLOURS, dashes, tension_colours
-from multilift_marl.sim.visuals import DRONE_COLOURS
+from multilift_marl.sim.scene import DRONE_COLOURS
 from multilift_marl.tasks.base import Box
 from multilift_marl.tasks.paths import own_time
 

@@ -57,8 +57,8 @@ def test_a_team_hangs_by_its_hooks_with_its_own_masses_cables_and_thrust(model):
     commanded = of_each("thrust_coefficient")[:, None] * state.rotor_speed**2
     thrust = p.vehicle_thrust_coefficient[..., None] * commanded
     lift = (thrust.sum(axis=2) * state.drone_rotation[..., 2, 2]).sum(axis=1)
-    rope = (world.system.cable_mass * p.cable_length / world.system.cable_length).sum(axis=1)
-    weight = GRAVITY * (p.payload_mass + p.vehicle_mass.sum(axis=1) + rope)
+    cable_mass = (world.system.cable_mass * p.cable_length / world.system.cable_length).sum(axis=1)
+    weight = GRAVITY * (p.payload_mass + p.vehicle_mass.sum(axis=1) + cable_mass)
     np.testing.assert_allclose(lift, weight, rtol=1e-9 if model == "massless" else 2e-3)
     world.step(commanded, 10)
     assert np.abs(state.payload_position - before[1]).max() < 2e-4

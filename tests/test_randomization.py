@@ -76,28 +76,28 @@ def test_no_draw_follows_another(draws):
 def test_other_draws_stay_what_they_are_without(draws):
     plain, more = make(num_drones=3), make(num_drones=3, **ALL)
     for _ in range(2):
-        told, telling = plain.reset(seed=4)[1]["randomization"], more.reset(seed=4)[1]["randomization"]
-        assert same(told["payload_mass"], telling["payload_mass"])
-        assert same(told["payload_force"], telling["payload_force"])
+        info, varied = plain.reset(seed=4)[1]["randomization"], more.reset(seed=4)[1]["randomization"]
+        assert same(info["payload_mass"], varied["payload_mass"])
+        assert same(info["payload_force"], varied["payload_force"])
         assert same(plain.task.goal, more.task.goal)
     narrow = make(num_drones=3, **(ALL | {"randomization.cable_length": 0.0, "randomization.wind": 0.0}))
     narrow = narrow.reset(seed=4)[1]["randomization"]
-    assert same(narrow["vehicle_mass"], telling["vehicle_mass"])
+    assert same(narrow["vehicle_mass"], varied["vehicle_mass"])
     assert (narrow["cable_length"] == 1.0).all() and not narrow["wind"].any()
 
 
-def test_info_tells_the_draw_at_reset_and_at_every_step(task, cables):
+def test_info_holds_the_draw_at_reset_and_at_every_step(task, cables):
     vec = make(task, **{"randomization.vehicle_mass": 0.1}, **cables)
-    told = vec.reset()[1]["randomization"]
+    drawn = vec.reset()[1]["randomization"]
     info = vec.step(zeros(vec))[4]
-    assert same(told, info["randomization"])
-    assert same(told["vehicle_mass"], vec.world.parameters.vehicle_mass)
-    assert same(told["payload_force"], vec.world.hidden_loads.payload_force)
+    assert same(drawn, info["randomization"])
+    assert same(drawn["vehicle_mass"], vec.world.parameters.vehicle_mass)
+    assert same(drawn["payload_force"], vec.world.hidden_loads.payload_force)
     with pytest.raises(ValueError, match="read-only"):
-        told["vehicle_mass"][0] = 1
+        drawn["vehicle_mass"][0] = 1
     again = vec.reset(mask=mask(4, 1))[1]["randomization"]
-    assert same(told["vehicle_mass"][[0, 2, 3]], again["vehicle_mass"][[0, 2, 3]])
-    assert (told["vehicle_mass"][1] != again["vehicle_mass"][1]).all()
+    assert same(drawn["vehicle_mass"][[0, 2, 3]], again["vehicle_mass"][[0, 2, 3]])
+    assert (drawn["vehicle_mass"][1] != again["vehicle_mass"][1]).all()
 
 
 def test_nothing_of_the_parameters_is_shown_to_the_drones(task, cables):
@@ -134,8 +134,9 @@ def test_teams_hang_in_equilibrium_with_their_own_cables_and_vehicles(model):
         world.system.formation_force[0] + 0.5 * GRAVITY * world.system.cable_mass[0] * np.eye(3)[2]
     )
     expected = tension * p.payload_mass / world.system.payload_mass
-    rope = GRAVITY * world.system.cable_mass[0]
-    np.testing.assert_allclose(world.state.cable_tension, expected[:, None].repeat(3, 1), atol=1e-6 + 0.6 * rope)
+    cable_weight = GRAVITY * world.system.cable_mass[0]
+    tolerance = 1e-6 + 0.6 * cable_weight
+    np.testing.assert_allclose(world.state.cable_tension, expected[:, None].repeat(3, 1), atol=tolerance)
     before = world.state.payload_position.copy()
     gain = world.system.vehicle.thrust_coefficient * p.vehicle_thrust_coefficient
     lift = (gain[..., None] * world.state.rotor_speed**2).sum(axis=2) * world.state.drone_rotation[..., 2, 2]
@@ -155,19 +156,19 @@ def test_a_cable_stretches_by_its_own_stiffness_from_its_own_length(model):
     world = World(system, 2, 1)
     length, stiffness, load = np.array([[1.0], [1.1]]), np.array([[2000.0], [3000.0]]), np.array([0.4, 0.6])
     world.set_parameters(EVERYONE, cable_length=length, cable_stiffness=stiffness, payload_mass=load)
-    rope = system.cable_mass[0] * length[:, 0]
+    cable_mass = system.cable_mass[0] * length[:, 0]
     world.state.drone_position[:, 0] = world.state.payload_position + length * [0, 0, 1]
     world.load(EVERYONE)
     for _ in range(4000):
-        cable_force = GRAVITY * (load + rope + system.vehicle.mass)
+        cable_force = GRAVITY * (load + cable_mass + system.vehicle.mass)
         height = world.state.drone_position[:, 0, 2] - 2.5
         world.step(
             (cable_force - 20 * height - 12 * world.state.drone_velocity[:, 0, 2])[:, None, None].repeat(4, 2) / 4
         )
     stretch = world.state.drone_position[:, 0, 2] - world.state.payload_position[:, 2] - length[:, 0]
-    own = rope / 2 if model == "chain" else 0.0
+    own = cable_mass / 2 if model == "chain" else 0.0
     np.testing.assert_allclose(stretch, GRAVITY * (load + own) / stiffness[:, 0], rtol=1e-5)
-    last = rope if model == "chain" else 0.0
+    last = cable_mass if model == "chain" else 0.0
     np.testing.assert_allclose(world.state.cable_tension[:, 0], GRAVITY * (load + last), rtol=1e-5)
 
 

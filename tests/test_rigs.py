@@ -46,10 +46,10 @@ def test_falcon4_is_the_default_rig():
     ("recipe", "rig"), [("track_auto6", "auto6"), ("pose_falcon3", "falcon3"), ("recover_crazymarl", "crazyflie2")]
 )
 def test_recipes_that_repeat_a_rig_say_the_same(recipe, rig):
-    flown, shipped = ml.load_config(recipe), ml.load_config(f"rigs/{rig}")
-    assert flown.env.num_drones == shipped.env.num_drones
+    trained, shipped = ml.load_config(recipe), ml.load_config(f"rigs/{rig}")
+    assert trained.env.num_drones == shipped.env.num_drones
     for section in ("vehicle", "payload", "cable"):
-        assert getattr(flown, section) == getattr(shipped, section)
+        assert getattr(trained, section) == getattr(shipped, section)
 
 
 @pytest.mark.parametrize("name", RIGS)

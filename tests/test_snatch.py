@@ -7,7 +7,7 @@ import pytest
 from conftest import load, make_system, without_drag
 
 from multilift_marl.sim import World
-from multilift_marl.sim.snatch import snatch_peak
+from multilift_marl.sim.cables.massless import snatch_peak
 from multilift_marl.validation.chains import exponential
 
 

@@ -9,7 +9,7 @@ import pytest
 from conftest import free_world, hover_thrust, make, make_system, mask, same, weightless, zeros
 
 from multilift_marl.sim import Air, World
-from multilift_marl.sim.gusts import advance_turbulence, dryden, gust_share, start_turbulence, turbulence
+from multilift_marl.sim.gusts import advance_turbulence, dryden, gust_factor, start_turbulence, turbulence
 from multilift_marl.validation.air import COMPONENTS, correlation, sample_turbulence, spectrum
 
 WINDY = {"wind.velocity": [4.0, -3.0, 0.0], "wind.turbulence": True}
@@ -156,11 +156,11 @@ def test_an_episode_is_the_same_alone_in_a_batch_and_on_any_number_of_threads():
     batches = [make(num_envs=8, num_threads=threads, **WINDY) for threads in (1, 2)]
     for vec in (alone, *batches):
         vec.reset(seed=3)
-    flown = [fly(vec, 20) for vec in (alone, *batches)]
-    assert same(flown[1], flown[2])
-    for ((obs, reward), gust), ((obs_8, reward_8), gust_8) in zip(flown[0], flown[1], strict=True):
+    flights = [fly(vec, 20) for vec in (alone, *batches)]
+    assert same(flights[1], flights[2])
+    for ((obs, reward), gust), ((obs_8, reward_8), gust_8) in zip(flights[0], flights[1], strict=True):
         assert same(obs[0], obs_8[5]) and same(reward[0], reward_8[5]) and same(gust[0], gust_8[5])
-    assert flown[0][0][1].any()
+    assert flights[0][0][1].any()
 
 
 def test_turbulence_changes_no_other_draw_of_an_episode():
@@ -197,8 +197,8 @@ def test_a_saved_episode_goes_on_bit_for_bit():
 
 def test_a_gust_rises_holds_and_falls_as_one_minus_cosine():
     for t, share in ((0, 0), (1, 0), (1.25, 0.5 - 0.5 * cos(pi / 4)), (1.5, 0.5), (2, 1), (4, 1), (4.5, 0.5), (5, 0)):
-        assert gust_share(float(t), 1.0, 1.0, 2.0) == pytest.approx(share, abs=1e-15)
-    assert gust_share(1e9, 1.0, 1.0, float("inf")) == 1.0 and gust_share(6.0, 1.0, 1.0, 2.0) == 0.0
+        assert gust_factor(float(t), 1.0, 1.0, 2.0) == pytest.approx(share, abs=1e-15)
+    assert gust_factor(1e9, 1.0, 1.0, float("inf")) == 1.0 and gust_factor(6.0, 1.0, 1.0, 2.0) == 0.0
 
 
 def test_a_gust_begins_anew_with_each_episode():

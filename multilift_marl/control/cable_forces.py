@@ -26,7 +26,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.cables import cable_end
+from multilift_marl.sim.cables.catenary import cable_end
 
 TILT_WIDENING = 1.8  # [-] at tilted targets, see `place_balanced`
 MIN_TENSION_RATIO = 0.2  # of its given tension, with which every cable is to pull

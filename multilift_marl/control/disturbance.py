@@ -15,9 +15,9 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.gains import Gains, limited
 from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale, sub, tmul, vec
+from multilift_marl.rig.constants import make_drones
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.hover import make_drones
 
 # Bandwidth over ω_p m/(m + m_L), at most: ω_p of the position loop, m and m_L the masses of a drone and of its load.
 # The share m_L/(m + m_L) of a thrust comes back as pull of the cable, which slows any loop around the drone. Faster,

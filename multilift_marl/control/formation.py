@@ -24,9 +24,9 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
+from multilift_marl.rig.constants import Drones, make_drones
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.hover import Drones, make_drones
 
 LEAP_SPEED = 20.0  # [m/s] of a slot from one control step to the next: what is faster was put elsewhere ...
 LEAP_RATE = 50.0  # [rad/s] ... or turned at once

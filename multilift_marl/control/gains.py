@@ -10,9 +10,9 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.errors import warn_once
 from multilift_marl.math3d import row
+from multilift_marl.rig.constants import make_drones
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.hover import make_drones
 
 POSITION_RATIO = 5.0  # attitude's natural frequency over position's, at least
 

@@ -9,9 +9,8 @@ import numpy as np
 
 from multilift_marl.errors import nearest
 from multilift_marl.math3d import add, matrow, mul, row, sub
-from multilift_marl.sim.hover import hook_position
 from multilift_marl.sim.parameters import CONFIGURED
-from multilift_marl.sim.state import SystemState
+from multilift_marl.sim.state import SystemState, hook_position
 from multilift_marl.sim.world import World
 
 Rows = dict[str, np.ndarray]

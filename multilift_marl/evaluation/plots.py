@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from multilift_marl.evaluation.rollout import Trace
-from multilift_marl.sim.visuals import DRONE_COLOURS
+from multilift_marl.sim.scene import DRONE_COLOURS
 
 # Told apart by the colour-blind too (Okabe & Ito, Color Universal Design, 2008).
 POLICY_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -12,8 +12,7 @@ import numpy as np
 from multilift_marl.math3d import mat_to_quat
 from multilift_marl.rendering.cameras import Camera
 from multilift_marl.rendering.overlays import Trail, add_box, add_lines, dashes, tension_colours
-from multilift_marl.sim.scene import build_model
-from multilift_marl.sim.visuals import DRONE_COLOURS, PAYLOAD_COLOUR
+from multilift_marl.sim.scene import DRONE_COLOURS, PAYLOAD_COLOUR, build_model
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec

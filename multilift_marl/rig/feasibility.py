@@ -1,4 +1,4 @@
-"""What a system must be able to do before anything is simulated: hover, keep apart, and be followed by time steps.
+"""Conditions of any system, before anything is simulated: it can hover, drones keep apart, time steps resolve it.
 
 Limits of time steps are dimensionless: how far something goes within a step, in units of what the step can resolve.
 There masses, moments of inertia, lengths and stiffnesses are the least that `randomization` draws, loads the largest.
@@ -50,9 +50,9 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
             f"{describe_team(vehicles)} lift {thrust.sum():.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of "
             f"{lifted}, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
         )
-    rope = system.hook_force - system.formation_force
+    cable_weight = system.hook_force - system.formation_force
     own = (1 + ranges.vehicle_mass) * GRAVITY * system.drone_mass[:, None] * [0, 0, 1]
-    hover = np.linalg.norm(heaviest * system.formation_force + rope + own, axis=1)
+    hover = np.linalg.norm(heaviest * system.formation_force + cable_weight + own, axis=1)
     thrust *= 1 - ranges.vehicle_thrust_coefficient
     if np.any(hover > thrust):
         i = int(np.argmax(hover - thrust))
@@ -287,7 +287,7 @@ def _check_cables(ranges: RandomizationConfig, system: System) -> None:
             f"cable {i} may be {shortest[i]:.3g} m long, less than {MIN_LENGTH:g} × the span of its drone, "
             f"{system.vehicles[i].span:.3g} m; raise cable.length or lower randomization.cable_length"
         )
-    if system.cable_model != "chain":
+    if not system.cable_mass.any():
         return
     node, link = system.cable_mass / (system.cable_segments - 1), shortest / system.cable_segments
     lightness = system.timestep * np.sqrt(tension / (node * link * shortest / system.cable_length))

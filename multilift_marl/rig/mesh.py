@@ -123,7 +123,7 @@ def _surface_fault(points: np.ndarray, faces: np.ndarray) -> str | None:
 def _integrate(points: np.ndarray, faces: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Return volume [m³], centre of mass (3,) [m] and inertia about it of 1 kg (3, 3) [m²] within a closed surface.
 
-    Each triangle spans a tetrahedron with a point, of positive volume if it looks away from it and else of negative
+    Each triangle spans a tetrahedron with a point, of positive volume if it faces away from it and else of negative
     volume; those outside cancel, so the sum is exact for any shape.
     """
     origin = points.mean(axis=0)

@@ -1,4 +1,4 @@
-"""The rig in numbers: payload and anchors of any team, and the pulls that hold the payload level."""
+"""The rig in numbers: payload and anchors of any team, and the cable forces that hold the payload level."""
 
 from __future__ import annotations
 
@@ -130,9 +130,9 @@ def _outside(shape: str, size: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bool, strength: np.ndarray) -> np.ndarray:
-    """Return the cables' pulls (N, 3) [N] that hold a payload level, as near as possible to `angle` from the vertical.
+    """Return the cable forces (N, 3) [N] that hold a payload level, as near as possible to `angle` from the vertical.
 
-    The pulls nearest to those in proportion to the drones' strength, each measured by its own, in the least-squares
+    The forces nearest to those in proportion to the drones' strength, each measured by its own, in the least-squares
     sense among all that balance the weight and its moments about the centre of mass.
 
     Args:
@@ -143,7 +143,7 @@ def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bo
         strength: of each drone, relative to the mean (N,) [-].
 
     Raises:
-        ConfigError: no pulls balance the payload, or some cable would have to push.
+        ConfigError: no forces balance the payload, or some cable would have to push.
     """
     n = len(anchors)
     centre = anchors[:, :2].mean(axis=0)

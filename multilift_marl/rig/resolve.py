@@ -60,20 +60,20 @@ def resolve_system(config: SystemConfig) -> System:
     stiffness = per_drone(cable.stiffness, n, "cable.stiffness")
     point, angle = payload.shape == "point", np.deg2rad(cable.angle)
     force = formation_forces(anchors, mass * GRAVITY, angle, point, spare / mean(list(spare)))
-    chain = cable.model == "chain"
-    segments = per_drone(cable.segments if chain else 1, n, "cable.segments").astype(int)
-    rope = per_drone(cable.density, n, "cable.density") * length if chain else np.zeros(n)
+    massless = cable.model == "massless"
+    segments = per_drone(1 if massless else cable.segments, n, "cable.segments").astype(int)
+    cable_mass = np.zeros(n) if massless else per_drone(cable.density, n, "cable.density") * length
     ends = anchors.copy()
     for i, links in enumerate(segments):
-        forces = _segment_forces(force[i], rope[i], links)
+        forces = _segment_forces(force[i], cable_mass[i], links)
         tension = np.linalg.norm(forces, axis=1)
         reach = length[i] / links + tension / (links * stiffness[i])
         ends[i] += (forces / tension[:, None] * reach[:, None]).sum(axis=0)
-    bending_damping = _BENDING_DECAY * rope / np.maximum(segments - 1, 1) * (length / segments) ** 2
+    bending_damping = _BENDING_DECAY * cable_mass / np.maximum(segments - 1, 1) * (length / segments) ** 2
     if cable.bending_damping is not None:
         bending_damping = np.full(n, cable.bending_damping)
     hooks = vector_per_drone(cable.hook, n, "cable.hook")
-    resting = resting_rotations(vehicles, force + GRAVITY * rope[:, None] * [0, 0, 1])
+    resting = resting_rotations(vehicles, force + GRAVITY * cable_mass[:, None] * [0, 0, 1])
     slots = ends - (resting * hooks[:, None, :]).sum(axis=-1)
     centred = np.hypot(slots[:, 0], slots[:, 1]) < 1e-9
     system = System(
@@ -95,7 +95,7 @@ def resolve_system(config: SystemConfig) -> System:
             np.inf if cable.breaking_load is None else cable.breaking_load, n, "cable.breaking_load"
         ),
         cable_segments=segments,
-        cable_mass=rope,
+        cable_mass=cable_mass,
         bending_stiffness=np.full(n, cable.bending_stiffness),
         bending_damping=bending_damping,
         formation_force=force,
@@ -119,7 +119,7 @@ def resolve_system(config: SystemConfig) -> System:
 
 
 def _segment_forces(force: np.ndarray, mass: float, segments: int) -> np.ndarray:
-    """Return the pulls (segments, 3) [N] of a cable of `mass` [kg] that pulls the payload by `force` (3,) [N].
+    """Return the forces (segments, 3) [N] in a cable of `mass` [kg] that holds the payload by `force` (3,) [N].
 
     Its mass is that of the nodes between segments, so each segment carries one node's weight more than that below it.
     """

@@ -1,4 +1,4 @@
-"""The physical system in numbers: what is simulated, and what controllers and tasks know of it."""
+"""The physical system in numbers, as simulated, and nominal to controllers and tasks."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class System:
         payload_axes: quaternion of the principal axes in its frame (4,).
         payload_drag_area: C_d A [m²].
         anchors: attachment of each cable from the payload's centre of mass, in its frame (N, 3) [m].
-        cable_model: "massless" or "chain".
+        cable_model: name of a model of `sim.cables`.
         cable_length, cable_stiffness, cable_damping: (N,) [m], [N/m], [N s/m].
         breaking_load: tension that breaks each cable (N,) [N]; infinite if none does.
         cable_segments: links of each cable (N,); 1 if massless.
         cable_mass: (N,) [kg]; 0 if massless.
         bending_stiffness, bending_damping: between the links of a chain (N,) [N m/rad], [N m s/rad].
-        formation_force: pull of each cable on the resting payload, in the payload frame (N, 3) [N].
+        formation_force: force of each cable on the resting payload, in the payload frame (N, 3) [N].
         hooks: where each cable is tied to its drone, from its centre of mass, in its frame (N, 3) [m].
         cable_ends: the hooks of resting drones in the payload frame, cables stretched and sagging (N, 3) [m].
         slots: resting drones in the payload frame (N, 3) [m].
@@ -101,7 +101,7 @@ class System:
 
     @property
     def hook_force(self) -> np.ndarray:
-        """Pull of each resting drone on its cable, which is the payload's share and the cable's weight (N, 3) [N]."""
+        """Force of each resting drone on its cable: `formation_force` and the cable's weight (N, 3) [N]."""
         return self.formation_force + GRAVITY * self.cable_mass[:, None] * [0, 0, 1]
 
     @property
@@ -110,7 +110,7 @@ class System:
 
         Nodes m that move to and fro across links l have ω² = 16 κ/(m l²), and by damping alone the rate 16 β/(m l²).
         """
-        if self.cable_model != "chain":
+        if not self.cable_mass.any():
             return 0.0
         inertia = self.cable_mass / (self.cable_segments - 1) * (self.cable_length / self.cable_segments) ** 2
         swing = 2 * np.sqrt(16 * self.bending_stiffness / inertia).max()
@@ -134,6 +134,6 @@ class System:
 
 
 def resting_rotations(vehicles: tuple[Vehicle, ...], cable_forces: np.ndarray) -> np.ndarray:
-    """Return the attitudes (N, 3, 3) in which drones at rest exert `pulls` (N, 3) [N] beside their own weight."""
+    """Return the attitudes (N, 3, 3) of drones that hold `cable_forces` (N, 3) [N] and their own weight at rest."""
     forces = cable_forces + GRAVITY * np.array([[0, 0, vehicle.mass] for vehicle in vehicles])
     return np.array([thrust_frame(tuple(force), 0.0) for force in forces]).reshape(-1, 3, 3)

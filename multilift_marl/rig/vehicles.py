@@ -122,7 +122,7 @@ _FALCON = Vehicle(
 # up and 0.025 s down, the numbers of RotorS' hummingbird, and those for which this controller is too slow: 0.15 s, with
 # which CrazyMARL and arplaboratory/learning-to-fly train, and 0.145 s of `crazyflie_id`, identified. docs/vehicles.md
 # says what the choice does. Idle speed: stated by none of them, assumed zero. Rotor radius: utiasDSL/gym-pybullet-
-# drones, gym_pybullet_drones/assets/cf2x.urdf; likewise below. Rotor inertia: drone-models (see below), cf2x_P250.
+# drones, gym_pybullet_drones/assets/cf2x.urdf, here and below. Rotor inertia: drone-models (see below), cf2x_P250.
 _CRAZYFLIE = Vehicle(
     name="crazyflie",
     mass=0.034,
@@ -311,7 +311,7 @@ def _resolve(fields: dict[str, Any]) -> Vehicle:
 
 
 def check_rotors(vehicle: Vehicle) -> None:
-    """Refuse rotors that overlap, which the models of wash and ground effect know nothing of: a ConfigError."""
+    """Refuse rotors that overlap, which the models of downwash and ground effect exclude: a ConfigError."""
     rotors = vehicle.rotor_positions
     apart = min(float(np.linalg.norm(a - b)) for i, a in enumerate(rotors) for b in rotors[:i])
     if 2 * vehicle.rotor_radius > apart:

@@ -1,4 +1,4 @@
-"""The air about the drones: their wash, what the ground does to their thrust, moments. docs/air.md derives it.
+"""The air about the drones: their downwash, the ground's effect on their thrust, moments. docs/air.md derives it.
 
 What is the same for the whole team, turbulence and gusts, is in `gusts.py`.
 """
@@ -12,12 +12,13 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.math3d import column, mat, norm, put, row, scale, sub, tmul, vec
+from multilift_marl.rig.constants import RigConstants, make_constants
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import AIR_DENSITY
 
 SPREADING = 0.094  # [-] half-width of a round turbulent jet over the distance (Hussein, Capp and George, JFM 1994)
 GROWTH = SPREADING / sqrt(2.0 * log(2.0))  # half the velocity is where a quarter of the momentum flux is
-_REACH = 4.0  # [-] widths of a jet beyond which it is not felt
+_REACH = 4.0  # [-] widths of a jet beyond which it is left out: e^-16 of its axis
 
 
 class AirConstants(NamedTuple):
@@ -32,16 +33,8 @@ class AirConstants(NamedTuple):
     gust_rise: float
     gust_hold: float
     downwash: bool
-    rotor_radius: np.ndarray
-    """(N,) [m]."""
-    rotor_positions: np.ndarray
-    """(N, 4, 3) [m]."""
-    arm: np.ndarray
-    """(N,) [m]."""
     payload_breadth: float
     """Radius of a disc as large as the payload's C_d A [m]."""
-    thrust_coefficient: np.ndarray
-    """(N,) [N s²]."""
     ground_effect: bool
     images: np.ndarray
     """(N, M, 2) squared distances between rotor axes [m²], each with its share of the 16 pairs of rotor and image."""
@@ -49,10 +42,13 @@ class AirConstants(NamedTuple):
     """Whether the air turns drones about their horizontal axes."""
     roll_moment: float
     """[N s] about body x, for each m/s through the air along body y."""
+    rotor_radius: np.ndarray
+    """(N,) [m]."""
+    arm: np.ndarray
+    """(N,) [m]."""
     rolling_moment: np.ndarray
-    """(N,) of each drone's rotors [kg m]."""
-    rotor_spin: np.ndarray
-    """(N, 4)."""
+    """(N,) of a rotor, over its speed and that of the air across it [kg m]."""
+    rig: RigConstants
 
     @property
     def still(self) -> bool:
@@ -62,7 +58,8 @@ class AirConstants(NamedTuple):
 
 def make_air(system: System) -> AirConstants:
     """Return the air of `system`."""
-    air, vehicles = system.air, system.vehicles
+    air = system.air
+    vehicles = system.vehicles
     hold = float("inf") if air.gust_hold is None else air.gust_hold
     return AirConstants(
         gusts=bool(air.turbulence or any(air.gust)),
@@ -72,17 +69,15 @@ def make_air(system: System) -> AirConstants:
         gust_rise=float(air.gust_rise),
         gust_hold=float(hold),
         downwash=air.wash,
-        rotor_radius=np.array([vehicle.rotor_radius for vehicle in vehicles]),
-        rotor_positions=np.array([vehicle.rotor_positions for vehicle in vehicles]),
-        arm=np.array([vehicle.arm for vehicle in vehicles]),
         payload_breadth=sqrt(system.payload_drag_area / pi),
-        thrust_coefficient=np.array([vehicle.thrust_coefficient for vehicle in vehicles]),
         ground_effect=air.ground_effect,
         images=_images(system),
         moments=bool(air.roll_moment or any(vehicle.rolling_moment for vehicle in vehicles)),
         roll_moment=float(air.roll_moment),
+        rotor_radius=np.array([vehicle.rotor_radius for vehicle in vehicles]),
+        arm=np.array([vehicle.arm for vehicle in vehicles]),
         rolling_moment=np.array([vehicle.rolling_moment for vehicle in vehicles], float),
-        rotor_spin=np.array([vehicle.rotor_spin for vehicle in vehicles], float),
+        rig=make_constants(system),
     )
 
 
@@ -102,33 +97,39 @@ def _images(system: System) -> np.ndarray:
 
 @kernel
 def update_downwash(e, state, air, c):
-    """Find the rotors' wash at every body of environment e, from the state as it is; write `air.wash`."""
-    felt, count = air.downwash[e], state.drone_position.shape[1]
-    felt[:] = 0.0
+    """Write the downwash at every body of environment e, `air.downwash`, from the state as it is."""
+    wash = air.downwash[e]
+    count = state.drone_position.shape[1]
     payload = row(state.payload_position, e)
+    wash[:] = 0.0
+    # Momentum fluxes of all jets add up at each body.
     for n in range(count):
-        attitude, here = mat(state.drone_rotation, e, n), vec(state.drone_position, e, n)
+        attitude = mat(state.drone_rotation, e, n)
+        here = vec(state.drone_position, e, n)
         speed = _vec4(state.rotor_speed, e, n)
         for i in range(count + 1):
             if i == n:
                 continue
             away = sub(vec(state.drone_position, e, i) if i < count else payload, here)
-            flux = jet_flux(n, away, c.arm[i] if i < count else c.payload_breadth, attitude, speed, c)
+            breadth = c.arm[i] if i < count else c.payload_breadth
+            flux = jet_flux(n, away, breadth, attitude, speed, c)
             if flux > 0.0:
-                put(felt[i], sub(row(felt, i), scale(flux, column(attitude, 2))))
+                put(wash[i], sub(row(wash, i), scale(flux, column(attitude, 2))))
+    # Velocities follow from their sums.
     for i in range(count + 1):
-        put(felt[i], _velocity(row(felt, i)))
+        put(wash[i], _velocity(row(wash, i)))
 
 
 @kernel
 def wash_at(e, point, breadth, state, c):
-    """Return the velocity of the wash of all drones at a point [m/s], world frame, averaged over `breadth` [m]."""
-    felt = (0.0, 0.0, 0.0)
+    """Return the velocity of the downwash of all drones at a point [m/s], world frame, averaged over `breadth` [m]."""
+    total = (0.0, 0.0, 0.0)
     for n in range(state.drone_position.shape[1]):
-        attitude, away = mat(state.drone_rotation, e, n), sub(point, vec(state.drone_position, e, n))
+        attitude = mat(state.drone_rotation, e, n)
+        away = sub(point, vec(state.drone_position, e, n))
         speed = _vec4(state.rotor_speed, e, n)
-        felt = sub(felt, scale(jet_flux(n, away, breadth, attitude, speed, c), column(attitude, 2)))
-    return _velocity(felt)
+        total = sub(total, scale(jet_flux(n, away, breadth, attitude, speed, c), column(attitude, 2)))
+    return _velocity(total)
 
 
 @kernel
@@ -146,15 +147,15 @@ def _velocity(flux):
 
 @kernel
 def jet_flux(n, away, breadth, attitude, speed, c):
-    """Return the momentum flux over density of the wash of drone n, against its thrust [m²/s²].
+    """Return the momentum flux over density of the downwash of drone n, against its thrust [m²/s²].
 
     Every rotor blows a round turbulent jet against its thrust f: the momentum flux ρ w² is Gaussian across it and
     adds up to f at any distance, the width grows in proportion to the distance once it exceeds that of the contracted
-    slipstream of momentum theory. The momentum fluxes of jets add up (Reichardt 1942). A body feels their mean over
+    slipstream of momentum theory. The momentum fluxes of jets add up (Reichardt 1942). On a body acts their mean over
     its breadth, with a Gaussian weight, so that no drag exceeds the momentum that there is.
 
     Args:
-        n: the drone that blows.
+        n: the drone whose jet it is.
         away: middle of the body from the drone, world frame [m].
         breadth: radius of the body [m]; 0 for the flux at a point.
         attitude: of the drone.
@@ -164,13 +165,16 @@ def jet_flux(n, away, breadth, attitude, speed, c):
     x, y, z = tmul(attitude, away)
     if z >= 0.0:
         return 0.0
+    # Width of the jet there, and whether any of it reaches the body.
     square = max(c.rotor_radius[n] / sqrt(2.0), -GROWTH * z) ** 2 + breadth * breadth
     if x * x + y * y > (c.arm[n] + _REACH * sqrt(square)) ** 2:
         return 0.0
+    # Thrusts of the four rotors, each weighted by the distance from its axis.
     thrust = 0.0
     for k in range(4):
-        dx, dy = x - c.rotor_positions[n, k, 0], y - c.rotor_positions[n, k, 1]
-        thrust += c.thrust_coefficient[n] * speed[k] * speed[k] * exp(-(dx * dx + dy * dy) / square)
+        dx = x - c.rig.rotor_positions[n, k, 0]
+        dy = y - c.rig.rotor_positions[n, k, 1]
+        thrust += c.rig.thrust_coefficient[n] * speed[k] * speed[k] * exp(-(dx * dx + dy * dy) / square)
     return thrust / (AIR_DENSITY * pi * square)
 
 
@@ -178,7 +182,7 @@ def jet_flux(n, away, breadth, attitude, speed, c):
 def ground_gain(height, n, c):
     """Return thrust of drone n near the ground over thrust far from it, at the same rotor speeds.
 
-    A rotor feels the images of all four as sources below the ground: 1/(1 - Σ R² z/(2 (d² + 4 z²)^1.5)) with d the
+    On a rotor act the images of all four as sources below the ground: 1/(1 - Σ R² z/(2 (d² + 4 z²)^1.5)) with d the
     distances between axes. For one rotor that is 1/(1 - (R/4z)²) (Cheeseman and Bennett, ARC R&M 3021, 1955), for a
     square of four Sanchez-Cuevas et al. 2017 without their empirical body lift. Mean of the rotors of a level drone.
 
@@ -187,7 +191,8 @@ def ground_gain(height, n, c):
         n: the drone.
         c: AirConstants.
     """
-    radius, total = c.rotor_radius[n], 0.0
+    radius = c.rotor_radius[n]
+    total = 0.0
     z = max(height, 0.5 * radius)
     for i in range(c.images.shape[1]):
         square = c.images[n, i, 0] + 4.0 * z * z
@@ -210,6 +215,6 @@ def air_moment(e, n, through, state, c):
     """
     turning = 0.0
     for k in range(4):
-        turning += c.rotor_spin[n, k] * state.rotor_speed[e, n, k]
+        turning += c.rig.rotor_spin[n, k] * state.rotor_speed[e, n, k]
     turning *= c.rolling_moment[n]
     return turning * through[0] + c.roll_moment * through[1], turning * through[1]

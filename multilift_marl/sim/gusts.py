@@ -1,19 +1,48 @@
 """Turbulence and gusts, the same for a whole team: at these heights turbulence is metres to tens of metres long.
 
-Random numbers are each environment's own, so results do not depend on how many are computed together.
+Random numbers are each environment's own, by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), one word of state. They
+depend on its seed and how many it has drawn before, so results do not depend on how many are computed together.
 """
 
 from __future__ import annotations
 
-from math import cos, exp, expm1, hypot, pi, sqrt
+from math import cos, exp, expm1, hypot, log, pi, sin, sqrt
+
+import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.math3d import add, clip, norm, put, row, scale, sub
-from multilift_marl.sim.rng import normal_pair
 
 FOOT = 0.3048  # [m]
-LEAST_HEIGHT, LARGEST_HEIGHT = 3.0, 1000 * FOOT  # [m] the low-altitude model's; below 10 ft it is not defined
-LEAST_AIRSPEED = 1.0  # [m/s]
+MIN_HEIGHT = 3.0  # [m] of the low-altitude model, which is not defined below 10 ft
+MAX_HEIGHT = 1000 * FOOT  # [m] of that model
+MIN_AIRSPEED = 1.0  # [m/s] at which a team that drifts with the wind meets turbulence
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # constants of SplitMix64
+_FIRST = np.uint64(0xBF58476D1CE4E5B9)
+_SECOND = np.uint64(0x94D049BB133111EB)
+_30 = np.uint64(30)
+_27 = np.uint64(27)
+_31 = np.uint64(31)
+_11 = np.uint64(11)
+
+
+@kernel
+def uniform(e, air):
+    """Return the next number of environment e, uniform in (0, 1]."""
+    air.generator[e] += _GOLDEN
+    z = air.generator[e]
+    z = (z ^ (z >> _30)) * _FIRST
+    z = (z ^ (z >> _27)) * _SECOND
+    z = z ^ (z >> _31)
+    return (float(z >> _11) + 1.0) * 2.0**-53
+
+
+@kernel
+def normal_pair(e, air):
+    """Return two independent standard normal numbers of environment e (Box and Muller 1958)."""
+    radius = sqrt(-2.0 * log(uniform(e, air)))
+    angle = 2.0 * pi * uniform(e, air)
+    return radius * cos(angle), radius * sin(angle)
 
 
 @kernel
@@ -27,7 +56,7 @@ def dryden(height, wind_speed):
     Returns:
         σ_u = σ_v, σ_w [m/s], L_u = L_v, L_w [m].
     """
-    feet = clip(height, LEAST_HEIGHT, LARGEST_HEIGHT) / FOOT
+    feet = clip(height, MIN_HEIGHT, MAX_HEIGHT) / FOOT
     shape = 0.177 + 0.000823 * feet
     up = 0.1 * wind_speed
     return up / shape**0.4, up, feet / shape**1.2 * FOOT, feet * FOOT
@@ -36,9 +65,12 @@ def dryden(height, wind_speed):
 @kernel
 def start_turbulence(e, air):
     """Draw the filters' state of environment e from its stationary distribution."""
-    (a, b), (c, d), (f, _) = normal_pair(e, air), normal_pair(e, air), normal_pair(e, air)
+    a, b = normal_pair(e, air)
+    c, d = normal_pair(e, air)
+    f, _ = normal_pair(e, air)
     put(air.filter[e], (a, b, 0.5 * b + 0.5 * c))
-    air.filter[e, 3], air.filter[e, 4] = d, 0.5 * d + 0.5 * f
+    air.filter[e, 3] = d
+    air.filter[e, 4] = 0.5 * d + 0.5 * f
 
 
 @kernel
@@ -54,7 +86,9 @@ def advance_turbulence(e, air, across, upward):
         air: its filter states are written.
         across, upward: time step over T = L/V of the horizontal components and of the vertical one [-].
     """
-    (a, b), (c, d), (f, _) = normal_pair(e, air), normal_pair(e, air), normal_pair(e, air)
+    a, b = normal_pair(e, air)
+    c, d = normal_pair(e, air)
+    f, _ = normal_pair(e, air)
     x = air.filter[e]
     x[0] = exp(-across) * x[0] + sqrt(-expm1(-2.0 * across)) * a
     x[1], x[2] = _step_pair(x[1], x[2], across, b, c)
@@ -64,7 +98,8 @@ def advance_turbulence(e, air, across, upward):
 @kernel
 def _step_pair(x, y, h, a, b):
     """Return the two states of a transverse filter after a step h, in units of T, with normal numbers a and b."""
-    decay, left = exp(-h), exp(-2.0 * h)
+    decay = exp(-h)
+    left = exp(-2.0 * h)
     first = sqrt(-expm1(-2.0 * h))
     both = (0.5 - left * (h + 0.5)) / first
     second = sqrt(max(0.0, 0.5 - left * (h * h + h + 0.5) - both * both))
@@ -81,7 +116,8 @@ def turbulence(e, air, across, upward, wind):
         across, upward: intensities σ_u = σ_v and σ_w [m/s].
         wind: mean wind [m/s].
     """
-    x, root = air.filter[e], sqrt(3.0)
+    x = air.filter[e]
+    root = sqrt(3.0)
     u = across * x[0]
     v = across * (root * x[1] + (1.0 - root) * x[2]) / sqrt(2.0)
     w = upward * (root * x[3] + (1.0 - root) * x[4]) / sqrt(2.0)
@@ -91,8 +127,8 @@ def turbulence(e, air, across, upward, wind):
 
 
 @kernel
-def gust_share(t, start, rise, hold):
-    """Return the share of a "1 - cosine" gust's amplitude at time t (MIL-F-8785C, 3.7), held and taken back."""
+def gust_factor(t, start, rise, hold):
+    """Return a "1 - cosine" gust over its amplitude at time t (MIL-F-8785C, 3.7), held and taken back."""
     s = t - start
     if s <= 0.0:
         return 0.0
@@ -106,7 +142,7 @@ def gust_share(t, start, rise, hold):
 
 @kernel
 def step_gusts(e, wind, state, air, timestep, c):
-    """Return turbulence and gust of this step [m/s], kept in `air.gust`, and go on to the next step.
+    """Return turbulence and gust of this step [m/s], kept in `air.gust`, and advance both to the next step.
 
     Height and airspeed are the payload's.
 
@@ -117,11 +153,11 @@ def step_gusts(e, wind, state, air, timestep, c):
         timestep: [s].
         c: AirConstants.
     """
-    gust = scale(gust_share(air.steps[e] * timestep, c.gust_start, c.gust_rise, c.gust_hold), c.gust)
+    gust = scale(gust_factor(air.steps[e] * timestep, c.gust_start, c.gust_rise, c.gust_hold), c.gust)
     if c.turbulence:
         across, upward, long, high = dryden(state.payload_position[e, 2], hypot(wind[0], wind[1]))
         gust = add(gust, turbulence(e, air, across, upward, wind))
-        distance = timestep * max(LEAST_AIRSPEED, norm(sub(row(state.payload_velocity, e), wind)))
+        distance = timestep * max(MIN_AIRSPEED, norm(sub(row(state.payload_velocity, e), wind)))
         advance_turbulence(e, air, distance / long, distance / high)
     put(air.gust[e], gust)
     air.steps[e] += 1

@@ -1,24 +1,23 @@
-"""True parameters that may differ between environments and from what the controller knows.
+"""True parameters that may differ between environments and from those of the controller.
 
 They are absolute, or factors on what the configuration says: setting them twice is the same as setting them once.
 """
 
 from __future__ import annotations
 
-from math import exp
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from multilift_marl.math3d import quat_to_mat
+from multilift_marl.rig.constants import rotor_lag
 from multilift_marl.rig.system import System
-from multilift_marl.sim.cables import limit_solref
-from multilift_marl.sim.scene import Layout
+from multilift_marl.sim.state_io import Layout
 
 
 class Parameters(NamedTuple):
-    """What of the system each environment may have its own of."""
+    """The system's parameters in which environments may differ."""
 
     payload_mass: np.ndarray
     """(E,) [kg]; inertia scales with it."""
@@ -42,13 +41,12 @@ class Parameters(NamedTuple):
     """(E, N) [-]."""
 
 
-_FAR = 1e9  # [m] at which the limit of a broken cable's tendon begins
 POSITIVE = tuple(name for name in Parameters._fields if not name.endswith(("center_of_mass", "drag")))
 CONFIGURED = (  # cost something in every step, so they may only differ where the configuration says that they do
     "payload_center_of_mass", "payload_drag", "vehicle_thrust_coefficient", "vehicle_rotor_time_constant",
     "vehicle_drag",
 )  # fmt: skip
-_MASSES = frozenset(("payload_mass", "payload_inertia", "payload_center_of_mass", "vehicle_mass"))
+MASSES = frozenset(("payload_mass", "payload_inertia", "payload_center_of_mass", "vehicle_mass"))
 
 
 class RotorVariation(NamedTuple):
@@ -56,16 +54,29 @@ class RotorVariation(NamedTuple):
 
     payload_center_of_mass: np.ndarray
     """(E, 3) from the nominal one, payload frame [m]."""
+    center_varies: bool
+    """Whether that may be off the origin of the payload's free joint."""
     payload_drag: np.ndarray
     """(E,) [-] over nominal."""
     thrust: np.ndarray
-    """(E, N) [-] likewise."""
+    """(E, N) [-] over nominal."""
     drag: np.ndarray
-    """(E, N) [-] likewise."""
-    rising: np.ndarray
-    """(E, N, 3), see `dynamics.Constants`."""
-    falling: np.ndarray
-    """(E, N, 3)."""
+    """(E, N) [-] over nominal."""
+    lag: np.ndarray
+    """(E, N, 2, 3), see `RigConstants`."""
+
+
+class Inertias(NamedTuple):
+    """Masses and moments of inertia that follow from parameters: body 0 is the payload, 1 + n drone n."""
+
+    mass: np.ndarray
+    """(E, 1 + N) [kg]."""
+    inertia: np.ndarray
+    """(E, 1 + N, 3, 3) about the centre of mass, body frame [kg m²]."""
+    inverse: np.ndarray
+    """(E, 1 + N, 3, 3) its inverse; zero of a point payload, which does not turn."""
+    center: np.ndarray
+    """(E, 1 + N, 3) centre of mass from the origin of the body frame [m]."""
 
 
 def nominal_parameters(system: System, num_envs: int) -> Parameters:
@@ -85,11 +96,6 @@ def nominal_parameters(system: System, num_envs: int) -> Parameters:
     )
 
 
-def lag_shares(h: float) -> tuple[float, float, float]:
-    """Return exp(-h), and the means of exp(-t) and exp(-2t) over 0 to h, for a step h in time constants."""
-    return exp(-h), (1 - exp(-h)) / h, (1 - exp(-2 * h)) / (2 * h)
-
-
 def make_rotor_variation(system: System, parameters: Parameters) -> RotorVariation | None:
     """Return what the loops need, None where neither the payload's centre of mass nor rotors nor drag vary."""
     if not system.varied.intersection(CONFIGURED):
@@ -97,11 +103,11 @@ def make_rotor_variation(system: System, parameters: Parameters) -> RotorVariati
     e, n = parameters.vehicle_mass.shape
     varied = RotorVariation(
         payload_center_of_mass=parameters.payload_center_of_mass,
+        center_varies="payload_center_of_mass" in system.varied,
         payload_drag=parameters.payload_drag,
         thrust=parameters.vehicle_thrust_coefficient,
         drag=parameters.vehicle_drag,
-        rising=np.zeros((e, n, 3)),
-        falling=np.zeros((e, n, 3)),
+        lag=np.zeros((e, n, 2, 3)),
     )
     write_lags(varied, system, parameters, np.ones(e, bool))
     return varied
@@ -112,8 +118,32 @@ def write_lags(varied: RotorVariation, system: System, parameters: Parameters, m
     for e in np.flatnonzero(mask):
         for n, vehicle in enumerate(system.vehicles):
             factor = parameters.vehicle_rotor_time_constant[e, n]
-            varied.rising[e, n] = lag_shares(system.timestep / (factor * vehicle.rotor_time_constant_up))
-            varied.falling[e, n] = lag_shares(system.timestep / (factor * vehicle.rotor_time_constant_down))
+            varied.lag[e, n] = rotor_lag(vehicle, system.timestep, factor)
+
+
+def make_inertias(system: System, parameters: Parameters) -> Inertias:
+    """Return the inertias of `system`, those of each environment by `parameters`."""
+    e, n = parameters.vehicle_mass.shape
+    b = 1 + n
+    inertias = Inertias(np.zeros((e, b)), np.zeros((e, b, 3, 3)), np.zeros((e, b, 3, 3)), np.zeros((e, b, 3)))
+    update_inertias(inertias, system, parameters)
+    return inertias
+
+
+def update_inertias(inertias: Inertias, system: System, parameters: Parameters) -> None:
+    """Bring inertias into line with parameters."""
+    inertias.mass[:, 0] = parameters.payload_mass
+    inertias.mass[:, 1:] = parameters.vehicle_mass
+    inertias.center[:, 0] = parameters.payload_center_of_mass
+    axes = np.reshape(quat_to_mat(*system.payload_axes.tolist()), (3, 3))
+    scale = parameters.payload_mass / system.payload_mass * parameters.payload_inertia
+    inertias.inertia[:, 0] = scale[:, None, None] * (axes * system.payload_inertia @ axes.T)
+    for i, vehicle in enumerate(system.vehicles):
+        own = parameters.vehicle_mass[:, i] / vehicle.mass
+        inertias.inertia[:, 1 + i] = own[:, None, None] * np.diag(vehicle.inertia)
+    inertias.inverse[:, 1:] = np.linalg.inv(inertias.inertia[:, 1:])
+    if system.payload_shape != "point":
+        inertias.inverse[:, 0] = np.linalg.inv(inertias.inertia[:, 0])
 
 
 def check_parameters(system: System, old: Parameters, mask: np.ndarray, values: dict[str, np.ndarray]) -> None:
@@ -143,9 +173,11 @@ def update_parameters(
         ValueError: see `check_parameters`.
     """
     check_parameters(system, parameters, mask, values)
-    changed, names = np.zeros(len(mask), bool), set()
+    changed = np.zeros(len(mask), bool)
+    names = set()
     for name, value in values.items():
-        old, new = getattr(parameters, name), np.asarray(value)
+        old = getattr(parameters, name)
+        new = np.asarray(value)
         differs = mask & (new != old).reshape(len(mask), -1).any(axis=1)
         if differs.any():
             changed |= differs
@@ -154,48 +186,31 @@ def update_parameters(
     return changed, names
 
 
-def write_model(
-    batch: Batch, model: mujoco.MjModel, layout: Layout, system: System, p: Parameters,
-    chosen: np.ndarray, names: set[str], broken: np.ndarray,
-) -> None:  # fmt: skip
-    """Write parameters into a batch's models, with all that MuJoCo derives from them.
+def write_masses(
+    batch: Batch, layout: Layout, system: System, parameters: Parameters, mask: np.ndarray, names: set[str]
+) -> None:
+    """Write masses, inertias and centres of mass into a batch's models, with all that MuJoCo derives from them.
 
     Args:
         batch: of n simulations.
-        model, layout, system: what they share.
-        p: of these n.
-        chosen: (n,) bool, those with new parameters.
-        names: what of them is new.
-        broken: (n, N) cables.
+        layout, system: common to them.
+        parameters: of these n.
+        mask: (n,) bool, those with new parameters.
+        names: the new parameters.
     """
-    mass = p.payload_mass[chosen] / system.payload_mass * p.payload_inertia[chosen]
+    if not names & MASSES:
+        return
+    p = parameters
     if names & {"payload_mass", "payload_inertia"}:
-        batch.expand("body_mass")[chosen, layout.payload_body] = p.payload_mass[chosen]
-        batch.expand("body_inertia")[chosen, layout.payload_body] = system.payload_inertia * mass[:, None]
+        factor = p.payload_mass[mask] / system.payload_mass * p.payload_inertia[mask]
+        batch.expand("body_mass")[mask, layout.payload_body] = p.payload_mass[mask]
+        batch.expand("body_inertia")[mask, layout.payload_body] = system.payload_inertia * factor[:, None]
     if "payload_center_of_mass" in names:
-        batch.expand("body_ipos")[chosen, layout.payload_body] = p.payload_center_of_mass[chosen]
+        batch.expand("body_ipos")[mask, layout.payload_body] = p.payload_center_of_mass[mask]
     if "vehicle_mass" in names:
-        weights, moments = batch.expand("body_mass"), batch.expand("body_inertia")
         for n, vehicle in enumerate(system.vehicles):
-            own = p.vehicle_mass[chosen, n]
-            weights[chosen, layout.drone_bodies[n]] = own
-            moments[chosen, layout.drone_bodies[n]] = np.array(vehicle.inertia) * (own / vehicle.mass)[:, None]
-    massless, longer = system.cable_model == "massless", "cable_length" in names
-    if longer:
-        apply_cable_limits(batch, system, p, broken)
-    heavier = bool(names & _MASSES)
-    if massless and (heavier or "cable_stiffness" in names):
-        batch.expand("tendon_solref_lim")
-    if heavier:
-        batch.set_const(chosen)
-    if massless and (heavier or "cable_stiffness" in names):
-        inverse_weight = batch.expanded("tendon_invweight0")
-        own = model.tendon_invweight0 if inverse_weight is None else inverse_weight[chosen]
-        solref = limit_solref(p.cable_stiffness[chosen], system.cable_damping, own)
-        batch.expand("tendon_solref_lim")[chosen] = solref
-
-
-def apply_cable_limits(batch: Batch, system: System, p: Parameters, broken: np.ndarray) -> None:
-    """Let the massless cables in `broken` (n, N) bool of a batch's simulations pull no more, all others be whole."""
-    if system.cable_model == "massless":
-        batch.expand("tendon_range")[..., 1] = np.where(broken, _FAR, p.cable_length)
+            own = p.vehicle_mass[mask, n]
+            moments = np.array(vehicle.inertia) * (own / vehicle.mass)[:, None]
+            batch.expand("body_mass")[mask, layout.drone_bodies[n]] = own
+            batch.expand("body_inertia")[mask, layout.drone_bodies[n]] = moments
+    batch.set_const(mask)

@@ -15,9 +15,9 @@ class Draw:
     """The hidden parameters of each environment's episode.
 
     Args:
-        world: `plant.payload_force` and `plant.wind` are written.
+        world: `hidden_loads.payload_force` and `hidden_loads.wind` are written.
         ranges: widths of the distributions.
-        imperfections: live arrays of delays (E,) [policy steps] and biases, by name, where there are any.
+        sensing: live arrays of delays (E,) [policy steps] and biases, by name, where there are any.
 
     Attributes:
         parameters: drawn, for `World.set_parameters`.
@@ -26,7 +26,8 @@ class Draw:
     """
 
     def __init__(self, world: World, ranges: RandomizationConfig, sensing: dict[str, np.ndarray]):
-        self.system, self.ranges = world.system, ranges
+        self.system = world.system
+        self.ranges = ranges
         self._nominal = nominal_parameters(world.system, 1)
         self.parameters = nominal_parameters(world.system, world.num_envs)
         self.values = self.parameters._asdict() | {
@@ -51,7 +52,9 @@ class Draw:
         """
         for name in self.changing:
             getattr(self.parameters, name)[env] = getattr(self._nominal, name)[0]
-        factor, magnitude, direction = rng.uniform(-1.0, 1.0), rng.uniform(), rng.uniform(-np.pi, np.pi)
+        factor = rng.uniform(-1.0, 1.0)
+        magnitude = rng.uniform()
+        direction = rng.uniform(-np.pi, np.pi)
         self.parameters.payload_mass[env] = self.system.payload_mass * (1.0 + self.ranges.payload_mass * factor)
         force = self.ranges.payload_force * magnitude
         self.values["payload_force"][env] = force * np.cos(direction), force * np.sin(direction), 0.0
@@ -80,10 +83,12 @@ class Draw:
     def _draw_more(self, env: int, rng: np.random.Generator) -> None:
         """Draw what has a stream of its own; all of it, so that no part depends on which others are switched on."""
         for name in Parameters._fields[1:]:
-            array, width = getattr(self.parameters, name), np.asarray(getattr(self.ranges, name))
-            share = width * rng.uniform(-1.0, 1.0, array.shape[1:])
-            array[env] = share if name == "payload_center_of_mass" else array[env] * (1.0 + share)
-        speed, direction = self.ranges.wind * rng.uniform(), rng.uniform(-np.pi, np.pi)
+            array = getattr(self.parameters, name)
+            width = np.asarray(getattr(self.ranges, name))
+            change = width * rng.uniform(-1.0, 1.0, array.shape[1:])
+            array[env] = change if name == "payload_center_of_mass" else array[env] * (1.0 + change)
+        speed = self.ranges.wind * rng.uniform()
+        direction = rng.uniform(-np.pi, np.pi)
         self.values["wind"][env] += speed * np.cos(direction), speed * np.sin(direction), 0.0
         for name in ("action_delay", "observation_delay"):
             low, high = getattr(self.ranges, name)

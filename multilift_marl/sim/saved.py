@@ -62,7 +62,8 @@ def _misfit(
         return "is missing"
     if key not in expected:
         return f"is unknown; {cure}"
-    array, like = saved[key], expected[key]
+    array = saved[key]
+    like = expected[key]
     if not isinstance(array, np.ndarray):
         return f"is {type(array).__name__}, expected an array; give what state_dict() returned"
     if array.shape != like.shape:

@@ -1,43 +1,27 @@
-"""From a system to a MuJoCo model. The order of bodies in MuJoCo's arrays is decided here."""
+"""From a system to a MuJoCo model, with what is drawn where pictures are made; it decides the order of bodies."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from itertools import combinations, product
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from multilift_marl.rig.mesh import add_mesh
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.cables import IMPEDANCE, limit_solref
+from multilift_marl.rig.vehicles import GRAVITY, Vehicle
+from multilift_marl.sim.cables import CABLE_MODELS
 from multilift_marl.sim.contact import add_contact, drone_half_size
-from multilift_marl.sim.visuals import (
-    DRONE_COLOURS,
-    PAYLOAD_COLOUR,
-    add_light,
-    add_rotorcraft,
-    add_surroundings,
-    add_target,
-)
+from multilift_marl.sim.state_io import Layout
 
-_GEOM, _OBJECT = mujoco.mjtGeom, mujoco.mjtObj
-
-
-class Layout(NamedTuple):
-    """Where the bodies stand in MuJoCo's arrays: the payload first, then the drones, each a free joint.
-
-    A point payload has three slide joints in place of its free joint. Chains are no part of the model.
-    """
-
-    payload_nq: int
-    """Coordinates of the payload: 7, or 3 for a point."""
-    payload_nv: int
-    """Velocities of the payload: 6, or 3 for a point."""
-    payload_body: int
-    """Index of the payload among bodies."""
-    drone_bodies: tuple[int, ...]
-    """Indices of the drones among bodies."""
+_GEOM = mujoco.mjtGeom
+VISUAL_GROUP = 2
+DRONE_COLOURS = (  # distinct to the colour-blind (Okabe & Ito 2008), none of them green like the target
+    (0.00, 0.45, 0.70, 1), (0.84, 0.37, 0.00, 1), (0.80, 0.47, 0.65, 1),
+    (0.34, 0.71, 0.91, 1), (0.90, 0.62, 0.00, 1), (0.35, 0.35, 0.38, 1),
+)  # fmt: skip
+PAYLOAD_COLOUR = (0.86, 0.66, 0.35, 1)
 
 
 def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
@@ -50,7 +34,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "multilift"
     set_options(spec, system.timestep)
-    # cables are limits of tendons or act as loads: there are no springs and dampers to look for
+    # cables are limits of tendons or act as loads: there are no springs and dampers to evaluate
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
     _add_world(spec, visuals)
     _add_payload(spec, system)
@@ -58,31 +42,33 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
         body = spec.worldbody.add_body(name=f"drone_{i}", pos=system.slots[i] + [0, 0, 1.5])
         body.add_freejoint(name=f"drone_{i}")
         _add_drone(body, system, i, visuals)
-        if system.cable_model == "massless":
-            _add_cable(spec, system, i)
+        CABLE_MODELS[system.cable_model].add_cable(spec, system, i)
     add_contact(spec, system.num_drones)
     if visuals:
-        add_light(spec.body("payload"))
+        _add_light(spec.body("payload"))
         margin = 0.04 * system.payload_size.min()
-        add_target(spec, system, margin, _payload_form(system, margin))
+        _add_target(spec, system, margin, _payload_form(system, margin))
     return spec
 
 
 def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
     """Set integrator, gravity, flags, solver and Jacobian."""
-    option, disable = spec.option, mujoco.mjtDisableBit
-    option.timestep, option.gravity = timestep, [0, 0, -GRAVITY]
+    option = spec.option
+    disable = mujoco.mjtDisableBit
+    option.timestep = timestep
+    option.gravity = [0, 0, -GRAVITY]
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    option.solver, option.tolerance, option.iterations = mujoco.mjtSolver.mjSOL_CG, 1e-18, 300
+    option.solver = mujoco.mjtSolver.mjSOL_CG
+    option.tolerance = 1e-18
+    option.iterations = 300
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.disableflags |= disable.mjDSBL_REFSAFE | disable.mjDSBL_AUTORESET | disable.mjDSBL_ISLAND
 
 
 def build_model(system: System, visuals: bool = False) -> tuple[mujoco.MjModel, Layout]:
-    """Return the compiled model and where its parts stand."""
+    """Return the compiled model and where its bodies are."""
     model = build_spec(system, visuals).compile()
-    if system.cable_model == "massless":
-        model.tendon_solref_lim[:] = limit_solref(system.cable_stiffness, system.cable_damping, model.tendon_invweight0)
+    CABLE_MODELS[system.cable_model].set_constants(model, system)
     point = system.payload_shape == "point"
     drones = tuple(model.body(f"drone_{i}").id for i in range(system.num_drones))
     return model, Layout(3 if point else 7, 3 if point else 6, model.body("payload").id, drones)
@@ -100,14 +86,17 @@ def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
         mujoco.mju_mat2Quat(quat, np.stack([right, up, -forward], axis=1).ravel())
         world.add_camera(name=name, pos=pos, quat=quat, fovy=45)
     if visuals:
-        add_surroundings(spec, floor)
+        _add_surroundings(spec, floor)
 
 
 def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
     point = system.payload_shape == "point"  # its slide joints count from the body's place, so that must be the origin
     body = spec.worldbody.add_body(name="payload", pos=[0, 0, 0 if point else 1.5])
-    body.mass, body.explicitinertial = system.payload_mass, True
-    body.inertia, body.ipos, body.iquat = system.payload_inertia, [0, 0, 0], system.payload_axes
+    body.mass = system.payload_mass
+    body.explicitinertial = True
+    body.inertia = system.payload_inertia
+    body.ipos = [0, 0, 0]
+    body.iquat = system.payload_axes
     if "payload_center_of_mass" in system.varied:
         body.simple = False  # or MuJoCo takes the centre of mass to be the origin for good
     colour = list(PAYLOAD_COLOUR)
@@ -129,7 +118,9 @@ def _payload_form(system: System, margin: float = 0.0) -> dict[str, Any]:
 
     A mesh has no margin; it collides as its convex hull.
     """
-    half, pos, mesh = system.payload_size / 2 + margin, system.payload_center, system.payload_mesh
+    half = system.payload_size / 2 + margin
+    pos = system.payload_center
+    mesh = system.payload_mesh
     if mesh is not None:
         return {"type": _GEOM.mjGEOM_MESH, "meshname": "payload", "pos": pos - mesh.middle}
     if system.payload_shape == "cylinder":
@@ -138,9 +129,12 @@ def _payload_form(system: System, margin: float = 0.0) -> dict[str, Any]:
 
 
 def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> None:
-    vehicle, name = system.vehicles[i], f"drone_{i}"
-    body.mass, body.explicitinertial = vehicle.mass, True
-    body.inertia, body.ipos = vehicle.inertia, [0, 0, 0]
+    vehicle = system.vehicles[i]
+    name = f"drone_{i}"
+    body.mass = vehicle.mass
+    body.explicitinertial = True
+    body.inertia = vehicle.inertia
+    body.ipos = [0, 0, 0]
     colour = DRONE_COLOURS[i % len(DRONE_COLOURS)]
     body.add_geom(
         name=name, type=_GEOM.mjGEOM_BOX, size=drone_half_size(vehicle),
@@ -150,16 +144,98 @@ def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> N
     for r, position in enumerate(vehicle.rotor_positions):
         body.add_site(name=f"{name}/rotor_{r}", pos=position, size=[0.008, 0, 0], group=4)
     if visuals:
-        add_rotorcraft(body, vehicle, colour)
+        _add_rotorcraft(body, vehicle, colour)
 
 
-def _add_cable(spec: mujoco.MjSpec, system: System, i: int) -> None:
-    cable = spec.add_tendon(name=f"cable_{i}", limited=True, range=[0, system.cable_length[i]])
-    cable.wrap_site(f"drone_{i}/hook")
-    cable.wrap_site(f"payload/anchor_{i}")
-    cable.solimp_limit = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2]
-    cable.width, cable.rgba = 0.006, [0.08, 0.08, 0.1, 1]
-    spec.add_sensor(
-        name=f"cable_{i}/tension", type=mujoco.mjtSensor.mjSENS_TENDONLIMITFRC,
-        objtype=_OBJECT.mjOBJ_TENDON, objname=f"cable_{i}",
+def _add_surroundings(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
+    """Add a pale sky, a floor of 1 m squares that fades into it, and soft light."""
+    visual = spec.visual
+    horizon = [0.88, 0.92, 0.96]
+    spec.stat.extent = 4.0  # fixed, so that every team is lit alike
+    spec.stat.center = [0, 0, 1.5]
+    visual.headlight.ambient = [0.42] * 3
+    visual.headlight.diffuse = [0.22] * 3
+    visual.headlight.specular = [0.05] * 3
+    visual.quality.shadowsize = 2048
+    visual.map.shadowclip = 1.2
+    visual.rgba.haze = [*horizon, 1]
+    visual.rgba.fog = [*horizon, 1]
+    visual.map.fogstart = 2.5
+    visual.map.fogend = 7.0
+    visual.map.znear = 0.01
+    visual.map.zfar = 50
+    texture = mujoco.mjtTexture
+    builtin = mujoco.mjtBuiltin
+    spec.add_texture(
+        name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=builtin.mjBUILTIN_GRADIENT,
+        rgb1=[0.30, 0.52, 0.82], rgb2=horizon, width=64, height=384,
     )  # fmt: skip
+    spec.add_texture(
+        name="grid", type=texture.mjTEXTURE_2D, builtin=builtin.mjBUILTIN_CHECKER, mark=mujoco.mjtMark.mjMARK_EDGE,
+        rgb1=[0.70, 0.73, 0.76], rgb2=[0.66, 0.69, 0.73], markrgb=[0.86, 0.88, 0.90], width=512, height=512,
+    )  # fmt: skip
+    material = spec.add_material(name="grid", texrepeat=[1, 1], texuniform=True, specular=0.0)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
+    floor.material = "grid"
+
+
+def _add_light(payload: mujoco.MjsBody) -> None:
+    """Hang a sun above the payload, so that its shadows reach wherever the team flies."""
+    payload.add_light(
+        name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK,
+        pos=[-1.0, -1.0, 5.0], dir=[0.15, 0.15, -1], castshadow=True, diffuse=[0.42] * 3, specular=[0.15] * 3,
+    )  # fmt: skip
+
+
+def _add_rotorcraft(body: mujoco.MjsBody, vehicle: Vehicle, colour: tuple[float, ...]) -> None:
+    """Draw hull, arms and rotor discs; the front ones in the drone's colour."""
+    arm = vehicle.arm
+    dark = [0.13, 0.13, 0.15, 1]
+    pale = [0.30, 0.32, 0.36, 0.55]
+    plain = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP, "mass": 0}
+    hull = np.array([0.50, 0.36, 0.26]) * arm
+    body.add_geom(type=_GEOM.mjGEOM_ELLIPSOID, size=hull, rgba=colour, **plain)
+    for position in vehicle.rotor_positions:
+        tip = position + [0, 0, 0.22 * arm]
+        disc = [0.62 * arm, 0.02 * arm, 0]
+        thick = [0.08 * arm, 0, 0]
+        body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[0, 0, 0, *position], size=thick, rgba=dark, **plain)
+        body.add_geom(type=_GEOM.mjGEOM_CYLINDER, fromto=[*position, *tip], size=thick, rgba=dark, **plain)
+        tint = [*colour[:3], 0.75] if position[0] > 0 else pale
+        body.add_geom(type=_GEOM.mjGEOM_CYLINDER, pos=tip, size=disc, rgba=tint, **plain)
+
+
+def _add_target(spec: mujoco.MjSpec, system: System, margin: float, form: dict[str, Any]) -> None:
+    """Add the target: a translucent payload with firm edges, a little larger, so that one that has arrived fits in.
+
+    Args:
+        spec, system: of the scene.
+        margin: by which it is larger on every side [m].
+        form: type, size and place of its geom, `margin` included; a point has a form of its own.
+    """
+    body = spec.worldbody.add_body(name="target", mocap=True, pos=[0, 0, -10])
+    plain = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP}
+    faint = [0.0, 0.75, 0.35, 0.18]
+    firm = [0.0, 0.60, 0.25, 1]
+    center = system.payload_center
+    half = system.payload_size / 2 + margin
+    if system.payload_shape == "point":
+        body.add_geom(type=_GEOM.mjGEOM_SPHERE, size=[half[0], 0, 0], rgba=[*firm[:3], 0.5], **plain)
+        return
+    body.add_geom(**form, rgba=faint, **plain)
+    thick = [0.03 * system.payload_size.min(), 0, 0]
+    for a, b in _rims(half) if system.payload_shape == "cylinder" else _edges(half):
+        body.add_geom(type=_GEOM.mjGEOM_CAPSULE, fromto=[*(center + a), *(center + b)], size=thick, rgba=firm, **plain)
+
+
+def _edges(half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the ends of the twelve edges of a box."""
+    corners = half * np.array(list(product((-1, 1), repeat=3)))
+    return [(a, b) for a, b in combinations(corners, 2) if np.count_nonzero(a != b) == 1]
+
+
+def _rims(half: np.ndarray, count: int = 24) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the ends of the sides of two polygons, the rims of an upright cylinder."""
+    angle = np.linspace(0, 2 * np.pi, count + 1)
+    rims = [half * np.stack([np.cos(angle), np.sin(angle), np.full(count + 1, side)], axis=1) for side in (-1.0, 1.0)]
+    return [(a, b) for rim in rims for a, b in zip(rim[:-1], rim[1:], strict=True)]

@@ -1,10 +1,15 @@
-"""What the simulation tells: plain arrays with the environment as first axis. E environments, N drones."""
+"""The physical state: plain arrays with the environment as first axis. E environments, N drones."""
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
+
+from multilift_marl._jit import kernel
+from multilift_marl.math3d import add, cross, mat, mul, norm, put, putmat, row, sub, thrust_frame, tmul, vec
+from multilift_marl.rig.vehicles import GRAVITY
 
 
 class SystemState(NamedTuple):
@@ -46,7 +51,7 @@ class SystemState(NamedTuple):
 
 
 class HiddenLoads(NamedTuple):
-    """True parameters and loads that may differ between environments and that no drone is told."""
+    """True parameters and loads that may differ between environments and that no drone observes."""
 
     payload_mass: np.ndarray
     """(E,) [kg]."""
@@ -59,12 +64,12 @@ class HiddenLoads(NamedTuple):
 
 
 class Air(NamedTuple):
-    """What blows beside the mean wind, and what that depends on; all zero where it is switched off."""
+    """Turbulence, gusts and downwash beside the mean wind, and their states; all zero where it is switched off."""
 
     gust: np.ndarray
     """(E, 3) turbulence and gust in the last physics step, the same for all bodies, world frame [m/s]."""
     downwash: np.ndarray
-    """(E, N + 1, 3) wash of the other drones at each drone, then at the payload, likewise [m/s]."""
+    """(E, N + 1, 3) downwash of the other drones at each drone, then at the payload, world frame [m/s]."""
     filter: np.ndarray
     """(E, 5) states of the turbulence filters: one of u, two each of v and w [-]."""
     generator: np.ndarray
@@ -93,11 +98,61 @@ class EpisodeStats(NamedTuple):
     tension_peak: np.ndarray
     """(E,) largest cable tension, the peaks of snatches inside a step and all substeps included [N]."""
     slack_time: np.ndarray
-    """(E,) time with any cable slack, or a chain that pulls its drone by no more than its weight [s]."""
+    """(E,) time with any cable slack, or a chain whose tension at the drone is no more than its weight [s]."""
     stretch_max: np.ndarray
     """(E,) largest tension over stiffness, relative to the cable's length [-]."""
 
     @classmethod
     def zeros(cls, num_envs: int) -> EpisodeStats:
-        """Return an empty record."""
+        """Return statistics without a step."""
         return cls(*(np.zeros(num_envs) for _ in cls._fields))
+
+
+class SimData(NamedTuple):
+    """The arrays of all environments that the compiled functions of a physics step write."""
+
+    state: SystemState
+    stats: EpisodeStats
+    diverged: np.ndarray
+    """(E,) bool, environments that are left as they are."""
+
+
+@kernel
+def hook_position(e, n, state, hooks):
+    """Return where cable n is tied to its drone, world frame [m]."""
+    return add(vec(state.drone_position, e, n), mul(mat(state.drone_rotation, e, n), row(hooks, n)))
+
+
+@kernel
+def place_at_hook(e, n, state, place, hooks):
+    """Put drone n where its hook is at `place`, with the attitude that it has."""
+    put(state.drone_position[e, n], sub(place, mul(mat(state.drone_rotation, e, n), row(hooks, n))))
+
+
+@kernel
+def hover_drone(e, n, state, cable_force, yaw, drones):
+    """Let drone n of environment e hover: attitude and rotor speeds that hold its weight and `cable_force` [N].
+
+    Args:
+        e, n: environment and drone.
+        state: SystemState, written.
+        cable_force: that the drone exerts on its cable, world frame [N].
+        yaw: heading [rad].
+        drones: `rig.constants.Drones`.
+    """
+    force = add(cable_force, (0.0, 0.0, drones.mass[n] * GRAVITY))
+    attitude = thrust_frame(force, yaw)
+    putmat(state.drone_rotation[e, n], attitude)
+
+    # Rotors share the thrust evenly, or so that they hold the moment of a hook that is off the centre of mass.
+    total = norm(force)
+    torque = (0.0, 0.0, 0.0)
+    if drones.hooked:
+        torque = cross(row(drones.hooks, n), tmul(attitude, cable_force))
+    for k in range(4):
+        square = total / (4.0 * drones.thrust_coefficient[n])
+        if drones.hooked:
+            a = drones.allocation[n, k]
+            thrust = a[0] * total + a[1] * torque[0] + a[2] * torque[1] + a[3] * torque[2]
+            square = max(thrust, 0.0) / drones.thrust_coefficient[n]
+        state.rotor_speed[e, n, k] = sqrt(square)

@@ -14,29 +14,28 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
+from multilift_marl.rig.constants import make_drones
 from multilift_marl.rig.system import System
 from multilift_marl.sim.air import make_air
-from multilift_marl.sim.chain import make_chain, read_chains, update_chain, write_chains
-from multilift_marl.sim.chain_arrays import Chain, Motion, Nodes
-from multilift_marl.sim.chain_dynamics import advance_chains
-from multilift_marl.sim.contact import find_fast, make_bodies, set_speculative
-from multilift_marl.sim.dynamics import apply_loads, make_constants
+from multilift_marl.sim.cables import CABLE_MODELS
+from multilift_marl.sim.cables.chain_arrays import Nodes
+from multilift_marl.sim.contact import body_radii, find_fast, set_speculative
+from multilift_marl.sim.dynamics import apply_loads
 from multilift_marl.sim.gusts import start_turbulence
-from multilift_marl.sim.hover import hover_drone, make_drones
-from multilift_marl.sim.inertia import make_inertias, update_inertias
 from multilift_marl.sim.parameters import (
     Parameters,
-    apply_cable_limits,
+    make_inertias,
     make_rotor_variation,
     nominal_parameters,
+    update_inertias,
     update_parameters,
     write_lags,
-    write_model,
+    write_masses,
 )
 from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.scene import build_model
-from multilift_marl.sim.state import Air, EpisodeStats, HiddenLoads, SystemState
-from multilift_marl.sim.state_io import make_state_layout, read_state, write_state
+from multilift_marl.sim.state import Air, EpisodeStats, HiddenLoads, SimData, SystemState, hover_drone
+from multilift_marl.sim.state_io import Rows, make_rows
 
 _log = logging.getLogger("multilift_marl.mujoco")
 REST_HEIGHT = 1.5  # [m] of the payload after World.reset
@@ -49,17 +48,16 @@ class Shard:
     lo: int
     hi: int
     batch: Batch
+    rows: Rows
     apply: Callable[[], None]
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
-    advance_chains: Callable[[], None] | None
-    """`advance_chains` of these environments; None with massless cables, which MuJoCo advances."""
+    advance_cables: Callable[[], None] | None
+    """What the cable model does before MuJoCo's step, if anything."""
     read: Callable[[], None]
-    """`read_rows` or `read_chains` of these environments."""
+    """`read_state` of the cable model."""
     broken: np.ndarray
-    """(hi - lo, N) cables that the batch's models lack."""
-    motion: Motion | None
-    """Working arrays of chains."""
-    find_fast: Callable[[], bool]
+    """(hi - lo, N) bool, broken cables that the batch's models have."""
+    find_fast: Callable[[], Any]
     """`contact.find_fast` of these environments."""
     fast: np.ndarray
     """(hi - lo,) bool, environments in which bodies approach each other fast."""
@@ -75,17 +73,18 @@ class World:
         seed: of the turbulence that each `reset` starts with; `seed_turbulence` gives another.
 
     Attributes:
-        system, num_envs, num_drones, model, layout: as given, E, N, MuJoCo's model and where what stands in it.
+        system, num_envs, num_drones, model, layout: as given, E, N, MuJoCo's model and where bodies are in it.
         state: SystemState of all environments; live arrays, E first.
         thrust: commanded thrust of each rotor (E, N, 4) [N].
         parameters: true parameters; changed by `set_parameters` alone.
-        plant: true loads; write `wind` and `payload_force` freely.
+        hidden_loads: true loads; write `wind` and `payload_force` freely.
         drones: nominal numbers of each drone.
-        air: what blows beside the mean wind.
-        record: what accumulated since the reset.
+        air: turbulence, gusts and downwash.
+        stats: statistics since the reset.
         diverged: (E,) bool, until reset.
+        cable_model, cables: module of the cable model and its numbers.
         nodes: Nodes of the chains; None with massless cables.
-        breakable: whether `state.cable_broken` is looked at after every physics step.
+        breakable: whether `state.cable_broken` is read after every physics step.
 
     Raises:
         ValueError: fewer than one environment, or a negative number of threads or seed.
@@ -96,24 +95,29 @@ class World:
             if value < least:
                 raise ValueError(f"{name}={value} must be at least {least}")
         _quiet_mujoco()
-        self.system, self.num_envs, self.num_drones = system, num_envs, system.num_drones
+        self.system = system
+        self.num_envs = num_envs
+        self.num_drones = system.num_drones
+        self.seed = seed
         self.model, self.layout = build_model(system)
-        self.thrust, self.drones = np.zeros((num_envs, self.num_drones, 4)), make_drones(system)
+        self.drones = make_drones(system)
+        self.thrust = np.zeros((num_envs, self.num_drones, 4))
         self.state = SystemState.zeros(num_envs, self.num_drones)
         self.parameters = nominal_parameters(system, num_envs)
-        self._varied = make_rotor_variation(system, self.parameters)
         self.hidden_loads = HiddenLoads(
             payload_mass=self.parameters.payload_mass, payload_force=np.zeros((num_envs, 3)),
             wind=np.tile(system.wind, (num_envs, 1)), motors_off=np.zeros((num_envs, self.num_drones), bool),
         )  # fmt: skip
-        self.air, self.seed = Air.zeros(num_envs, self.num_drones), seed
-        self.stats, self.diverged = EpisodeStats.zeros(num_envs), np.zeros(num_envs, bool)
+        self.air = Air.zeros(num_envs, self.num_drones)
+        self.stats = EpisodeStats.zeros(num_envs)
+        self.diverged = np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
-        self.nodes = Nodes.zeros(num_envs, system) if system.cable_model == "chain" else None
+        self.cable_model = CABLE_MODELS[system.cable_model]
+        self._varied = make_rotor_variation(system, self.parameters)
         self._inertias = make_inertias(system, self.parameters)
-        self._chain: Chain | None = None
-        self._write: Callable[..., None] = write_state
-        self._state_layout: tuple[object, ...] = ()
+        self.cables = self.cable_model.make_cables(system, self.parameters, self._inertias)
+        self.nodes: Nodes | None = self.cables.nodes
+        self._data = SimData(self.state, self.stats, self.diverged)
         self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
         self._pool: tuple[int, ThreadPoolExecutor] | None = None  # with its process
         self.reset()
@@ -121,7 +125,8 @@ class World:
     def reset(self, mask: np.ndarray | None = None) -> SystemState:
         """Put the environments in `mask` (E,) (None: all) at rest in formation, payload at 1.5 m; return the state."""
         mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask, bool)
-        system, state = self.system, self.state
+        system = self.system
+        state = self.state
         state.payload_position[mask] = [0, 0, REST_HEIGHT]
         state.payload_rotation[mask] = np.eye(3)
         state.payload_velocity[mask] = state.payload_body_rates[mask] = 0
@@ -131,7 +136,8 @@ class World:
             for n, force in enumerate(system.hook_force):
                 hover_drone(e, n, state, tuple(force), 0.0, self.drones)
         self.set_parameters(mask, **nominal_parameters(system, self.num_envs)._asdict())
-        self.hidden_loads.payload_force[mask], self.hidden_loads.wind[mask] = 0, system.wind
+        self.hidden_loads.payload_force[mask] = 0
+        self.hidden_loads.wind[mask] = system.wind
         if system.air.turbulence:
             for e in np.flatnonzero(mask).tolist():
                 self.seed_turbulence(e, np.random.SeedSequence(self.seed, spawn_key=(e,)))
@@ -167,8 +173,8 @@ class World:
             shard.apply()
             if shard.find_fast():
                 set_speculative(shard.batch, shard.fast)
-            if shard.advance_chains is not None:
-                shard.advance_chains()
+            if shard.advance_cables is not None:
+                shard.advance_cables()
             try:
                 shard.batch.step()
             except SimulationError as error:
@@ -206,13 +212,13 @@ class World:
         if self._varied is not None and "vehicle_rotor_time_constant" in names:
             write_lags(self._varied, self.system, self.parameters, changed)
         update_inertias(self._inertias, self.system, self.parameters)
-        if self._chain is not None:
-            update_chain(self._chain, self.system, self.parameters)
+        self.cable_model.update_cables(self.cables, self.system, self.parameters)
         for shard in self.shards:
-            local = changed[shard.lo : shard.hi]
-            if local.any():
-                shared = self.model, self.layout, self.system
-                write_model(shard.batch, *shared, self._shard_parameters(shard), local, names, shard.broken)
+            mask = changed[shard.lo : shard.hi]
+            if mask.any():
+                own = self._shard_parameters(shard)
+                write_masses(shard.batch, self.layout, self.system, own, mask, names)
+                self.cable_model.update_models(shard.batch, self.system, own, mask, names, shard.broken)
 
     def seed_turbulence(self, env: int, seed: np.random.SeedSequence) -> None:
         """Start the turbulence of environment `env` anew from its stationary distribution, drawn from `seed`."""
@@ -237,7 +243,7 @@ class World:
             if local.any():
                 self._sync_broken(shard)
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
-                self._write(shard.batch.state, shard.lo, shard.hi, mask, self.state, self.stats, *self._state_layout)
+                self.cable_model.write_state(shard.rows, mask, self._data, self.cables)
         self.diverged[mask] = False
 
     def check_warnings(self) -> None:
@@ -255,7 +261,8 @@ class World:
 
     def cable_points(self, env: int, cable: int) -> np.ndarray:
         """Return the points of a cable from its anchor to its hook (S + 1, 3) [m]; of a broken one without the hook."""
-        state, system = self.state, self.system
+        state = self.state
+        system = self.system
         anchor = state.payload_position[env] + state.payload_rotation[env] @ system.anchors[cable]
         hook = state.drone_position[env, cable] + state.drone_rotation[env, cable] @ system.hooks[cable]
         count = system.cable_segments[cable] - 1
@@ -301,7 +308,9 @@ class World:
         """Bring the shard's models into line with `state.cable_broken`."""
         broken = self.state.cable_broken[shard.lo : shard.hi]
         if (broken != shard.broken).any():
-            apply_cable_limits(shard.batch, self.system, self._shard_parameters(shard), broken)
+            own = self._shard_parameters(shard)
+            mask = np.ones(len(broken), bool)
+            self.cable_model.update_models(shard.batch, self.system, own, mask, {"cable_broken"}, broken)
             shard.broken[:] = broken
 
     def _shard_parameters(self, shard: Shard) -> Parameters:
@@ -310,33 +319,20 @@ class World:
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int).tolist()
-        shards, bodies = [], make_bodies(self.system)
+        shards = []
+        radii = body_radii(self.system)
+        air_constants = make_air(self.system)
+        air = None if air_constants.still else (self.air, air_constants)
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
             batch = Batch(self.model, hi - lo, nthread=1)
-            constants = make_constants(self.system, self.layout, batch)
-            rows = make_state_layout(
-                self.system, self.layout, self.parameters, self._inertias, batch
-            )  # the same for every shard
-            span, flow = (batch.state, lo, hi), make_air(self.system)
-            air = (None, None) if flow.still else (self.air, flow)
-            blown = (self.thrust, self.state, self.hidden_loads, self.stats, constants, *air, self._varied)
-            apply, seen = bind(apply_loads, *span, *blown), (self.state, self.stats, self.diverged, rows)
-            chains_step = motion = None
-            if self.nodes is None:
-                self._write, self._state_layout = write_state, (rows,)
-                read = bind(read_state, *span, batch.bind("sensordata"), *seen)
-            else:
-                if self._chain is None:
-                    self._chain = make_chain(self.system, self.layout, self.parameters, self._inertias, batch)
-                chains = self._chain, self.nodes
-                self._write, self._state_layout = write_chains, (rows, *chains)
-                motion = Motion.zeros(hi - lo, self.system)
-                chains_step = bind(advance_chains, *span, self.state, self.diverged, *chains, motion)
-                read = bind(read_chains, *span, batch.bind("qfrc_constraint"), *seen, *chains, motion)
-            broken = np.zeros((hi - lo, self.num_drones), bool)
+            rows = make_rows(self.layout, batch, lo)
+            loads = self.thrust, self.hidden_loads
+            apply = bind(apply_loads, rows, *loads, self._data, air_constants.rig, air, self._varied)
+            advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
             fast = np.zeros(hi - lo, bool)
-            watch: Any = bind(find_fast, lo, hi, self.state, fast, bodies)
-            shards.append(Shard(lo, hi, batch, apply, chains_step, read, broken, motion, watch, fast))
+            find = bind(find_fast, lo, self.state, fast, radii, self.system.timestep)
+            broken = np.zeros((hi - lo, self.num_drones), bool)
+            shards.append(Shard(lo, hi, batch, rows, apply, advance, read, broken, find, fast))
         return shards
 
 

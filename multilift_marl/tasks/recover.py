@@ -29,8 +29,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.catenary import SLACK
-from multilift_marl.sim.hover import place_at_hook
+from multilift_marl.sim.state import place_at_hook
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
 from multilift_marl.tasks.observations import Component, cable_vector
@@ -205,7 +204,7 @@ class Recover(Task):
         """See `Task.prepare`."""
         option = self.options
         check_heights(option)
-        taut = SLACK if self.world.system.cable_model == "chain" else 1.0  # chains that hang straighter pull at once
+        taut = self.world.cable_model.SLACK
         self._slack = min(option.start_slack, taut), taut
         self._early = ignore(TILT, CABLE)
         if option.start == "crazymarl":  # a quarter of its teams start on the ground

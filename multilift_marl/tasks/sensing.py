@@ -15,7 +15,7 @@ import numpy as np
 from multilift_marl._jit import kernel, prebind
 from multilift_marl.config.schema import RandomizationConfig
 from multilift_marl.math3d import add, axis_angle, mat, matmul, matrow, norm, put, putmat, row, scale, vec
-from multilift_marl.sim.rng import normal_pair
+from multilift_marl.sim.gusts import normal_pair
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks.observations import observation_names
 from multilift_marl.tasks.view import Errors, View, reduce_view, update_errors

@@ -13,11 +13,12 @@ from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
+from multilift_marl.rig.constants import Drones, make_drones
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.cables import cable_end
-from multilift_marl.sim.hover import Drones, hover_drone, make_drones, place_at_hook
+from multilift_marl.sim.cables.catenary import cable_end
 from multilift_marl.sim.parameters import Parameters
+from multilift_marl.sim.state import hover_drone, place_at_hook
 
 
 class CableEquilibrium(NamedTuple):

@@ -14,7 +14,7 @@ from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.cables import IMPEDANCE, limit_solref
+from multilift_marl.sim.cables.massless import IMPEDANCE, limit_solref
 from multilift_marl.sim.scene import set_options
 from multilift_marl.sim.world import World
 from multilift_marl.validation.chains import hanging_chain, inclined_chains, straight_chain, tested_stiffness

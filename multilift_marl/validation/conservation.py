@@ -10,7 +10,7 @@ import numpy as np
 
 from multilift_marl.config.load import load_config
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.dynamics import make_constants
+from multilift_marl.sim.state_io import body_dof
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Plot, Result
 from multilift_marl.validation.symmetry import Team, make_team, poses, take_off, velocities
@@ -119,7 +119,6 @@ def without_contact(world: World) -> World:
 def free_flight(world: World, seconds: float) -> tuple[Drift, np.ndarray, np.ndarray]:
     """Let a team fall; return its drift, times (T,) [s] and energies (T, 2) over the first: left, and with dampers."""
     start = totals(world)
-    shard = world.shards[0]
     h = world.system.timestep
     thrust = np.zeros((1, world.num_drones, 4))
     taken = 0.0
@@ -128,7 +127,7 @@ def free_flight(world: World, seconds: float) -> tuple[Drift, np.ndarray, np.nda
     steps = round(seconds / h)
     for i in range(1, steps + 1):
         world.step(thrust)
-        taken += float(shard.motion.dissipated[0]) if shard.motion is not None else 0.0
+        taken += float(world.cables.motion.dissipated[0]) if world.nodes is not None else 0.0
         if i % round(0.1 / h) == 0:
             energy = totals(world).energy
             times.append(i * h)
@@ -273,12 +272,10 @@ def loads(world: World) -> tuple[np.ndarray, np.ndarray]:
     The torques are in the frames of the bodies. What chains add for MuJoCo is taken off again.
     """
     shard = world.shards[0]
-    constants = make_constants(world.system, world.layout, shard.batch)
-    row = shard.batch.state[0]
-    at = np.array([constants.force, *constants.drone_loads])[:, None] + np.arange(6)
-    applied = row[at]
-    if shard.motion is not None:
-        applied = applied - shard.motion.impulse / world.system.timestep
+    first = shard.rows.force + np.array([body_dof(b, shard.rows) for b in range(1 + world.num_drones)])
+    applied = shard.rows.state[0][first[:, None] + np.arange(6)]
+    if world.nodes is not None:
+        applied = applied - world.cables.motion.impulse[0] / world.system.timestep
     return applied[:, :3], applied[:, 3:]
 
 

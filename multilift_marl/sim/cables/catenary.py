@@ -1,4 +1,4 @@
-"""How a chain hangs between two points: the elastic catenary of its links, and an arc where it is slack."""
+"""How cables hang at rest: the end of one by its tension; a chain between two points, an arc where it is slack."""
 
 from __future__ import annotations
 
@@ -9,14 +9,34 @@ import numpy as np
 from multilift_marl._jit import kernel
 from multilift_marl.math3d import add, cross, dot, norm, put, row, scale, sub, unit
 
-SLACK = 0.98  # of its length: a cable whose ends are closer is laid in an arc, one that sags less hangs by its weight
+SLACK = 0.98  # [-] of its length: a chain whose ends are closer is laid in an arc, else it hangs by its weight
+
+
+@kernel
+def cable_end(direction, tension, length, stiffness, segments, weight):
+    """Return the drone's end of a hanging cable at rest, from its anchor [m].
+
+    Args:
+        direction, tension: unit vector and magnitude [N] of the force in its middle.
+        length, stiffness: of the whole cable [m], [N/m].
+        segments: of a chain, whose mass is that of the nodes between them.
+        weight: of the whole cable [N]; 0 if massless.
+    """
+    if weight == 0.0:
+        return scale(length + tension / stiffness, direction)
+    end = (0.0, 0.0, 0.0)
+    for j in range(segments):
+        force = add(scale(tension, direction), (0.0, 0.0, weight * (j / (segments - 1) - 0.5)))
+        size = norm(force)
+        end = add(end, scale((length / size + 1.0 / stiffness) / segments, force))
+    return end
 
 
 @kernel
 def hang(chord, opening, length, stiffness, weight, links):
     """Write direction, stretch [m] and velocity [m/s] of each link (n, 7) of a chain that hangs between two points.
 
-    Segment j pulls with F_j = F_0 + j w e_z. The F_0 whose links reach to the other end minimises the complementary
+    The force of segment j is F_j = F_0 + j w e_z. The F_0 whose links reach the other end minimises the complementary
     energy, Σ (l |F_j| + |F_j|²/2k) - F_0 · chord, which is convex: Newton's method with halved steps finds it.
     Velocities, of a link's upper end relative to its lower one, are all alike; those of an arc do not stretch it.
 
@@ -27,7 +47,8 @@ def hang(chord, opening, length, stiffness, weight, links):
         weight: of a node, w [N].
         links: written.
     """
-    n, distance = links.shape[0], norm(chord)
+    n = links.shape[0]
+    distance = norm(chord)
     if distance < SLACK * n * length:
         _hang_slack(chord, distance, length, links)
         _turn_links(opening, links)
@@ -38,13 +59,13 @@ def hang(chord, opening, length, stiffness, weight, links):
     for _ in range(50):
         if norm(gap) < 1e-14 * distance:
             break
-        share = 1.0
+        fraction = 1.0
         for _ in range(30):
-            trial = add(force, scale(share, step))
+            trial = add(force, scale(fraction, step))
             found = _complementary(chord, trial, length, stiffness, weight, n)
             if found[0] <= energy + 1e-14 * abs(energy):
                 break
-            share *= 0.5
+            fraction *= 0.5
         force = trial
         energy, gap, step = found
     straight = not norm(gap) < 1e-9 * distance
@@ -62,14 +83,16 @@ def hang(chord, opening, length, stiffness, weight, links):
 @kernel
 def _complementary(chord, force, length, stiffness, weight, n):
     """Return the energy of `hang` at F_0, how far the links miss the other end, and Newton's step."""
-    energy, gap = -dot(force, chord), chord
-    xx, yy, zz, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    energy = -dot(force, chord)
+    gap = chord
+    xx = yy = zz = xy = xz = yz = 0.0
     for j in range(n):
         cable_force = add(force, (0.0, 0.0, j * weight))
         size = max(norm(cable_force), 1e-9)
         energy += length * size + 0.5 * size * size / stiffness
         gap = sub(gap, scale(length / size + 1.0 / stiffness, cable_force))
-        flat, bend = length / size + 1.0 / stiffness, length / size**3
+        flat = length / size + 1.0 / stiffness
+        bend = length / size**3
         xx += flat - bend * cable_force[0] * cable_force[0]
         yy += flat - bend * cable_force[1] * cable_force[1]
         zz += flat - bend * cable_force[2] * cable_force[2]
@@ -88,7 +111,8 @@ def _hang_slack(chord, distance, length, links):
     if norm(below) < 1e-3:
         below = sub((1.0, 0.0, 0.0), scale(along[0], along))
     below = unit(below)
-    low, high = 1e-9, 2.0 * np.pi / n
+    low = 1e-9
+    high = 2.0 * np.pi / n
     for _ in range(60):
         bend = 0.5 * (low + high)
         if length * sin(0.5 * n * bend) > distance * sin(0.5 * bend):
@@ -108,11 +132,16 @@ def _turn_links(opening, links):
     They are what is left of one vector λ across each link d, λ - d (d · λ), and add up to `opening`.
     """
     n = links.shape[0]
-    xx, yy, zz, xy, xz, yz = float(n), float(n), float(n), 0.0, 0.0, 0.0
+    xx = yy = zz = float(n)
+    xy = xz = yz = 0.0
     for j in range(n):
         x, y, z = row(links, j)
-        xx, yy, zz = xx - x * x, yy - y * y, zz - z * z
-        xy, xz, yz = xy - x * y, xz - x * z, yz - y * z
+        xx -= x * x
+        yy -= y * y
+        zz -= z * z
+        xy -= x * y
+        xz -= x * z
+        yz -= y * z
     common = _solve(xx, yy, zz, xy, xz, yz, opening)
     for j in range(n):
         link = row(links, j)
@@ -122,7 +151,9 @@ def _turn_links(opening, links):
 @kernel
 def _solve(xx, yy, zz, xy, xz, yz, right):
     """Return the solution of three linear equations with a symmetric matrix."""
-    first, second, third = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+    first = (xx, xy, xz)
+    second = (xy, yy, yz)
+    third = (xz, yz, zz)
     minor = cross(second, third)
     volume = dot(first, minor)
     return scale(1.0 / volume, (dot(minor, right), dot(cross(third, first), right), dot(cross(first, second), right)))
