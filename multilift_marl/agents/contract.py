@@ -10,10 +10,9 @@ from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.trained import FORMAT
 from multilift_marl.agents.versions import package_versions
 from multilift_marl.config.config import Config
-from multilift_marl.control.actions import ACTIONS, Team
+from multilift_marl.control.actions import ACTIONS, THRUST, Team
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.gains import make_gains
-from multilift_marl.control.scales import THRUST
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.errors import CheckpointError
 from multilift_marl.sim.state import SystemState

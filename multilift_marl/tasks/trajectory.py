@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
-from multilift_marl.control.cable_forces import drone_offset, place_slots, spread
+from multilift_marl.control.cable_forces import distribute_wrench, drone_offset, place_slots
 from multilift_marl.control.formation import hook_arm, place_formation, wrap
 from multilift_marl.math3d import (
     add,
@@ -242,7 +242,7 @@ def _evaluate_plan(lo, hi, time, dt, plan, planned, rig, hanging, inertia, balan
             cable_force = turn(c, si, add(mixed, scale(share, mat_row(plan.cable_force, e, 0, n))))
             put(planned.cable_force[e, n], cable_force)
             force, moment = sub(force, cable_force), sub(moment, cross(mul(attitude, row(rig.anchors, n)), cable_force))
-        linear, angular = spread(force, moment, attitude, balance)
+        linear, angular = distribute_wrench(force, moment, attitude, balance)
         moved = sub(position, before)
         for n in range(count):
             arm = mul(attitude, row(rig.anchors, n))
