@@ -37,7 +37,7 @@ from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason
 from multilift_marl.evaluation.rollout import trace_episode
 
-_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best_policy")
+_NEEDED = ("critic", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best_policy")
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -236,7 +236,7 @@ class Trainer:
     def _training_state(self) -> dict[str, Any]:
         """Return what else training depends on."""
         return {
-            "loss": self.learner.loss.state_dict(),  # actor and critic with normalisers, value normaliser
+            "critic": self.learner.critic.state_dict(),  # with its normaliser and that of the values
             "optimizer": self.learner.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
             "env": self.env.get_state(),
@@ -260,7 +260,7 @@ class Trainer:
     def _load(self, content: dict[str, Any]) -> None:
         environments, optimizer = content["env"], self.learner.optimizer
         own = self._content() | self._training_state()
-        for key in ("loss", "rng", "returns", "iteration", "seconds"):
+        for key in ("critic", "rng", "returns", "iteration", "seconds"):
             check_like(content[key], own[key], key)
         if content["best_policy"] is not None:
             check_policy(content["best_policy"], "'best_policy'")
@@ -272,7 +272,8 @@ class Trainer:
         for key in ("world.system", "task_name"):  # which the first checkpoints do not hold
             environments.setdefault(key, own["env"][key])
         self.env.set_state(environments)
-        self.learner.loss.load_state_dict(content["loss"])
+        self.learner.actor.load_state_dict(content["actor"])
+        self.learner.critic.load_state_dict(content["critic"])
         optimizer.load_state_dict(content["optimizer"])
         for group, expected in zip(optimizer.param_groups, own["optimizer"]["param_groups"], strict=True):
             for key in expected.keys() - {"params"}:
