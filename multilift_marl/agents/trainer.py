@@ -126,7 +126,7 @@ class Trainer:
         self._best_saved = self._attempt(self._restore_best)
         while not (self.finished or self._stop):
             start = time.perf_counter()
-            first = self.evaluator.best is None  # the untrained policy, which flies the script
+            first = self.evaluator.best is None  # the untrained policy, which acts as the script
             values = {} if first else self.step()
             if "return" in values:
                 shown["return"] = f"{values['return']:.0f}"
@@ -292,7 +292,7 @@ class Trainer:
             save_checkpoint(path, best)
 
     def _draw_best(self) -> Path:
-        """Return the path of a picture of the first episode, flown by the best policy."""
+        """Return the path of a picture of the first episode of the best policy."""
         from multilift_marl.evaluation.plots import plot_paths  # matplotlib takes a while
 
         policy, path = self.evaluator.best_policy(), self.folder / "flight.png"
