@@ -1,4 +1,4 @@
-"""Judge a team: `python evaluate.py run=latest episodes=200`; `python evaluate.py --help` explains every key."""
+"""Evaluate a team: `python evaluate.py run=latest episodes=200`; `python evaluate.py --help` explains every key."""
 
 import sys
 

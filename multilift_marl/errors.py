@@ -60,5 +60,5 @@ def pip_install(extra: str) -> str:
 
 def reason(error: BaseException) -> str:
     """Return what went wrong in few words, such as "No space left on device"."""
-    told = error.strerror if isinstance(error, OSError) else None
-    return told or str(error).partition("\n")[0] or type(error).__name__
+    message = error.strerror if isinstance(error, OSError) else None
+    return message or str(error).partition("\n")[0] or type(error).__name__

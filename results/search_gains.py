@@ -15,10 +15,12 @@ from math import radians
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
-from multilift_marl.cli.common import run_command
+from multilift_marl.cli.common import run_command, split_options
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.values import Positive, Section
 from multilift_marl.control.scripted import LINEAR, Formation, check_interface
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
@@ -140,22 +142,27 @@ def search(config: Config, start: np.ndarray, spread: float, minutes: float) -> 
     return start + scale * np.array(strategy.mean)
 
 
+class Options(Section):
+    """Keys of the search beside those of the configuration."""
+
+    config: str = Field("pose_wind", description="the task, a configuration's name or path")
+    minutes: Positive = Field(30.0, description="[min] that the search takes")
+    script: str = Field("formation_feedback", description="whose gains it begins with")
+    spread: Positive = Field(0.3, description="[-] of the first candidates, over the distances of `FREE`")
+
+
 def main(values: dict[str, Any]) -> int:
-    """Search, print and evaluate."""
-    own = {key: values.pop(key, default) for key, default in OWN.items()}
-    for key in ("minutes", "spread"):
-        if isinstance(own[key], bool) or not isinstance(own[key], int | float) or not 0 < own[key] < float("inf"):
-            raise ConfigError(f"{key} must be a positive number, but is {own[key]!r}")
-    script = str(own["script"])
+    """Search, print and test."""
+    options, overrides = split_options(Options, values)
+    script = options.script
     if script not in SCRIPTS:
         raise ConfigError(f"the search cannot begin with script '{script}'{nearest(script, SCRIPTS)}")
-    config = load_config(str(own["config"]), {"env.num_envs": 48, **values})
+    config = load_config(options.config, {"env.num_envs": 48, **overrides})
     check_interface(script, config.control.action)
     if config.task not in TASKS:
         raise ConfigError(f"task {config.task} cannot be searched; take hover or pose")
-    start = starting_gains(script)
-    fresh = build_config(config.model_dump(), {"env.num_envs": 256})
-    gains = search(config, start, own["spread"], own["minutes"])
+    start, fresh = starting_gains(script), build_config(config.model_dump(), {"env.num_envs": 256})
+    gains = search(config, start, options.spread, options.minutes)
     for (name, axes, _), gain in zip(FREE, gains, strict=True):
         for axis, moved in axes:
             print(f'        ("{name}", {axis}, {moved}, {gain:.3f}),')
@@ -165,7 +172,5 @@ def main(values: dict[str, Any]) -> int:
     return 0
 
 
-OWN = {"config": "pose_wind", "minutes": 30, "script": "formation_feedback", "spread": 0.3}
-
 if __name__ == "__main__":
-    sys.exit(run_command(main, __doc__, OWN, None))
+    sys.exit(run_command(main, __doc__ or "", Options, None))

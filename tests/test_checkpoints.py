@@ -171,7 +171,7 @@ def test_a_run_with_a_part_of_another_kind_is_not_resumed(tmp_path):
     for path, value in (
         (("iteration",), "3"), (("iteration",), -1), (("best_policy",), [0.5]),
         (("seconds",), float("nan")), (("rng",), None),
-        (("rng",), torch.zeros_like(whole["rng"])), (("returns",), torch.zeros(7)), (("loss",), []), (("env",), 3),
+        (("rng",), torch.zeros_like(whole["rng"])), (("returns",), torch.zeros(7)), (("critic",), []), (("env",), 3),
         (("env", "steps"), [1]), (("env", "more"), torch.zeros(8)), (("optimizer",), {}), (moment, 3),
         (moment, torch.full((64, 52), torch.nan)), (("optimizer", "param_groups", 0, "lr"), "fast"),
     ):  # fmt: skip

@@ -21,9 +21,9 @@ COUNT = int(os.environ.get("COMMAND_LINES", "100"))
 ACCEPTED = "accepted"
 COMMANDS = {
     "train": (train.main, ["config", "task", "import", "resume"], "config=hover"),
-    "evaluate": (evaluate.main, [*evaluate._DEFAULTS, "task", "import"], "policy=formation"),
+    "evaluate": (evaluate.main, [*evaluate.Options.model_fields, "task", "import"], "policy=formation"),
     "export": (export.main, ["run", "out", "import"], "run=hover"),
-    "view": (view.main, [*view._DEFAULTS, "import"], "task=hover"),
+    "view": (view.main, [*view.Options.model_fields, "import"], "task=hover"),
 }
 VALUES = [
     "", "0", "1", "-1", "1e400", "-1e-400", "nan", "inf", ".inf", "null", "~", "true", "yes", "0x", "1_0", "007",

@@ -13,8 +13,7 @@ import torch
 from conftest import make
 
 from multilift_marl.agents.checkpoint import save_checkpoint
-from multilift_marl.agents.contract import make_contract
-from multilift_marl.agents.export import export_policy
+from multilift_marl.agents.export import export_policy, make_contract
 from multilift_marl.agents.networks import Actor
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.cli.export import main as export

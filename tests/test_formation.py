@@ -151,8 +151,11 @@ def test_feedback_scripts_move_the_slots_against_what_they_observe(name):
 @pytest.mark.parametrize(
     ("task", "along"),
     [
-        ("pose", {"payload_error_0": 0.3, "way_position_0": 0.3, "payload_velocity_1": 0.2, "way_velocity_1": 0.2}),
-        ("pose", {"payload_rotation_error_1": 0.2, "way_rotation_1": 0.2}),
+        (
+            "pose",
+            {"payload_error_0": 0.3, "planned_position_0": 0.3, "payload_velocity_1": 0.2, "planned_velocity_1": 0.2},
+        ),
+        ("pose", {"payload_rotation_error_1": 0.2, "planned_rotation_1": 0.2}),
         ("track", {"payload_velocity_0": 1.0, "target_velocity_0": 1.0}),
     ],
 )
@@ -196,7 +199,7 @@ def test_the_leading_script_needs_to_know_the_way():
     assert "formation_lead" not in fitting_scripts(make("hover", num_envs=1))
     assert fitting_scripts(make("track", num_envs=1, **{"control.action": "rotor"})) == []
     message = refusal(make_scripted, "formation_lead", make("hover", num_envs=1))
-    assert message.startswith("formation_lead needs to know where the target will go, and task hover does not tell")
+    assert message.startswith("formation_lead needs to observe where the target will go, and task hover has no such")
 
 
 def test_unknown_script_names_the_nearest():

@@ -14,7 +14,7 @@ from conftest import SMALL, make, refusal
 import multilift_marl as ml
 from multilift_marl import plugins
 from multilift_marl.agents.checkpoint import load_checkpoint
-from multilift_marl.agents.trained import ExportedPolicy
+from multilift_marl.agents.policy import ExportedPolicy
 from multilift_marl.agents.trainer import new_run
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.cli.export import main as export

@@ -101,4 +101,4 @@ def test_the_script_needs_to_know_who_is_lost():
     assert "formation_redistributed" in fitting_scripts(make("loss", num_envs=1))
     assert "formation_redistributed" not in fitting_scripts(make("gate", num_envs=1))
     message = refusal(make_scripted, "formation_redistributed", make("hover", num_envs=1))
-    assert message.startswith("formation_redistributed is for the loss of a drone, and task hover tells of none")
+    assert message.startswith("formation_redistributed is for the loss of a drone, and task hover has none")

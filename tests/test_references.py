@@ -9,7 +9,7 @@ import pytest
 from conftest import floats, make, make_system, refuse_system, with_vehicle
 
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.control.formation import Reference, smooth, start_reference, wrap
+from multilift_marl.control.formation import Reference, Smoothing, smooth, start_reference, wrap
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import fly
 from multilift_marl.math3d import heading
@@ -24,7 +24,7 @@ def control_step(command, seconds, yaw=0.0, frequency=6.0, speed=1.0, dt=0.004) 
     one, history = Reference.zeros(1, 1), Reference.zeros(steps, 1)
     one.command[:], one.command_yaw[:] = command, yaw
     for step in range(steps):
-        smooth(0, 1, one, frequency, speed, dt)
+        smooth(0, 1, one, Smoothing(frequency, speed, dt))
         for kept, now in zip(history, one, strict=True):
             kept[step] = now[0]
     return history
@@ -126,7 +126,7 @@ def test_a_free_drone_follows_its_reference_to_the_centimetre():
     gains = make_gains(ControlConfig(), system)._replace(load_share=np.zeros(1))
     thrust, errors = np.zeros((1, 1, 4)), []
     for _ in range(1250):
-        smooth(0, 1, reference, 6.0, 1.0, 0.004)
+        smooth(0, 1, reference, Smoothing(6.0, 1.0, 0.004))
         fly(0, 1, world.state, reference, np.zeros((1, 1, 3)), thrust, gains)
         world.step(thrust)
         errors.append(np.linalg.norm(world.state.drone_position - reference.position))

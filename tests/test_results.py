@@ -205,14 +205,14 @@ def test_the_search_finds_gains_that_cost_less(monkeypatch):
     ("keys", "reason"),
     [
         ({"script": "formation_gust"}, "did you mean 'formation_gusts'"),
-        ({"script": None}, "cannot begin with script 'None'"),
+        ({"script": None}, "script must be a valid string, but is None"),
         ({"script": "formation_lead"}, "cannot begin with script 'formation_lead'"),
         ({"config": "track"}, "task track cannot be searched; take hover or pose"),
         ({"config": "loss"}, "task loss cannot be searched"),
         ({"control.action": "velocity"}, "cannot fly control.action=velocity"),
-        ({"minutes": "abc"}, "minutes must be a positive number, but is 'abc'"),
-        ({"minutes": 0}, "minutes must be a positive number"),
-        ({"spread": float("nan")}, "spread must be a positive number"),
+        ({"minutes": "abc"}, "minutes must be a number, but is 'abc'"),
+        ({"minutes": 0}, "minutes must be greater than 0"),
+        ({"spread": float("nan")}, "spread must be a finite number"),
     ],
 )
 def test_what_cannot_be_searched_is_refused(keys, reason):

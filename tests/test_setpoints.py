@@ -7,25 +7,17 @@ import pytest
 from conftest import GRAVITY, floats, free_world, load, make_system
 
 from multilift_marl.config.schema import ControlConfig
+from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.gains import Gains, drone_gains, make_gains
-from multilift_marl.control.geometric import rate_torque
-from multilift_marl.control.setpoints import (
-    Setpoint,
-    fly_acc_rates,
-    fly_acceleration,
-    fly_attitude,
-    fly_rates,
-    fly_velocity,
-    smooth_velocity,
-    track_own_state,
-)
+from multilift_marl.control.geometric import attitude_torque, fly, fly_rates, rate_torque
+from multilift_marl.control.setpoints import Setpoint, smooth_velocity, track_own_state
 from multilift_marl.math3d import axis_angle
 from multilift_marl.sim import World
 
 DT = 1e-3
 QUICK = {"rotor_time_constant_up": 1e-4, "rotor_time_constant_down": 1e-4, "rotor_inertia": 0.0}
-NO_PULL = np.zeros((1, 1, 3))
+NO_CABLE = np.zeros((1, 1, 3))
 SEEDS = range(3)
 
 
@@ -63,10 +55,11 @@ def test_at_the_desired_rates_only_the_gyroscopic_torque_is_left(seed):
 @pytest.mark.parametrize("axis", range(3))
 def test_a_step_of_the_body_rate_is_first_order(axis):
     world, gains = quick_drone()
-    rates, total = np.zeros((1, 1, 3)), np.full((1, 1), gains.mass * GRAVITY)
-    rates[0, 0, axis] = 0.1
+    setpoint = Setpoint.zeros(1, 1)
+    setpoint.thrust[:] = gains.mass * GRAVITY
+    setpoint.rates[0, 0, axis] = 0.1
     seen = fly_for(
-        world, 0.3, lambda: fly_rates(0, 1, world.state, rates, total, NO_PULL, world.thrust, gains),
+        world, 0.3, lambda: fly_rates(0, 1, world.state, setpoint, NO_CABLE, world.thrust, gains),
         lambda: world.state.drone_body_rates[0, 0].copy(),
     )  # fmt: skip
     t = DT * np.arange(1, len(seen) + 1)
@@ -78,10 +71,11 @@ def test_a_step_of_the_body_rate_with_motor_lag_is_second_order():
     tau = 0.033
     world, gains = quick_drone(rotor_time_constant_up=tau, rotor_time_constant_down=tau)
     k = gains.k_w[0, 0]
-    rates, total = np.zeros((1, 1, 3)), np.full((1, 1), gains.mass * GRAVITY)
-    rates[0, 0, 0] = 0.05
+    setpoint = Setpoint.zeros(1, 1)
+    setpoint.thrust[:] = gains.mass * GRAVITY
+    setpoint.rates[0, 0, 0] = 0.05
     seen = fly_for(
-        world, 0.4, lambda: fly_rates(0, 1, world.state, rates, total, NO_PULL, world.thrust, gains),
+        world, 0.4, lambda: fly_rates(0, 1, world.state, setpoint, NO_CABLE, world.thrust, gains),
         lambda: world.state.drone_body_rates[0, 0, 0],
     )  # fmt: skip
     t, decay = DT * np.arange(1, len(seen) + 1), 0.5 / tau
@@ -92,16 +86,27 @@ def test_a_step_of_the_body_rate_with_motor_lag_is_second_order():
 
 def test_rates_and_thrust_give_up_yaw_first():
     world, gains = quick_drone()
-    rates, total = np.array([[[1.0, -0.5, 30.0]]]), np.full((1, 1), gains.mass * GRAVITY)
-    fly_rates(0, 1, world.state, rates, total, NO_PULL, world.thrust, gains)
+    setpoint = Setpoint.zeros(1, 1)
+    setpoint.thrust[:] = gains.mass * GRAVITY
+    setpoint.rates[:] = [1.0, -0.5, 30.0]
+    fly_rates(0, 1, world.state, setpoint, NO_CABLE, world.thrust, gains)
     given = world.system.vehicle.allocation @ world.thrust[0, 0]
-    asked = np.array(rate_torque((0.0, 0.0, 0.0), floats(rates), drone_gains(gains, 0)))
-    np.testing.assert_allclose(given[:3], [total[0, 0], *asked[:2]], rtol=1e-9)
-    assert 0 < given[3] < 0.9 * asked[2]
+    wanted = np.array(rate_torque((0.0, 0.0, 0.0), floats(setpoint.rates), drone_gains(gains, 0)))
+    np.testing.assert_allclose(given[:3], [setpoint.thrust[0, 0], *wanted[:2]], rtol=1e-9)
+    assert 0 < given[3] < 0.9 * wanted[2]
     assert np.isclose(world.thrust, gains.thrust_max).any() or np.isclose(world.thrust, gains.thrust_min).any()
 
 
 # Attitude
+
+
+def turn_to(
+    world: World, gains: Gains, desired: np.ndarray, rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> None:
+    """Write the thrusts that turn the drone to an attitude (3, 3), which turns at body rates, at the hover thrust."""
+    state, g = world.state, drone_gains(gains, 0)
+    torque = attitude_torque(floats(state.drone_rotation), floats(state.drone_body_rates), floats(desired), rates, g)
+    world.thrust[0, 0] = allocate(g.mass * GRAVITY, torque, g.allocation, g.thrust_min, g.thrust_max)
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -110,19 +115,13 @@ def test_a_step_of_the_attitude_is_second_order_with_the_configured_frequency_an
     world, _ = quick_drone()
     gains = make_gains(ControlConfig(attitude_damping=damping), world.system)
     frequency = (20.0, 20.0, 8.0)[axis]
-    desired = np.reshape(axis_angle(floats(np.eye(3)[axis]), 0.02), (1, 1, 3, 3))
-    rates, total = np.zeros((1, 1, 3)), np.full((1, 1), gains.mass * GRAVITY)
+    desired = np.array(axis_angle(floats(np.eye(3)[axis]), 0.02))
 
     def angle():
         r = world.state.drone_rotation[0, 0]
         return 0.5 * (r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1])[axis]
 
-    seen = fly_for(
-        world,
-        8 / frequency,
-        lambda: fly_attitude(0, 1, world.state, desired, rates, total, NO_PULL, world.thrust, gains),
-        angle,
-    )
+    seen = fly_for(world, 8 / frequency, lambda: turn_to(world, gains, desired), angle)
     t, decay = DT * np.arange(1, len(seen) + 1), damping * frequency
     w = frequency * np.sqrt(1 - damping**2)
     expected = 0.02 * (1 - np.exp(-decay * t) * (np.cos(w * t) + decay / w * np.sin(w * t)))
@@ -131,14 +130,12 @@ def test_a_step_of_the_attitude_is_second_order_with_the_configured_frequency_an
 
 def test_a_turning_attitude_is_followed_without_lag():
     world, gains = quick_drone()
-    desired, rates = np.eye(3).reshape(1, 1, 3, 3).copy(), np.array([[[0.0, 0.0, 0.4]]])
     world.state.drone_body_rates[0, 0, 2] = 0.4
     load(world)
-    total, time = np.full((1, 1), gains.mass * GRAVITY), [0.0]
+    time = [0.0]
 
     def step():
-        desired[0, 0] = np.reshape(axis_angle((0.0, 0.0, 1.0), 0.4 * time[0]), (3, 3))
-        fly_attitude(0, 1, world.state, desired, rates, total, NO_PULL, world.thrust, gains)
+        turn_to(world, gains, np.array(axis_angle((0.0, 0.0, 1.0), 0.4 * time[0])), (0.0, 0.0, 0.4))
         time[0] += DT
 
     turned = fly_for(world, 1.0, step, lambda: world.state.drone_rotation[0, 0].copy())
@@ -148,41 +145,53 @@ def test_a_turning_attitude_is_followed_without_lag():
 # Acceleration
 
 
+def follow_acceleration(world: World, reference: Reference, gains: Gains, tilt_rates: np.ndarray | None = None) -> None:
+    """Write the thrusts for the reference's acceleration alone."""
+    track_own_state(0, 1, world.state, reference, 0.0)
+    fly(0, 1, world.state, reference, NO_CABLE, world.thrust, gains, tilt_rates)
+
+
 @pytest.mark.parametrize("acceleration", [(0.0, 0.0, 2.0), (1.5, 0.0, 0.0), (0.5, -1.0, 1.0)])
 def test_a_steady_acceleration_is_that_commanded(acceleration):
     world, gains = quick_drone()
     reference = Reference.zeros(1, 1)
     reference.acceleration[:] = acceleration
     seen = fly_for(
-        world, 1.0, lambda: fly_acceleration(0, 1, world.state, reference, NO_PULL, world.thrust, gains),
+        world, 1.0, lambda: follow_acceleration(world, reference, gains),
         lambda: world.state.drone_velocity[0, 0].copy(),
     )  # fmt: skip
     np.testing.assert_allclose((seen[-1] - seen[-101]) / 0.1, acceleration, atol=0.01)
 
 
-def lag_of_a_changing_acceleration(told: bool) -> float:
-    """Return the largest error of a sinusoidal acceleration [m/s²], with or without the rates of its attitude told."""
+def lag_of_a_changing_acceleration(with_rates: bool) -> float:
+    """Return the largest error of a sinusoidal acceleration [m/s²], with or without the rates of its attitude."""
     world, gains = quick_drone()
-    reference, rates, w, asked = Reference.zeros(1, 1), np.zeros((1, 1, 3)), 4.0, []
+    reference, rates, w, wanted = Reference.zeros(1, 1), np.zeros((1, 1, 3)), 4.0, []
 
     def step():
-        t = len(asked) * DT
+        t = len(wanted) * DT
         acceleration, jerk = 2.0 * np.sin(w * t), 2.0 * w * np.cos(w * t)
         reference.acceleration[0, 0] = [acceleration, 0, 0]
-        rates[0, 0, 1] = told * jerk * GRAVITY / (GRAVITY**2 + acceleration**2)  # of atan(a/g)
-        fly_acc_rates(0, 1, world.state, reference, rates, NO_PULL, world.thrust, gains)
-        asked.append(acceleration)
+        rates[0, 0, 1] = with_rates * jerk * GRAVITY / (GRAVITY**2 + acceleration**2)  # of atan(a/g)
+        follow_acceleration(world, reference, gains, rates)
+        wanted.append(acceleration)
 
     speed = fly_for(world, 1.5, step, lambda: world.state.drone_velocity[0, 0, 0])
-    return np.abs(np.gradient(speed, DT) - asked)[500:].max()
+    return np.abs(np.gradient(speed, DT) - wanted)[500:].max()
 
 
 def test_rates_beside_the_acceleration_take_the_lag_out_of_a_changing_one():
-    assert lag_of_a_changing_acceleration(told=True) < 0.2
-    assert lag_of_a_changing_acceleration(told=True) < 0.3 * lag_of_a_changing_acceleration(told=False)
+    assert lag_of_a_changing_acceleration(with_rates=True) < 0.2
+    assert lag_of_a_changing_acceleration(with_rates=True) < 0.3 * lag_of_a_changing_acceleration(with_rates=False)
 
 
 # Velocity
+
+
+def follow_velocity(world: World, reference: Reference, gains: Gains) -> None:
+    """Write the thrusts for the reference's velocity alone."""
+    reference.position[:] = world.state.drone_position
+    fly(0, 1, world.state, reference, NO_CABLE, world.thrust, gains)
 
 
 def test_a_velocity_error_falls_exponentially():
@@ -190,7 +199,7 @@ def test_a_velocity_error_falls_exponentially():
     reference = Reference.zeros(1, 1)
     reference.velocity[0, 0, 2] = 0.5
     seen = fly_for(
-        world, 1.0, lambda: fly_velocity(0, 1, world.state, reference, NO_PULL, world.thrust, gains),
+        world, 1.0, lambda: follow_velocity(world, reference, gains),
         lambda: world.state.drone_velocity[0, 0, 2],
     )  # fmt: skip
     t = DT * np.arange(1, len(seen) + 1)
@@ -202,7 +211,7 @@ def test_a_sideways_velocity_is_reached_and_kept():
     reference = Reference.zeros(1, 1)
     reference.velocity[0, 0] = [0.6, -0.3, 0.1]
     seen = fly_for(
-        world, 1.8, lambda: fly_velocity(0, 1, world.state, reference, NO_PULL, world.thrust, gains),
+        world, 1.8, lambda: follow_velocity(world, reference, gains),
         lambda: world.state.drone_velocity[0, 0].copy(),
     )  # fmt: skip
     np.testing.assert_allclose(seen[-1], [0.6, -0.3, 0.1], atol=2e-3)

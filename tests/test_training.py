@@ -6,12 +6,16 @@ import json
 import numpy as np
 import pytest
 import torch
-from conftest import load_script, make_trainer
+from conftest import make_trainer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensordict.nn import TensorDictModule
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.objectives.multiagent import MAPPOLoss
+from torchrl.objectives.value import MultiAgentGAE
 
 from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
 from multilift_marl.agents.logging import RunLog, read_metrics
-from multilift_marl.agents.mappo import update
+from multilift_marl.agents.mappo import estimate_advantage, surrogate_loss, value_loss
 from multilift_marl.agents.networks import Normalizer
 from multilift_marl.agents.trainer import adapted_rate, resume_run
 from multilift_marl.config.load import load_config
@@ -43,10 +47,9 @@ def test_ten_iterations_equal_five_a_stop_and_five_more(tmp_path, kind):
     resumed = resume_run(half.folder, {"env.num_threads": 2})
     assert (resumed.iteration, resumed.iterations) == (5, 10)
     assert resumed.run()
-    for (name, one), two in zip(
-        whole.learner.loss.state_dict().items(), resumed.learner.loss.state_dict().values(), strict=True
-    ):
-        assert torch.equal(one, two), name
+    for network in ("actor", "critic"):  # with their normalisers
+        one, two = (getattr(trainer.learner, network).state_dict() for trainer in (whole, resumed))
+        assert all(torch.equal(one[name], two[name]) for name in one)
     columns = ("frames", "return", "reward/total", "approx_kl", "eval/return", "eval/best_iteration",
                "final/learned_return")  # fmt: skip
     rows, again = read_metrics(whole.folder), read_metrics(half.folder)
@@ -121,37 +124,65 @@ def test_time_outs_are_bootstrapped_and_failures_are_not(tmp_path):
     while not batch["next", "truncated"].any():
         batch = next(iter(trainer.collector))
     gamma = trainer.config.train.gamma
+    advantage, value = estimate_advantage(trainer.learner, batch)
     with torch.no_grad():
-        trainer.learner.advantage(batch)
-        value = trainer.learner.critic(batch["state"])
         following = trainer.learner.critic(batch["next", "state"])
     reward, done = batch["next", "agents", "reward"], batch["next", "truncated"].squeeze(-1)
     expected = reward + gamma * following - value  # nothing follows the last step of an episode
-    torch.testing.assert_close(batch["advantage"][done], expected[done], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(advantage[done], expected[done], rtol=1e-4, atol=1e-4)
     batch["next", "terminated"] = batch["next", "truncated"].clone()
-    with torch.no_grad():
-        trainer.learner.advantage(batch)
-    torch.testing.assert_close(batch["advantage"][done], (reward - value)[done], rtol=1e-4, atol=1e-4)
+    advantage, _ = estimate_advantage(trainer.learner, batch)
+    torch.testing.assert_close(advantage[done], (reward - value)[done], rtol=1e-4, atol=1e-4)
 
 
-def test_learning_is_mappo_as_written_without_torchrls_losses(tmp_path):
-    trainer = make_trainer(tmp_path, **{"env.episode_seconds": 0.2, "train.target_kl": 1.0})
+@pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
+def test_advantages_losses_and_gradients_are_those_of_torchrl(tmp_path, algorithm):
+    trainer = make_trainer(
+        tmp_path, **{"env.episode_seconds": 0.2, "train.target_kl": 1.0, "train.algorithm": algorithm}
+    )
     for _ in range(2):
         trainer.step()
-    arithmetic = load_script("bench/training").Arithmetic(trainer)
-    arithmetic.optimizer.load_state_dict(copy.deepcopy(trainer.learner.optimizer.state_dict()))
-    batch = next(iter(trainer.collector))
+    ours = trainer.learner
+    ours.optimizer.zero_grad(set_to_none=True)
+    theirs = copy.deepcopy(ours)
+    batch = next(iter(trainer.collector)).clone()
     batch["next", "terminated"][0, 3] = batch["next", "done"][0, 3] = True
     assert batch["next", "truncated"].any()
-    before = [parameter.clone() for parameter in trainer.learner.actor.parameters()]
-    torch.manual_seed(1)
-    arithmetic.seconds(batch)
-    torch.manual_seed(1)
-    update(trainer.learner, batch)
-    assert any((old != new).any() for old, new in zip(before, trainer.learner.actor.parameters(), strict=True))
-    for ours, theirs in ((arithmetic.actor, trainer.learner.actor), (arithmetic.critic, trainer.learner.critic)):
-        for (name, value), expected in zip(ours.state_dict().items(), theirs.state_dict().values(), strict=True):
-            torch.testing.assert_close(value, expected, rtol=1e-4, atol=1e-6, msg=name)
+
+    # TorchRL's estimator and loss on copies of the networks.
+    agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
+    parameters = [agents["loc"], agents["scale"]]
+    actor = ProbabilisticActor(
+        TensorDictModule(theirs.actor, in_keys=[agents["observation"]], out_keys=parameters), in_keys=parameters,
+        out_keys=[agents["action"]], distribution_class=IndependentNormal, return_log_prob=True,
+    )  # fmt: skip
+    source = "state" if algorithm == "mappo" else agents["observation"]
+    critic = TensorDictModule(theirs.critic, in_keys=[source], out_keys=[agents["state_value"]])
+    keys = {"value": agents["state_value"], "reward": agents["reward"], "done": "done", "terminated": "terminated"}
+    estimator = MultiAgentGAE(gamma=theirs.config.gamma, lmbda=theirs.config.gae_lambda, value_network=critic)
+    estimator.set_keys(**keys)
+    loss = MAPPOLoss(
+        actor, critic, value_norm=theirs.critic.value_norm, clip_epsilon=theirs.config.clip, entropy_bonus=False,
+        critic_coeff=theirs.config.value_weight, loss_critic_type="l2", normalize_advantage=False, functional=False,
+    )  # fmt: skip
+    loss.set_keys(**keys, action=agents["action"], sample_log_prob=("agents", "action_log_prob"))
+    advantage, value = estimate_advantage(ours, batch)
+    with torch.no_grad():
+        estimator(batch)
+    assert torch.equal(advantage, batch["advantage"]) and torch.equal(advantage + value, batch["value_target"])
+
+    rows = batch.reshape(-1)[::2]
+    expected = loss(rows)
+    (expected["loss_objective"] + expected["loss_critic"]).backward()
+    seen = [rows["agents", name] for name in ("observation", "action", "action_log_prob")]
+    policy, _, kl, clipped = surrogate_loss(ours, *seen, rows["advantage"])
+    error = ours.config.value_weight * value_loss(ours, ours.critic_input(rows), rows["value_target"])
+    (policy + error).backward()
+    assert torch.equal(policy, expected["loss_objective"]) and torch.equal(error, expected["loss_critic"])
+    assert torch.equal(kl, expected["kl_approx"]) and torch.equal(clipped, expected["clip_fraction"])
+    for mine, its in ((ours.actor, theirs.actor), (ours.critic, theirs.critic)):
+        for one, two in zip(mine.parameters(), its.parameters(), strict=True):
+            assert torch.equal(one.grad, two.grad)
 
 
 def test_normalizer_equals_the_statistics_of_all_batches():

@@ -15,7 +15,7 @@ import numpy as np
 
 import multilift_marl as ml
 from multilift_marl._jit import bind, kernel
-from multilift_marl.agents.trained import TrainedPolicy
+from multilift_marl.agents.policy import TrainedPolicy
 from multilift_marl.control.formation import Goal
 from multilift_marl.envs import multilift_v0
 from multilift_marl.envs.core import MultiliftVec

@@ -1,6 +1,6 @@
 """Evaluations during training: how good the policy is, which one is the best, and what training gained over its script.
 
-All flights are on seeds of evaluation during training. Their episodes come in blocks: every evaluation flies block 0,
+All episodes are on seeds of evaluation during training. They come in blocks: every evaluation takes block 0,
 so that its numbers can be compared over a training; the others have decided nothing before, so that no policy is called
 better for having been lucky.
 """
@@ -82,7 +82,8 @@ class Evaluator:
         """Fly the best policy and the script that training of so many iterations began with."""
         learned = self._fly(self.best_policy().bind, iterations + 1)
         script = self._fly(LINEAR[self.config.train.residual], iterations + 1)
-        before, after = ({name: float(flown[name].mean()) for name in _METRICS} for flown in (script, learned))
+        before = {name: float(script[name].mean()) for name in _METRICS}
+        after = {name: float(learned[name].mean()) for name in _METRICS}
         return Gain(before, after, is_better(learned, script))
 
     def best_policy(self) -> LearnedPolicy:

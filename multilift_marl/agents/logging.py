@@ -8,15 +8,18 @@ import json
 import platform
 import subprocess
 from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import imageio.v3 as iio
-from torch.utils.tensorboard import SummaryWriter
 
 from multilift_marl._files import write_whole
-from multilift_marl.agents.versions import package_versions
 
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+_PACKAGES = ("multilift_marl", "numpy", "mujoco", "numba", "torch", "torchrl", "tensordict", "gymnasium", "pettingzoo")
 _GROUPS = {  # of TensorBoard's tags; names that have none and are not here belong to the update
     "episodes": ("return", "success", "failure", "diverged"),
     "speed": ("fps", "share_sampling", "share_learning"),
@@ -38,7 +41,7 @@ class RunLog:
         self._behind = False  # whether rows are missing in the file
         if self._rows:
             self._rewrite()
-        self._writer: SummaryWriter | None = SummaryWriter(str(folder), purge_step=frames + 1 if iteration else None)
+        self._writer: SummaryWriter | None = _open_writer(folder, frames + 1 if iteration else None)
 
     def write(self, row: dict[str, float], values: dict[str, float]) -> None:
         """Write one iteration: `row` holds iteration and frames, `values` the numbers; TensorBoard's step is frames."""
@@ -54,7 +57,7 @@ class RunLog:
                 csv.DictWriter(file, self._columns, restval="").writerow(line)
             self._behind = False
         if self._writer is None:
-            self._writer = SummaryWriter(str(self._path.parent))
+            self._writer = _open_writer(self._path.parent)
         for name, value in values.items():
             try:
                 self._writer.add_scalar(_tag(name), value, row["frames"])
@@ -86,6 +89,13 @@ class RunLog:
         writer.writerows(self._rows)
         write_whole(self._path, text.getvalue().encode(), flush=False)
         self._behind = False
+
+
+def _open_writer(folder: Path, purge_step: int | None = None) -> SummaryWriter:
+    """Return TensorBoard's writer, whose import takes a while."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=purge_step)
 
 
 def _tag(name: str) -> str:
@@ -120,6 +130,18 @@ def write_versions(folder: Path) -> None:
         + "\n",
         encoding="utf-8",
     )
+
+
+def package_versions(*more: str) -> dict[str, str | None]:
+    """Return the version of each package that training depends on, and of `more`; None for one not installed."""
+    return {name: _version(name) for name in (*_PACKAGES, *more)}
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 def _git_commit() -> str | None:

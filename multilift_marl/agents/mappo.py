@@ -6,12 +6,11 @@ import time
 from dataclasses import dataclass
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import IndependentNormal, PopArtValueNorm, ProbabilisticActor
-from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
-from torchrl.objectives.value import MultiAgentGAE
+from torch.distributions import Independent, Normal
+from torchrl.modules import PopArtValueNorm
 
 from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, TeamNet, draw_action
 from multilift_marl.config.schema import TrainConfig
@@ -21,27 +20,8 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.tasks.observations import drone_numbers
 
 
-class KeyedNetwork(TensorDictModuleBase):
-    """A network whose input and outputs are keys of a TensorDict.
-
-    TensorDict's own module does the same with bookkeeping that costs as much as a small network.
-    """
-
-    def __init__(self, network: nn.Module, source: NestedKey, targets: list[NestedKey]):
-        super().__init__()
-        self.in_keys, self.out_keys = [source], targets
-        self.network = network
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write what the network returns."""
-        values = self.network(tensordict.get(self.in_keys[0]))
-        for key, value in zip(self.out_keys, values if isinstance(values, tuple) else (values,), strict=True):
-            tensordict.set(key, value)
-        return tensordict
-
-
 class StochasticPolicy(nn.Module):
-    """What flies the rollouts: observations to actions drawn from the actor's Gaussian, and their log-probabilities."""
+    """The policy of the rollouts: actions drawn from the actor's Gaussian, and their log-probabilities."""
 
     def __init__(self, actor: Actor):
         super().__init__()
@@ -49,21 +29,24 @@ class StochasticPolicy(nn.Module):
 
     @torch.no_grad()
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return actions (..., N, A) and log-probabilities (..., N)."""
+        """Return actions (..., N, A) and log-probabilities (..., N) for observations (..., N, D)."""
         return draw_action(self.actor(observation)[0], self.actor.log_std.exp())
 
 
 @dataclass
 class Learner:
-    """What learns: networks, loss, advantage estimator, optimiser."""
+    """What learns: networks and their optimiser, and the policy of the rollouts for TorchRL's collector."""
 
     config: TrainConfig
     actor: Actor
     critic: CentralCritic | LocalCritic
-    policy: KeyedNetwork
-    loss: MAPPOLoss
-    advantage: MultiAgentGAE
+    policy: TensorDictModule
     optimizer: torch.optim.Adam
+
+    def critic_input(self, batch: TensorDictBase) -> torch.Tensor:
+        """Return what the critic sees: the global state of `mappo`, each drone's observation of `ippo`."""
+        source: torch.Tensor = batch["state"] if self.config.algorithm == "mappo" else batch["agents", "observation"]
+        return source
 
 
 def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
@@ -80,95 +63,93 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     vec = env.vec
     base = torch.from_numpy(residual_matrix(config.residual, vec))
     actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
-    agents = {name: ("agents", name) for name in ("observation", "action", "loc", "scale", "state_value", "reward")}
-    gaussian, log_prob = [agents["loc"], agents["scale"]], ("agents", "action_log_prob")
-    policy = KeyedNetwork(StochasticPolicy(actor), agents["observation"], [agents["action"], log_prob])
-    mean = KeyedNetwork(actor, agents["observation"], gaussian)
-    judged = ProbabilisticActor(
-        mean, in_keys=gaussian, out_keys=[agents["action"]], distribution_class=IndependentNormal,
-        return_log_prob=True, log_prob_key=log_prob,
-    )  # fmt: skip
+    policy = TensorDictModule(
+        StochasticPolicy(actor),
+        in_keys=[("agents", "observation")],
+        out_keys=[("agents", "action"), ("agents", "action_log_prob")],
+    )
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
     critic: CentralCritic | LocalCritic
-    source: str | tuple[str, str]
     if config.algorithm == "mappo":
         drones = drone_numbers(vec.num_drones, vec.action_size)
-        critic, source = CentralCritic(config.critic, vec.state_size, drones, config.hidden, value_norm), "state"
+        critic = CentralCritic(config.critic, vec.state_size, drones, config.hidden, value_norm)
     else:
-        critic, source = LocalCritic(vec.observation_size, config.hidden, value_norm), agents["observation"]
-    value = KeyedNetwork(critic, source, [agents["state_value"]])
+        critic = LocalCritic(vec.observation_size, config.hidden, value_norm)
 
-    # 3. The loss and the advantage estimator. Time-outs are bootstrapped: only `terminated` ends a return.
-    keys = {"value": agents["state_value"], "reward": agents["reward"], "done": "done", "terminated": "terminated"}
-    loss = (MAPPOLoss if config.algorithm == "mappo" else IPPOLoss)(
-        judged, value, value_norm=value_norm, clip_epsilon=config.clip,
-        entropy_bonus=config.entropy > 0, entropy_coeff=config.entropy, critic_coeff=config.value_weight,
-        loss_critic_type="l2", normalize_advantage=False, functional=False,
-    )  # fmt: skip
-    loss.set_keys(**keys, action=agents["action"], sample_log_prob=log_prob)
-    advantage = MultiAgentGAE(gamma=config.gamma, lmbda=config.gae_lambda, value_network=value)
-    advantage.set_keys(**keys)
-    groups = [{"params": list(actor.parameters())}, {"params": list(critic.parameters())}]  # rates of their own
+    # 3. The optimiser, with rates of their own.
+    groups = [{"params": list(actor.parameters())}, {"params": list(critic.parameters())}]
     optimizer = torch.optim.Adam(groups, lr=config.learning_rate, eps=1e-5, fused=True)
-    return Learner(config, actor, critic, policy, loss, advantage, optimizer)
+    return Learner(config, actor, critic, policy, optimizer)
 
 
-def _rows(data: TensorDictBase, chosen: torch.Tensor) -> TensorDictBase:
-    """Return some rows of `data`, in a quarter of the time of `data[chosen]`."""
-    return data.apply(lambda values: values.index_select(0, chosen), batch_size=chosen.shape)
+@torch.no_grad()
+def estimate_advantage(learner: Learner, batch: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return generalised advantage estimates and values (E, T, N, 1) of rollouts (Schulman et al., ICLR 2016).
+
+    Time-outs are bootstrapped: only `terminated` ends a return.
+    """
+    following = batch["next"]
+    value: torch.Tensor = learner.critic(learner.critic_input(batch))
+    next_value = learner.critic(learner.critic_input(following))
+    gamma = torch.tensor(learner.config.gamma)
+    discount = gamma * ~following["terminated"].unsqueeze(-2)
+    decay = torch.tensor(learner.config.gae_lambda) * gamma * ~following["done"].unsqueeze(-2)
+    delta = following["agents", "reward"] + discount * next_value - value
+    advantage = torch.empty_like(delta)
+    last = torch.zeros_like(delta[:, 0])
+    for t in reversed(range(delta.shape[1])):
+        last = delta[:, t] + last * decay[:, t]
+        advantage[:, t] = last
+    return advantage, value
 
 
-def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
+def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
     """Improve policy and critic on one batch of rollouts [E, T]; return diagnostics.
 
     Args:
         learner: changed in place.
         batch: what the collector returned; not changed.
     """
-    config, start, batch = learner.config, time.perf_counter(), batch.copy()
-    # 1. Advantages, from values of the critic before the update.
-    with torch.no_grad():
-        learner.advantage(batch)
-    residual = batch["value_target"] - batch["agents", "state_value"]
-    explained = 1 - residual.var() / batch["value_target"].var().clamp(min=1e-8)
-    keep = [("agents", key) for key in ("observation", "action", "action_log_prob")] + ["state", "value_target"]
-    data = batch.select(*keep, "advantage").reshape(-1)
-    advantage = data["advantage"]
-    data["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
+    config, start = learner.config, time.perf_counter()
+    observation, critic_input = batch["agents", "observation"], learner.critic_input(batch)
+
+    # 1. Advantages, from values of the critic before the update, normalised over the batch.
+    advantage, value = estimate_advantage(learner, batch)
+    target = advantage + value
+    explained = 1 - (target - value).var() / target.var().clamp(min=1e-8)
+    advantage = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
+    action, log_prob = batch["agents", "action"], batch["agents", "action_log_prob"]
+    columns = [each.flatten(0, 1) for each in (observation, action, log_prob, advantage, critic_input, target)]
 
     # 2. Some epochs of minibatches, fewer if the policy moves too far.
-    actor, critic = (group["params"] for group in learner.optimizer.param_groups)
-    diagnostics, stop = [], False
+    actor_parameters, critic_parameters = (group["params"] for group in learner.optimizer.param_groups)
+    diagnostics: list[torch.Tensor] = []
+    stop = False
     for _ in range(config.epochs):
-        order = torch.randperm(data.shape[0])
+        order = torch.randperm(len(columns[0]))
         for chunk in order.chunk(config.minibatches):
-            losses = learner.loss(_rows(data, chunk))
-            total = losses["loss_objective"] + losses["loss_critic"]
+            rows = [column.index_select(0, chunk) for column in columns]
+            policy_loss, entropy, kl, clipped = surrogate_loss(learner, *rows[:4])
+            critic_loss = config.value_weight * value_loss(learner, *rows[4:])
+            total = policy_loss + critic_loss
             if config.entropy > 0:
-                total = total + losses["loss_entropy"]
+                total = total - config.entropy * entropy
             learner.optimizer.zero_grad(set_to_none=True)
             total.backward()
-            norm = nn.utils.clip_grad_norm_(actor, config.max_grad_norm)
-            nn.utils.clip_grad_norm_(critic, config.max_grad_norm)
+            norm = nn.utils.clip_grad_norm_(actor_parameters, config.max_grad_norm)
+            nn.utils.clip_grad_norm_(critic_parameters, config.max_grad_norm)
             learner.optimizer.step()
-            values = [
-                losses["kl_approx"],
-                losses["clip_fraction"],
-                losses["loss_objective"],
-                losses["loss_critic"],
-                norm,
-            ]
-            diagnostics.append(torch.stack([value.detach().mean() for value in values]))
+            values = [kl, clipped, policy_loss, critic_loss, norm]
+            diagnostics.append(torch.stack([value.detach() for value in values]))
         if torch.stack(diagnostics[-config.minibatches :])[:, 0].mean() > config.target_kl:
             stop = True
             break
 
     # 3. Statistics of the observations, for the next rollouts.
-    learner.actor.normalizer.update(batch["agents", "observation"])
-    source = "state" if config.algorithm == "mappo" else ("agents", "observation")
-    learner.critic.normalizer.update(batch[source])
+    learner.actor.normalizer.update(observation)
+    learner.critic.normalizer.update(critic_input)
 
     mean = torch.stack(diagnostics).mean(0)
     names = ("approx_kl", "clip_fraction", "loss_policy", "loss_critic", "gradient_norm")
@@ -180,6 +161,26 @@ def update(learner: Learner, batch: TensorDict) -> dict[str, float]:
         "stopped_early": float(stop),
         "learning_seconds": time.perf_counter() - start,
     }
+
+
+def surrogate_loss(
+    learner: Learner, observation: torch.Tensor, action: torch.Tensor, log_prob: torch.Tensor, advantage: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the clipped loss (Schulman et al., arXiv 1707.06347), entropy, approximate KL and clipped share."""
+    clip = torch.tensor(learner.config.clip)
+    distribution = Independent(Normal(*learner.actor(observation)), 1)
+    log_ratio = (distribution.log_prob(action) - log_prob).unsqueeze(-1)
+    clipped = log_ratio.clamp((-clip).log1p(), clip.log1p())
+    gain = torch.stack([log_ratio.exp() * advantage, clipped.exp() * advantage], -1).min(dim=-1).values
+    share = (clipped != log_ratio).float().mean()
+    return (-gain).mean(), distribution.entropy().mean(), -log_ratio.mean(), share
+
+
+def value_loss(learner: Learner, source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Return the squared error in units of the value normaliser, which learns from the targets first."""
+    value, norm = learner.critic(source), learner.critic.value_norm
+    norm.update(target)
+    return (norm.normalize(target) - norm.normalize(value)).square().mean()
 
 
 def adapted_rate(rate: float, kl: float, desired: float) -> float:

@@ -130,10 +130,10 @@ class Actor(nn.Module):
     """Gaussian policy of a drone, the same for all: observations (..., N, D) to mean and deviation (..., N, A).
 
     Its mean is that of a linear script, `base` (A, D), plus a network whose last layer starts at zero: an untrained
-    team flies the script.
+    team acts as the script.
 
     Args:
-        kind: what drones are told of each other; see `TeamNet`. With "local" each acts on its own observation alone.
+        kind: what drones know of each other; see `TeamNet`. With "local" each acts on its own observation alone.
         observation_size, action_size: D, A.
         hidden: widths of the hidden layers.
         initial_std: deviation at the start.

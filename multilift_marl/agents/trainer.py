@@ -37,7 +37,7 @@ from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason
 from multilift_marl.evaluation.rollout import trace_episode
 
-_NEEDED = ("loss", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best_policy")
+_NEEDED = ("critic", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best_policy")
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -126,7 +126,7 @@ class Trainer:
         self._best_saved = self._attempt(self._restore_best)
         while not (self.finished or self._stop):
             start = time.perf_counter()
-            first = self.evaluator.best is None  # the untrained policy, which flies the script
+            first = self.evaluator.best is None  # the untrained policy, which acts as the script
             values = {} if first else self.step()
             if "return" in values:
                 shown["return"] = f"{values['return']:.0f}"
@@ -236,7 +236,7 @@ class Trainer:
     def _training_state(self) -> dict[str, Any]:
         """Return what else training depends on."""
         return {
-            "loss": self.learner.loss.state_dict(),  # actor and critic with normalisers, value normaliser
+            "critic": self.learner.critic.state_dict(),  # with its normaliser and that of the values
             "optimizer": self.learner.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
             "env": self.env.get_state(),
@@ -260,7 +260,7 @@ class Trainer:
     def _load(self, content: dict[str, Any]) -> None:
         environments, optimizer = content["env"], self.learner.optimizer
         own = self._content() | self._training_state()
-        for key in ("loss", "rng", "returns", "iteration", "seconds"):
+        for key in ("critic", "rng", "returns", "iteration", "seconds"):
             check_like(content[key], own[key], key)
         if content["best_policy"] is not None:
             check_policy(content["best_policy"], "'best_policy'")
@@ -272,7 +272,8 @@ class Trainer:
         for key in ("world.system", "task_name"):  # which the first checkpoints do not hold
             environments.setdefault(key, own["env"][key])
         self.env.set_state(environments)
-        self.learner.loss.load_state_dict(content["loss"])
+        self.learner.actor.load_state_dict(content["actor"])
+        self.learner.critic.load_state_dict(content["critic"])
         optimizer.load_state_dict(content["optimizer"])
         for group, expected in zip(optimizer.param_groups, own["optimizer"]["param_groups"], strict=True):
             for key in expected.keys() - {"params"}:
@@ -291,7 +292,7 @@ class Trainer:
             save_checkpoint(path, best)
 
     def _draw_best(self) -> Path:
-        """Return the path of a picture of the first episode, flown by the best policy."""
+        """Return the path of a picture of the first episode of the best policy."""
         from multilift_marl.evaluation.plots import plot_paths  # matplotlib takes a while
 
         policy, path = self.evaluator.best_policy(), self.folder / "flight.png"

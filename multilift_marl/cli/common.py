@@ -1,4 +1,4 @@
-"""What the commands share: key=value arguments, errors in one sentence, help."""
+"""What the commands share: key=value arguments, their options, errors in one sentence, help."""
 
 from __future__ import annotations
 
@@ -6,51 +6,53 @@ import io
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from multilift_marl._interrupt import end_quiet_import
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import check_names, explain, load_config, parse_overrides
 from multilift_marl.config.validate import validate
+from multilift_marl.config.values import Section
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install, reason, shorten
 from multilift_marl.plugins import import_modules
 from multilift_marl.tasks import find_task, list_tasks
 
+Options = TypeVar("Options", bound=Section)
 _EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  # of all other packages: train
 
 
 def run_command(
-    main: Callable[[dict[str, Any]], int], usage: str, own: Iterable[str], arguments: Sequence[str] | None,
-    configuration: str | None = "config", names: Collection[str] = (),
+    main: Callable[[dict[str, Any]], int], usage: str, options: type[Section], arguments: Sequence[str] | None,
+    configuration: str | None = "config",
 ) -> int:  # fmt: skip
     """Run a command on key=value arguments and return its exit status; a user's error is one sentence on stderr.
 
     Args:
-        main: the command, called with the values by key.
+        main: the command, called with the values by key; see `split_options`.
         usage: the head of its help.
-        own: its keys beside those of a configuration.
+        options: its keys beside those of a configuration. Text is taken as it stands, all else read as YAML.
         arguments: None for those of this process.
         configuration: its key that names a configuration, whose keys and values its help lists; None: it has none.
-        names: those of its keys that name files and the like, taken as they are.
     """
     end_quiet_import()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    own = options.model_fields
+    texts = [key for key, field in own.items() if _is_text(field.annotation)]
     _open_streams()
     try:
-        if any(argument in ("-h", "--help") for argument in arguments):
-            values = parse_overrides((each for each in arguments if each not in ("-h", "--help")), names)
-            check_names(values, own)
-            import_modules(values.get("import"))
+        wanted = [argument for argument in arguments if argument not in ("-h", "--help")]
+        values = parse_overrides(wanted, texts)
+        check_names(values, own)
+        import_modules(values.get("import"))  # first of all: checkpoints, too, may need them
+        if len(wanted) < len(arguments):
             explained = "" if configuration is None else _explain_configuration(values, own, configuration)
-            print(f"{usage}{explained}")
+            print(f"{usage}\n\nKeys of this command (default, meaning):\n{explain(options)}{explained}")
             status = 0
         else:
-            values = parse_overrides(arguments, names)
-            check_names(values, own)
-            import_modules(values.get("import"))  # first of all: checkpoints, too, may need them
             status = main(values)
         sys.stdout.flush()
         return status
@@ -99,12 +101,26 @@ def _give_up_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def whole_number(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
-    """Return the value of a command's own key; a ConfigError if it is no whole number from `least` to `most`."""
-    whole = isinstance(value, int | float) and not isinstance(value, bool) and value == value // 1
-    if not whole or not least <= value <= most:
-        raise ConfigError(f"{key} must be a whole number from {least} to {most}, but is {shorten(repr(value))}")
-    return int(value)
+def _is_text(annotation: Any) -> bool:
+    """Return whether a key holds text: str, one of some words, or none."""
+    parts = typing.get_args(annotation) or (annotation,)
+    return all(part in (str, type(None)) or isinstance(part, str) for part in parts)
+
+
+def split_options(options: type[Options], values: Mapping[str, Any]) -> tuple[Options, dict[str, Any]]:
+    """Return a command's options, validated as a configuration is, and the other values by key.
+
+    Raises:
+        ConfigError: a wrong type or a value out of range.
+    """
+    own = {key: value for key, value in values.items() if key in options.model_fields}
+    return validate(options, own), {key: value for key, value in values.items() if key not in own}
+
+
+def limit_torch_threads() -> None:
+    """Let torch, where it has been imported, use one thread: for networks this small, more only wait for each other."""
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(1)
 
 
 def make_folder(folder: Path) -> Path:

@@ -2,96 +2,100 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
-from multilift_marl.cli.common import make_folder, run_command, title, whole_number
-from multilift_marl.cli.policies import find_policy
+from multilift_marl.agents.policy import find_policy, load_policy
+from multilift_marl.cli.common import limit_torch_threads, make_folder, run_command, split_options, title
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.values import Between, Float, Int, Section
 from multilift_marl.control.scripted import fitting_scripts
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.errors import ConfigError, RenderingError, nearest
-from multilift_marl.evaluation.report import format_table, make_report, write_report
+from multilift_marl.errors import ConfigError, RenderingError
+from multilift_marl.evaluation.metrics import format_table, make_report, write_report
 from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
-from multilift_marl.rendering import CAMERAS
 
-_USAGE = """Judge a team on fixed seeds, beside the scripted ones on the same episodes.
+_USAGE = """Evaluate a team on fixed seeds, beside the scripted ones on the same episodes.
 
   python evaluate.py run=latest episodes=200 seed=1000 baseline=formation_integral video=true [key=value ...]
   python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
-  run         a run folder, its name, "latest", or the name of a shipped policy ("hover")     (latest)
-  policy      in place of a run: a script (formation, formation_integral, formation_feedback, formation_gusts,
-              formation_lead, formation_narrow, formation_redistributed, payload_geometric), one's own class
-              (module:Class, file.py:Class), an exported policy (.onnx), a checkpoint (.pt)   (none)
-  config      environment of that policy, a configuration's name or path; task=<other> keeps its vehicles, payload,
-              cables and control, see python train.py --help            (what it was trained in, of scripts hover)
-  import      a module of one's own with tasks or vehicles (docs/plugins.md)                  (as the run)
-  checkpoint  best, last, or a file                                                           (best)
-  episodes    how many                                                                        (200)
-  seed        evaluation seed: episode i is the same for every policy                         (1000)
-  baseline    drawn beside the policy, named like it, or a run folder or shipped policy; none: fly the policy alone
-                                                                                              (formation_integral)
-  video       true: also an mp4 of the first episode                                          (false)
-  camera      of the video: side, top or chase                                                (side)
-  trail       seconds of flight that drones and payload draw behind them in the video         (2)
-  out         folder for metrics.json, plots and video      (<run>/eval/<time>, of a script runs/<policy>-<config>/…)
-
+Scripts are formation, formation_integral, formation_feedback, formation_gusts, formation_lead, formation_narrow,
+formation_redistributed and payload_geometric. task=<other> keeps the configuration's vehicles, payload, cables and
+control, see python train.py --help.
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
 
-_DEFAULTS = {
-    "run": "latest", "policy": None, "config": None, "checkpoint": "best", "episodes": 200, "seed": 1000,
-    "baseline": "formation_integral", "video": False, "camera": "side", "trail": 2.0, "out": None,
-}  # fmt: skip
 
-_NAMES = ("run", "policy", "config", "checkpoint", "baseline", "camera", "out")
+class Options(Section):
+    """Keys of the command beside those of the configuration."""
+
+    run: str = Field("latest", description='a run folder, its name, "latest", or a shipped policy ("hover")')
+    policy: str | None = Field(
+        None, description="in place of a run: a script, one's own class (module:Class, file.py:Class), .onnx, .pt"
+    )
+    config: str | None = Field(
+        None, description="environment of that policy, name or path; None: what it was trained in, of scripts hover"
+    )
+    checkpoint: str = Field("best", description="of the run: best, last, or a file")
+    episodes: Annotated[Int, Between(1, 1e6)] = Field(200, description="how many")
+    seed: Int = Field(1000, ge=0, description="evaluation seed: episode i is the same for every policy")
+    baseline: str = Field(
+        "formation_integral", description="drawn beside the policy, named like it, or a run; none: the policy alone"
+    )
+    video: bool = Field(False, description="also an mp4 of the first episode")
+    camera: Literal["side", "top", "chase"] = Field("side", description="of the video")
+    trail: Annotated[Float, Between(0, 1000, "s")] = Field(
+        2.0, description="[s] of the paths that the video draws behind drones and payload"
+    )
+    out: str | None = Field(
+        None, description="folder for metrics.json, plots and video; None: <run>/eval/<time>, of a script runs/..."
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate; return the exit status."""
-    return run_command(_evaluate, _USAGE, _DEFAULTS, arguments, names=_NAMES)
+    return run_command(_evaluate, _USAGE, Options, arguments)
 
 
 def _evaluate(values: dict[str, Any]) -> int:
-    _check_source(values)
-    own = {key: values.pop(key, default) for key, default in _DEFAULTS.items()}
-    _check(own)
-    own["baseline"] = str(own["baseline"])
-    baseline = find_policy(own["baseline"], "baseline", ["none"]) if own["baseline"] != "none" else None
-    flown = _find_run(own) if own["policy"] is None else _find_named(own, values)
-    config = build_config(flown.config.model_dump(), {"env.num_threads": 0} | values)
+    options, overrides = split_options(Options, values)
+    _check_source(options)
+    alone = options.baseline == "none"
+    baseline = None if alone else find_policy(options.baseline, "baseline", ["none"])
+    team = _find_run(options) if options.policy is None else _find_named(options, options.policy, overrides)
+    limit_torch_threads()
+    config = build_config(team.config.model_dump(), {"env.num_threads": 0} | overrides)
     _ = config.system
     probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
-    makers = {flown.name: flown.make}
+    makers = {team.name: team.make}
     if baseline is not None:
-        makers |= {name: find_policy(name).bind for name in fitting_scripts(probe) if name != flown.name}
-        makers.setdefault(own["baseline"], baseline.bind)
+        makers |= {name: find_policy(name).bind for name in fitting_scripts(probe) if name != team.name}
+        makers.setdefault(options.baseline, baseline.bind)
     for make in makers.values():  # refuses what does not fit, before there is a folder
         make(probe)
-    out = make_folder(Path(own["out"]) if own["out"] else flown.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
+    out = make_folder(Path(options.out) if options.out else team.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
 
     order = sorted(makers, key=lambda name: ":" not in name)  # one's own first: should they fail, nothing is lost
-    episodes = {name: _fly(config, makers[name], name, own) for name in order}
-    judged = episodes.pop(flown.name)
-    report = make_report(config, own["seed"], judged, episodes)
-    print(f"\n{flown.source}: {own['episodes']} episodes, seed {own['seed']}; mean (95 % interval)\n")
-    print(format_table(report, flown.name))
+    episodes = {name: _fly(config, makers[name], name, options) for name in order}
+    report = make_report(config, options.seed, episodes.pop(team.name), episodes)
+    print(f"\n{team.source}: {options.episodes} episodes, seed {options.seed}; mean (95 % interval)\n")
+    print(format_table(report, team.name))
     write_report(out / "metrics.json", report)
     print(f"\nwrote {out / 'metrics.json'}")
-    _draw(config, makers, flown, own, out)
+    _draw(config, makers, team, options, out)
     return 0
 
 
-class _Flown(NamedTuple):
-    """What is judged."""
+class _Team(NamedTuple):
+    """What is evaluated."""
 
     name: str
     """Of its column: "policy" for a learned one, else the script's."""
@@ -102,89 +106,63 @@ class _Flown(NamedTuple):
     """That its evaluations belong to."""
 
 
-def _check_source(values: dict[str, Any]) -> None:
+def _check_source(options: Options) -> None:
     """Refuse keys of a run beside another policy, and the other way round."""
-    named = values.get("policy") is not None
-    wrong = [key for key in (("run", "checkpoint") if named else ("config",)) if key in values]
+    named = options.policy is not None
+    wrong = [key for key in (("run", "checkpoint") if named else ("config",)) if key in options.model_fields_set]
     if wrong and named:
-        raise ConfigError(f"policy={values['policy']} takes the place of a run and has no {wrong[0]}; leave out one")
+        raise ConfigError(f"policy={options.policy} takes the place of a run and has no {wrong[0]}; leave out one")
     if wrong:
         raise ConfigError("a run brings its own configuration: leave out config, or fly a script by policy=formation")
 
 
-def _find_named(own: dict[str, Any], values: dict[str, Any]) -> _Flown:
-    name = str(own["policy"])
+def _find_named(options: Options, name: str, overrides: dict[str, Any]) -> _Team:
     policy = find_policy(name)
-    if policy.config is None or own["config"] is not None:
-        config = load_config(str(own["config"] or "hover"), values)
-        where = title(values | {"config": own["config"]})
+    if policy.config is None or options.config is not None:
+        config = load_config(options.config or "hover", overrides)
+        where = title(overrides | {"config": options.config})
     else:
         config, where = policy.config, policy.config.task
     module, _, kind = name.rpartition(":")
     label = f"{Path(module).name.removesuffix('.py')}.{kind}" if module else Path(name).stem
-    return _Flown(name, f"{name} on {where}", config, policy.bind, Path("runs") / f"{label}-{where}")
+    return _Team(name, f"{name} on {where}", config, policy.bind, Path("runs") / f"{label}-{where}")
 
 
-def _check(own: dict[str, Any]) -> None:
-    own["episodes"] = whole_number("episodes", own["episodes"], 1, 1_000_000)
-    own["seed"] = whole_number("seed", own["seed"], 0)
-    if not isinstance(own["video"], bool):
-        raise ConfigError(f"video must be true or false, but is {own['video']!r}")
-    if own["camera"] not in CAMERAS:
-        raise ConfigError(f"unknown camera '{own['camera']}'{nearest(str(own['camera']), CAMERAS)}")
-    if isinstance(own["trail"], bool) or not isinstance(own["trail"], int | float) or not 0 <= own["trail"] < 1e3:
-        raise ConfigError(f"trail must be a number of seconds from 0 to 1000, but is {own['trail']!r}")
+def _find_run(options: Options) -> _Team:
+    policy = load_policy(options.run, options.checkpoint)
+    return _Team("policy", policy.source, policy.config, policy.bind, policy.folder)
 
 
-def _find_run(own: dict[str, Any]) -> _Flown:
-    run, checkpoint = str(own["run"]), str(own["checkpoint"])
-    import torch
-
-    from multilift_marl.agents.checkpoint import find_run
-    from multilift_marl.agents.policy import load_policy, shipped_policies
-
-    torch.set_num_threads(1)  # for networks this small, more of them only wait for each other
-    if run in shipped_policies() and not os.path.exists(run):
-        if checkpoint != "best":
-            raise ConfigError(f"checkpoint={checkpoint} means nothing to the shipped policy '{run}'; leave it out")
-        policy, folder = load_policy(run), Path("runs") / f"shipped-{run}"
-    else:
-        folder = find_run(run)
-        file = folder / "checkpoints" / f"{checkpoint}.pt" if checkpoint in ("best", "last") else Path(checkpoint)
-        policy = load_policy(folder if checkpoint == "best" else file)
-    return _Flown("policy", policy.source, policy.config, policy.bind, folder)
-
-
-def _fly(config: Config, maker: Any, name: str, own: dict[str, Any]) -> dict[str, np.ndarray]:
+def _fly(config: Config, maker: Any, name: str, options: Options) -> dict[str, np.ndarray]:
     from tqdm import tqdm
 
-    with tqdm(total=own["episodes"], desc=name, unit="episode", leave=False) as bar:
-        return fly_episodes(config, maker, own["episodes"], own["seed"], progress=lambda n: bar.update(n - bar.n))
+    with tqdm(total=options.episodes, desc=name, unit="episode", leave=False) as bar:
+        return fly_episodes(config, maker, options.episodes, options.seed, progress=lambda n: bar.update(n - bar.n))
 
 
-def _draw(config: Config, makers: dict[str, Any], flown: _Flown, own: dict[str, Any], out: Path) -> None:
+def _draw(config: Config, makers: dict[str, Any], team: _Team, options: Options, out: Path) -> None:
     """Plot the first episode of policy and baseline, and the training; film the policy if asked."""
     from multilift_marl.evaluation import plots
 
-    names = dict.fromkeys([flown.name] + ([] if own["baseline"] == "none" else [own["baseline"]]))
-    traces = {name: trace_episode(config, makers[name], 0, own["seed"]) for name in names}
+    names = dict.fromkeys([team.name] + ([] if options.baseline == "none" else [options.baseline]))
+    traces = {name: trace_episode(config, makers[name], 0, options.seed) for name in names}
     plots.plot_errors(out / "errors.png", traces)
-    plots.plot_tensions(out / "tensions.png", traces[flown.name], f"{flown.name}, episode 0")
-    plots.plot_paths(out / "paths.png", traces[flown.name], f"{flown.name}, episode 0")
-    if own["policy"] is None:
+    plots.plot_tensions(out / "tensions.png", traces[team.name], f"{team.name}, episode 0")
+    plots.plot_paths(out / "paths.png", traces[team.name], f"{team.name}, episode 0")
+    if options.policy is None:
         from multilift_marl.agents.logging import read_metrics
 
-        if rows := read_metrics(flown.folder):
+        if rows := read_metrics(team.folder):
             plots.plot_training(out / "training.png", rows)
     print(f"wrote plots in {out}")
-    if own["video"]:
+    if options.video:
         try:
-            _film(config, flown.make, own, out / "episode_0.mp4")
+            _film(config, team.make, options, out / "episode_0.mp4")
         except RenderingError as error:
             print(f"no video: {error}", file=sys.stderr)
 
 
-def _film(config: Config, maker: Any, own: dict[str, Any], path: Path) -> None:
+def _film(config: Config, maker: Any, options: Options, path: Path) -> None:
     """Film the first episode, every other policy step."""
     from tqdm import tqdm
 
@@ -197,14 +175,14 @@ def _film(config: Config, maker: Any, own: dict[str, Any], path: Path) -> None:
 
         def shoot(vec: Any) -> None:
             if not tools:
-                tools.append(stack.enter_context(rendering.Renderer(vec, camera=own["camera"], trail=own["trail"])))
+                tools.append(stack.enter_context(rendering.Renderer(vec, camera=options.camera, trail=options.trail)))
                 tools.append(stack.enter_context(rendering.VideoWriter(path, config.env.policy_hz / 2)))
             renderer, video = tools
             if vec.steps[0] % 2 == 0:
                 video.append(renderer.frame())
                 bar.update()
 
-        trace_episode(config, maker, 0, own["seed"], shoot)
+        trace_episode(config, maker, 0, options.seed, shoot)
     print(f"wrote {path}")
 
 

@@ -7,8 +7,11 @@ import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from multilift_marl.cli.common import run_command, title
+from pydantic import Field
+
+from multilift_marl.cli.common import run_command, split_options, title
 from multilift_marl.config.load import load_config
+from multilift_marl.config.values import Section
 from multilift_marl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -19,22 +22,25 @@ _USAGE = """Train a team.
   python train.py config=hover [key=value ...]     a new run in runs/<config>-<time>-s<seed>/
   python train.py resume=<run|latest>              go on with a run from its last checkpoint
 
-  config   a configuration's name or the path of a YAML file (default hover)
-  task     another task than the configuration's: config=rigs/auto6 task=track has the values of track, over them
-           env.num_drones, sim, vehicle, payload, cable, control and wind of rigs/auto6, over them the keys given here
-  import   a module of one's own, name or .py file: tasks, vehicles, configurations (docs/plugins.md)
-  resume   a run folder; takes only train.frames, train.checkpoint_every, eval.*, env.num_threads, import beside it
-
+task=<other> takes another task than the configuration's: config=rigs/auto6 task=track has the values of track, over
+them env.num_drones, sim, vehicle, payload, cable, control and wind of rigs/auto6, over them the keys given here.
 With --help, config=<name> and other keys show the values that they stand for."""
 
 _RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.episodes", "env.num_threads", "import")
 
-_NAMES = ("config", "resume")
+
+class Options(Section):
+    """Keys of the command beside those of the configuration."""
+
+    config: str = Field("hover", description="a configuration's name or the path of a YAML file")
+    resume: str | None = Field(
+        None, description=f'a run folder, its name or "latest"; beside it only {", ".join(_RESUMABLE)}'
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train; return the exit status."""
-    return run_command(_train, _USAGE, _NAMES, arguments, names=_NAMES)
+    return run_command(_train, _USAGE, Options, arguments)
 
 
 def _train(values: dict[str, Any]) -> int:
@@ -42,25 +48,25 @@ def _train(values: dict[str, Any]) -> int:
     from multilift_marl.agents.checkpoint import find_run
     from multilift_marl.agents.trainer import new_run, resume_run
 
-    if "resume" in values:
-        folder = find_run(values.pop("resume"))
-        for key in values:
+    options, overrides = split_options(Options, values)
+    if options.resume is not None:
+        folder = find_run(options.resume)
+        for key in values.keys() - {"resume"}:
             if key not in _RESUMABLE:
                 raise ConfigError(
                     f"'{key}' cannot change when a run is resumed: start a new run, or give one of "
                     f"{', '.join(_RESUMABLE)}"
                 )
-        trainer = resume_run(folder, values)
+        trainer = resume_run(folder, overrides)
         if trainer.finished:
             more = f"python train.py resume={folder} train.frames={2 * trainer.frames}"
             print(f"{folder} is finished, with {trainer.frames:,} steps; for more, say how many in all: {more}")
             return 0
         print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
     else:
-        name = title(values)
-        config = load_config(str(values.pop("config", "hover")), values)
+        config = load_config(options.config, overrides)
         _ = config.system  # refuse an impossible system before the long wait
-        trainer = new_run(config, name)
+        trainer = new_run(config, title(values))
         folder = trainer.folder
         print(f"training {config.train.frames:,} steps in {folder}")
     finished = trainer.run()

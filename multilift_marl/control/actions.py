@@ -1,8 +1,9 @@
 """Action interfaces: what the numbers in [-1, 1] mean. One class each, all in the table at the end.
 
-An interface turns actions into set-points once for each policy step (`act`), and set-points into rotor thrusts at the
-control rate (`follow`). Vectors are given in the drone's slot frame (x outward from the payload, y to the left of it, z
-up), body rates in the body frame. An action of zero hovers as well as the interface can, under the nominal payload.
+An interface turns actions into set-points once for each policy step (`set_action`), and set-points into rotor thrusts
+at the control rate (`control_step`). Vectors are given in the drone's slot frame (x outward from the payload, y to the
+left of it, z up), body rates in the body frame. An action of zero hovers as well as the interface can, under the
+nominal payload.
 """
 
 from __future__ import annotations
@@ -15,26 +16,49 @@ import numpy as np
 from multilift_marl._jit import bind, kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.allocation import allocate
-from multilift_marl.control.formation import Goal, Reference, smooth, smooth_moving, to_goal_frame
+from multilift_marl.control.formation import Goal, Reference, Smoothing, smooth, smooth_moving, to_goal_frame
 from multilift_marl.control.gains import Gains, drone_gains
-from multilift_marl.control.geometric import control, fly, hook_moment
-from multilift_marl.control.scales import THRUST, YAW_RATE, ActionComponent, rate_components, vector_components
-from multilift_marl.control.setpoints import (
-    STILL,
-    Setpoint,
-    fly_acc_rates,
-    fly_acceleration,
-    fly_rates,
-    fly_velocity,
-    smooth_velocity,
-    track_own_state,
-    track_own_state_to_yaw,
-)
-from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, turn, vec
+from multilift_marl.control.geometric import fly, fly_rates, hook_moment
+from multilift_marl.control.setpoints import Setpoint, smooth_velocity, track_own_state, track_own_state_to_yaw
+from multilift_marl.math3d import add, heading, mat, norm, put, thrust_frame, turn, vec
 from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.state import SystemState
 
 Call = Callable[[], None]
+
+
+class ActionComponent(NamedTuple):
+    """One number of an action, in [-1, 1]."""
+
+    name: str
+    frame: str
+    unit: str
+    limit: str
+    """Key of `control` with what 1 stands for, -1 for its opposite; THRUST where drones have limits of their own."""
+    meaning: str
+
+
+THRUST = ""
+"""The limit of thrusts: -1 is the least that the rotors can give, 0 the one at rest, 1 the largest."""
+
+
+def vector_components(unit: str, limit: str, meaning: str) -> tuple[ActionComponent, ...]:
+    """Return the three numbers of a vector in the slot frame; `meaning` says of what."""
+    return tuple(
+        ActionComponent(name, "slot", unit, limit, f"{meaning}, {where}")
+        for name, where in (("outward", "away from the payload"), ("sideways", "to the left of that"), ("up", "upward"))
+    )
+
+
+def rate_components(
+    *axes: str, limit: str = "max_tilt_rate", meaning: str = "angular velocity"
+) -> tuple[ActionComponent, ...]:
+    """Return a body rate for each of the axes, "roll", "pitch" or "yaw"."""
+    where = {"roll": "about body x", "pitch": "about body y", "yaw": "about body z"}
+    return tuple(ActionComponent(f"{axis}_rate", "body", "rad/s", limit, f"{meaning} {where[axis]}") for axis in axes)
+
+
+YAW_RATE = ActionComponent("yaw_rate", "world", "rad/s", "max_yaw_rate", "change of the heading, about the vertical")
 
 
 class Team(NamedTuple):
@@ -45,7 +69,7 @@ class Team(NamedTuple):
     reference: Reference
     setpoint: Setpoint
     cable_force: np.ndarray
-    """(E, N, 3) what the drones pull their cables with, any rejected disturbance included [N]."""
+    """(E, N, 3) force of the drones on their cables, any rejected disturbance included [N]."""
     thrust: np.ndarray
     """(E, N, 4) rotor thrusts, written [N]."""
     gains: Gains
@@ -56,14 +80,15 @@ class Interface:
 
     Class attributes:
         numbers: of an action, each with its frame, unit and full scale.
-        rejects: values of `control.disturbance` that go with it, beside "none".
+        supports: values of `control.disturbance` that go with it, beside "none".
     """
 
     numbers: ClassVar[tuple[ActionComponent, ...]]
     supports: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: ControlConfig, dt: float):
-        self.settings, self.dt = settings, dt
+        self.settings = settings
+        self.dt = dt
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
         """Return the call that turns `action` (E, N, A) in [-1, 1] of environments lo to hi into set-points."""
@@ -71,10 +96,10 @@ class Interface:
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
         """Return what is called in turn at every control step, the last of them for the thrusts."""
-        raise NotImplementedError
+        return (bind(fly, lo, hi, team.state, team.reference, team.cable_force, team.thrust, team.gains, None),)
 
     def control_step_moving_goal(self, lo: int, hi: int, plan: Call, set_action: Call, team: Team) -> tuple[Call, ...]:
-        """Return the same as `follow` for goals that move, by calling `plan`, at every control step."""
+        """Return the same as `control_step` for goals that move, by calling `plan`, at every control step."""
         return plan, *self.control_step(lo, hi, team)
 
     def thrusts(self, team: Team) -> np.ndarray:
@@ -91,27 +116,26 @@ class ReferenceAction(Interface):
     )
     supports = ("integral", "indi")
 
+    def __init__(self, settings: ControlConfig, dt: float):
+        super().__init__(settings, dt)
+        self._smoothing = Smoothing(settings.reference_frequency, settings.reference_speed, dt)
+
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
-        """See `Interface.act`."""
+        """See `Interface.set_action`."""
         ranges = (self.settings.max_offset, self.settings.max_yaw)
         return bind(_command_offset, lo, hi, action, team.goal, team.reference, *ranges)
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
-        """See `Interface.follow`."""
-        smoothing = (self.settings.reference_frequency, self.settings.reference_speed, self.dt)
-        flown = (team.state, team.reference, team.cable_force, team.thrust, team.gains)
-        if self.settings.disturbance == "none":  # both in one call, which is quicker
-            return (bind(control, lo, hi, *flown, *smoothing),)
-        return bind(smooth, lo, hi, team.reference, *smoothing), bind(fly, lo, hi, *flown)
+        """See `Interface.control_step`."""
+        smoothed = bind(smooth, lo, hi, team.reference, self._smoothing)
+        return smoothed, *super().control_step(lo, hi, team)
 
     def control_step_moving_goal(self, lo: int, hi: int, plan: Call, set_action: Call, team: Team) -> tuple[Call, ...]:
-        """See `Interface.ride`."""
-        smoothing = (self.settings.reference_frequency, self.settings.reference_speed, self.dt)
-        flown = (team.state, team.reference, team.cable_force, team.thrust, team.gains)
-        left = Reference.zeros(*team.reference.yaw.shape)
-        leave = bind(to_goal_frame, lo, hi, team.reference, team.goal, left)
-        moved = bind(smooth_moving, lo, hi, team.reference, team.goal, left, *smoothing)
-        return leave, plan, set_action, moved, bind(fly, lo, hi, *flown)
+        """See `Interface.control_step_moving_goal`."""
+        before = Reference.zeros(*team.reference.yaw.shape)
+        relative = bind(to_goal_frame, lo, hi, team.reference, team.goal, before)
+        smoothed = bind(smooth_moving, lo, hi, team.reference, team.goal, before, self._smoothing)
+        return relative, plan, set_action, smoothed, *super().control_step(lo, hi, team)
 
 
 class VelocityAction(Interface):
@@ -121,16 +145,15 @@ class VelocityAction(Interface):
     supports = ("indi",)
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
-        """See `Interface.act`."""
+        """See `Interface.set_action`."""
         ranges = (self.settings.max_velocity, self.settings.max_yaw_rate)
         return bind(_command_vector, lo, hi, action, team.goal, team.reference, team.setpoint.velocity, *ranges)
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
-        """See `Interface.follow`."""
+        """See `Interface.control_step`."""
         smoothing = (self.settings.reference_frequency, self.dt)
-        moved = bind(smooth_velocity, lo, hi, team.state, team.reference, team.setpoint, *smoothing)
-        flown = bind(fly_velocity, lo, hi, team.state, team.reference, team.cable_force, team.thrust, team.gains)
-        return moved, flown
+        smoothed = bind(smooth_velocity, lo, hi, team.state, team.reference, team.setpoint, *smoothing)
+        return smoothed, *super().control_step(lo, hi, team)
 
 
 class AccelerationAction(Interface):
@@ -140,21 +163,21 @@ class AccelerationAction(Interface):
     supports = ("indi",)
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
-        """See `Interface.act`."""
+        """See `Interface.set_action`."""
         ranges = (self.settings.max_acceleration, self.settings.max_yaw_rate)
         return bind(_command_vector, lo, hi, action, team.goal, team.reference, team.reference.acceleration, *ranges)
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
-        """See `Interface.follow`."""
-        moved = bind(track_own_state, lo, hi, team.state, team.reference, self.dt)
-        flown = bind(fly_acceleration, lo, hi, team.state, team.reference, team.cable_force, team.thrust, team.gains)
-        return moved, flown
+        """See `Interface.control_step`."""
+        tracked = bind(track_own_state, lo, hi, team.state, team.reference, self.dt)
+        return tracked, *super().control_step(lo, hi, team)
 
 
 class AccRatesAction(Interface):
     """Acceleration outward, sideways and upward, and roll and pitch rates; the yaw is the target's.
 
-    The rates are those of the attitude that the acceleration asks for (Zeng et al., arXiv 2508.01522).
+    The rates are those of the attitude that the acceleration asks for (Zeng et al., arXiv 2508.01522). An acceleration
+    alone says nothing of how it will change: these rates feed forward what the jerk would.
     """
 
     numbers = (
@@ -164,19 +187,16 @@ class AccRatesAction(Interface):
     supports = ("indi",)
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
-        """See `Interface.act`."""
+        """See `Interface.set_action`."""
         ranges = (self.settings.max_acceleration, self.settings.max_tilt_rate)
         return bind(_command_acc_rates, lo, hi, action, team.goal, team.reference, team.setpoint.rates, *ranges)
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
-        """See `Interface.follow`."""
+        """See `Interface.control_step`."""
         smoothing = (self.settings.reference_frequency, self.dt)
-        rates = team.setpoint.rates
-        moved = bind(track_own_state_to_yaw, lo, hi, team.state, team.reference, *smoothing)
-        flown = bind(
-            fly_acc_rates, lo, hi, team.state, team.reference, rates, team.cable_force, team.thrust, team.gains
-        )
-        return moved, flown
+        tracked = bind(track_own_state_to_yaw, lo, hi, team.state, team.reference, *smoothing)
+        followed = (team.state, team.reference, team.cable_force, team.thrust, team.gains)
+        return tracked, bind(fly, lo, hi, *followed, team.setpoint.rates)
 
 
 class CtbrAction(Interface):
@@ -189,19 +209,16 @@ class CtbrAction(Interface):
     )
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
-        """See `Interface.act`."""
-        ranges = (self.settings.max_tilt_rate, self.settings.max_yaw_rate)
-        where = (team.state, team.reference, team.setpoint, team.cable_force)
-        return bind(_command_rates, lo, hi, action, *where, team.gains, *ranges)
+        """See `Interface.set_action`."""
+        return bind(_command_rates, lo, hi, action, team, self.settings.max_tilt_rate, self.settings.max_yaw_rate)
 
     def thrusts(self, team: Team) -> np.ndarray:
         """See `Interface.thrusts`."""
         return team.setpoint.thrust[..., None]
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
-        """See `Interface.follow`."""
-        rates, total = team.setpoint.rates, team.setpoint.thrust
-        return (bind(fly_rates, lo, hi, team.state, rates, total, team.cable_force, team.thrust, team.gains),)
+        """See `Interface.control_step`."""
+        return (bind(fly_rates, lo, hi, team.state, team.setpoint, team.cable_force, team.thrust, team.gains),)
 
 
 class RotorAction(Interface):
@@ -210,25 +227,23 @@ class RotorAction(Interface):
     numbers = tuple(ActionComponent(f"rotor_{k}", "body", "N", THRUST, f"thrust of rotor {k}") for k in range(4))
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
-        """See `Interface.act`."""
-        return bind(
-            _command_rotors, lo, hi, action, team.state, team.reference, team.cable_force, team.thrust, team.gains
-        )
+        """See `Interface.set_action`."""
+        return bind(_command_rotors, lo, hi, action, team)
 
     def thrusts(self, team: Team) -> np.ndarray:
         """See `Interface.thrusts`."""
         return team.thrust
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
-        """See `Interface.follow`."""
+        """See `Interface.control_step`."""
         return ()
 
 
 @kernel
 def _in_world(e, n, action, goal, full):
     """Return the first three numbers of an action, times `full`, turned from the slot frame into the world."""
-    asked = (full * action[e, n, 0], full * action[e, n, 1], full * action[e, n, 2])
-    return turn(goal.slot_frame[e, n, 0], goal.slot_frame[e, n, 1], asked)
+    commanded = (full * action[e, n, 0], full * action[e, n, 1], full * action[e, n, 2])
+    return turn(goal.slot_frame[e, n, 0], goal.slot_frame[e, n, 1], commanded)
 
 
 @kernel
@@ -258,9 +273,9 @@ def _command_acc_rates(lo, hi, action, goal, reference, rates, max_acceleration,
 
 
 @kernel
-def _hover_thrust(e, n, cable_force, g):
-    """Return the thrust [N] that carries a drone and its pull."""
-    return norm(add(vec(cable_force, e, n), (0.0, 0.0, g.mass[n] * GRAVITY)))
+def _hover_force(cable_force, mass):
+    """Return the force [N] that carries a drone of a mass [kg] and the force on its cable."""
+    return add(cable_force, (0.0, 0.0, mass * GRAVITY))
 
 
 @kernel
@@ -270,32 +285,35 @@ def _between(action, low, middle, high):
 
 
 @kernel
-def _command_rates(lo, hi, action, state, reference, setpoint, cable_force, g, max_tilt_rate, max_yaw_rate):
-    track_own_state(lo, hi, state, reference, 0.0)
+def _command_rates(lo, hi, action, team, max_tilt_rate, max_yaw_rate):
+    track_own_state(lo, hi, team.state, team.reference, 0.0)
+    setpoint, g = team.setpoint, team.gains
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            hover = _hover_thrust(e, n, cable_force, g)
+            hover = norm(_hover_force(vec(team.cable_force, e, n), g.mass[n]))
             setpoint.thrust[e, n] = _between(action[e, n, 0], 4.0 * g.thrust_min[n], hover, 4.0 * g.thrust_max[n])
-            tilting = scale(max_tilt_rate, (action[e, n, 1], action[e, n, 2], 0.0))
-            put(setpoint.rates[e, n], (tilting[0], tilting[1], max_yaw_rate * action[e, n, 3]))
+            setpoint.rates[e, n, 0] = max_tilt_rate * action[e, n, 1]
+            setpoint.rates[e, n, 1] = max_tilt_rate * action[e, n, 2]
+            setpoint.rates[e, n, 2] = max_yaw_rate * action[e, n, 3]
 
 
 @kernel
-def _command_rotors(lo, hi, action, state, reference, cable_force, thrust, g):
-    track_own_state(lo, hi, state, reference, 0.0)
+def _command_rotors(lo, hi, action, team):
+    track_own_state(lo, hi, team.state, team.reference, 0.0)
+    g = team.gains
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            total, yaw = _hover_thrust(e, n, cable_force, g), heading(mat(state.drone_rotation, e, n))
+            # Rotor thrusts at rest: equal ones, unless the cable is tied off the centre of mass.
+            force = _hover_force(vec(team.cable_force, e, n), g.mass[n])
+            total = norm(force)
             rotors = (0.25 * total, 0.25 * total, 0.25 * total, 0.25 * total)
             if g.hooked:
-                d, rest = (
-                    drone_gains(g, n),
-                    thrust_frame(add(vec(cable_force, e, n), (0.0, 0.0, g.mass[n] * GRAVITY)), yaw),
-                )
-                moment = hook_moment(n, rest, vec(cable_force, e, n), STILL, g)
+                d = drone_gains(g, n)
+                attitude = thrust_frame(force, heading(mat(team.state.drone_rotation, e, n)))
+                moment = hook_moment(n, attitude, vec(team.cable_force, e, n), (0.0, 0.0, 0.0), g)
                 rotors = allocate(total, moment, d.allocation, d.thrust_min, d.thrust_max)
             for k in range(4):
-                thrust[e, n, k] = _between(action[e, n, k], g.thrust_min[n], rotors[k], g.thrust_max[n])
+                team.thrust[e, n, k] = _between(action[e, n, k], g.thrust_min[n], rotors[k], g.thrust_max[n])
 
 
 ACTIONS: dict[str, type[Interface]] = {

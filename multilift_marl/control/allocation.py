@@ -40,7 +40,7 @@ def allocate(thrust, torque, inverse, low, high):
                     share = min(share, max(room, 0.0) / need)
         roll, pitch = share * torque[0], share * torque[1]
 
-        # Thrust: as near to what is asked as that leaves, and what it leaves of yaw.
+        # Thrust: as near to the commanded one as that leaves, and what it leaves of yaw.
         least, most = -1e30, 1e30
         for k in range(4):
             tilt = inverse[k, 1] * roll + inverse[k, 2] * pitch

@@ -1,4 +1,13 @@
-"""The pulls with which the cables exert a wrench on the payload, and where the drones are that pull so."""
+"""Cable forces that exert a wrench on the payload, and where the drones are that exert them.
+
+One problem: the forces nearest to given ones whose sum and moment are prescribed. Three solvers, which agree to
+round-off where the cables can exert them (tests/test_cable_forces.py):
+
+- `solve_cable_forces`, a kernel, in general: every cable keeps a least tension, found by Newton's method;
+- `distribute_wrench`, a kernel, without that bound: one product with an inverse that `make_wrench_distribution`
+  computes once for a rig, for planned motions that ask for it at every control step;
+- `balance_forces`, in NumPy, without that bound: many attitudes at once, once for a configuration.
+"""
 
 from __future__ import annotations
 
@@ -29,15 +38,16 @@ from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables.catenary import cable_end
 
 TILT_WIDENING = 1.8  # [-] at tilted targets, see `place_balanced`
-MIN_TENSION_RATIO = 0.2  # of its given tension, with which every cable is to pull
+MIN_TENSION_RATIO = 0.2  # least tension of every cable, over its given one
 BALANCED = 1e-6  # [N] and [N m] for each N of weight: balance to within rounding
-_DAMPING = 1e-9  # relative; makes moments that no pulls can exert harmless
-_ITERATIONS = 20
-_STILL = (0.0, 0.0, 0.0)
+RANK = 1e-9  # singular values below it, relative to the largest, count as zero
+_DAMPING = 1e-9  # relative; keeps the equations regular where no cable forces can exert some moment
+_ITERATIONS = 20  # Newton's method ends after three to six
+_ZERO = (0.0, 0.0, 0.0)
 
 
 class WrenchDistribution(NamedTuple):
-    """How `spread` finds λ = A F + B M and μ = Bᵀ F + C M, all in the payload's frame."""
+    """How `distribute_wrench` finds λ = A F + B M and μ = Bᵀ F + C M, all in the payload's frame."""
 
     a: tuple[float, ...]
     """9 numbers, like the next ones."""
@@ -45,41 +55,69 @@ class WrenchDistribution(NamedTuple):
     c: tuple[float, ...]
 
 
-def make_wrench_distribution(anchors: np.ndarray) -> WrenchDistribution:
-    """Return how wrenches are spread over anchors (N, 3) [m].
+def wrench_matrix(arms: np.ndarray) -> np.ndarray:
+    """Return G (..., 6, 3 N), by which forces (3 N,) at `arms` (..., N, 3) exert force and moment."""
+    x, y, z = np.moveaxis(arms, -1, 0)
+    zero = np.zeros_like(x)
+    cross_matrix = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])  # (3, 3, ..., N): r × of each arm
+    moments = np.moveaxis(cross_matrix, (0, 1), (-3, -1)).reshape(*arms.shape[:-2], 3, -1)
+    forces = np.broadcast_to(np.tile(np.eye(3), arms.shape[-2]), moments.shape)
+    return np.concatenate([forces, moments], axis=-2)
 
-    Where pulls cannot exert one, what is left is least, moments over a lever counted as forces are.
+
+def balance_forces(arms: np.ndarray, nominal: np.ndarray, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the forces nearest to nominal ones that exert a wrench, and by how much they miss it.
+
+    Args:
+        arms: from the payload's centre of mass to the anchors, in A attitudes (A, N, 3) [m].
+        nominal: forces (N, 3) [N].
+        wrench: force and moment in each attitude (A, 6) [N], [N m].
+
+    Returns:
+        Forces (A, N, 3) [N], and the largest component of the wrench that they do not exert (A,) [N], [N m].
     """
-    x, y, z = anchors.T
-    zero, lever = np.zeros_like(x), np.sqrt((anchors**2).sum(axis=1).mean() * 2 / 3) or 1.0
-    arms = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]) / lever  # r ×
-    exerted = np.vstack([np.tile(np.eye(3), len(anchors)), arms.transpose(0, 2, 1).reshape(3, -1)])
-    inverse = np.linalg.pinv(exerted @ exerted.T, rcond=1e-9, hermitian=True)
+    matrix, flat = wrench_matrix(arms), nominal.ravel()
+    change = np.einsum("aij,aj->ai", np.linalg.pinv(matrix, rcond=RANK), wrench - matrix @ flat)
+    missed = np.einsum("aij,aj->ai", matrix, flat + change) - wrench
+    return (flat + change).reshape(arms.shape), np.abs(missed).max(axis=1)
+
+
+def make_wrench_distribution(anchors: np.ndarray) -> WrenchDistribution:
+    """Return how wrenches are distributed over anchors (N, 3) [m].
+
+    Where forces cannot exert one, what is left is least, moments over a lever counted as forces are.
+    """
+    lever = np.sqrt((anchors**2).sum(axis=1).mean() * 2 / 3) or 1.0
+    exerted = wrench_matrix(anchors)
+    exerted[3:] /= lever
+    inverse = np.linalg.pinv(exerted @ exerted.T, rcond=RANK, hermitian=True)
     parts = inverse[:3, :3], inverse[:3, 3:] / lever, inverse[3:, 3:] / lever**2
     return WrenchDistribution(*(tuple(part.ravel().tolist()) for part in parts))
 
 
 @kernel
-def spread(force, moment, attitude, by):
-    """Return λ, μ such that pulls changed by λ + μ × r_i, the least change that does so, exert a wrench more.
+def distribute_wrench(force, moment, attitude, distribution):
+    """Return λ, μ such that forces changed by λ + μ × r_i, the least change that does so, exert a wrench more.
 
-    With it `solve_pulls` is solved at once where no cable is at its bound.
+    It solves the problem of `solve_cable_forces` where no cable is at its bound.
 
     Args:
-        force, moment: to be exerted beside what the pulls exert [N], [N m], world frame.
+        force, moment: to be exerted beside what the given forces exert [N], [N m], world frame.
         attitude: of the payload, 9 numbers.
-        by: Spread over the anchors.
+        distribution: WrenchDistribution over the anchors.
     """
-    f, m = tmul(attitude, force), tmul(attitude, moment)
-    linear, angular = add(mul(by.a, f), mul(by.b, m)), add(tmul(by.b, f), mul(by.c, m))
+    f = tmul(attitude, force)
+    m = tmul(attitude, moment)
+    linear = add(mul(distribution.a, f), mul(distribution.b, m))
+    angular = add(tmul(distribution.b, f), mul(distribution.c, m))
     return mul(attitude, linear), mul(attitude, angular)
 
 
 @kernel
 def solve_cable_forces(force, moment, attitude, anchors, least, cable_force):
-    """Replace the pulls (N, 3) by the nearest ones that exert a wrench, every cable pulling; return the imbalance.
+    """Replace forces (N, 3) by the nearest ones that exert a wrench, every cable taut; return the imbalance.
 
-    Pulls f_i minimise Σ |f_i - n_i|² subject to Σ f_i = F, Σ r_i × f_i = M and u_i · f_i ≥ t_i, with n_i the given
+    Forces f_i minimise Σ |f_i - n_i|² subject to Σ f_i = F, Σ r_i × f_i = M and u_i · f_i ≥ t_i, with n_i the given
     ones, u_i = n_i/|n_i|, t_i = `least` |n_i|. By the conditions of Karush, Kuhn and Tucker f_i = v_i +
     max(0, t_i - u_i · v_i) u_i with v_i = n_i + λ + μ × r_i, so that only six numbers are sought, which Newton's method
     finds exactly in a few steps: the six equations are linear while the same cables are at their bounds.
@@ -88,37 +126,45 @@ def solve_cable_forces(force, moment, attitude, anchors, least, cable_force):
         force, moment: F on the payload [N], M about its centre of mass [N m], world frame.
         attitude: of the payload, 9 numbers.
         anchors: (N, 3) in its frame [m].
-        least: tension of every cable over that of its given pull, at least; -inf for no bound.
-        pull: (N, 3) n_i, world frame [N]; written.
+        least: tension of every cable over its given one, at least; -inf for no bound.
+        cable_force: (N, 3) n_i, world frame [N]; written.
 
     Returns:
         What is left of F and M, the largest component [N], [N m]; of a moment that these cables cannot exert, most.
     """
-    linear, angular = _STILL, _STILL
-    imbalance, exact = np.inf, 1e-13 * max(_largest(force), 1.0)
+    linear = _ZERO  # λ
+    angular = _ZERO  # μ
+    imbalance = np.inf
+    exact = 1e-13 * max(_largest(force), 1.0)  # round-off of the sums
     for _ in range(_ITERATIONS):
-        lacking, twisting, a, b, c = _balance(force, moment, attitude, anchors, least, cable_force, linear, angular)
+        # What the forces of these λ, μ leave of the wrench. It ends there if that is nothing, or stays as it is.
+        wrench = (force, moment)
+        missing, (a, b, c) = _balance(wrench, attitude, anchors, least, cable_force, linear, angular)
+        lacking, twisting = missing
         left = max(_largest(lacking), _largest(twisting))
         stalled = abs(left - imbalance) < 0.01 * imbalance
         imbalance = left
         if stalled or left <= exact:
             break
+
+        # Newton's step, a symmetric system in blocks: a Δλ + b Δμ = lacking, bᵀ Δλ + c Δμ = twisting, by the Schur
+        # complement of a.
         inverse = _inverse(a, _DAMPING * (a[0] + a[4] + a[8]))
-        # a symmetric system in blocks: a Δλ + b Δμ = lacking, bᵀ Δλ + c Δμ = twisting
         through = matmul(transpose(b), inverse)
         schur = _minus(c, matmul(through, b))
         change = mul(_inverse(schur, _DAMPING * (c[0] + c[4] + c[8])), sub(twisting, mul(through, lacking)))
         linear = add(linear, mul(inverse, sub(lacking, mul(b, change))))
         angular = add(angular, change)
+
+    # The forces of the λ, μ found.
     for i in range(cable_force.shape[0]):
-        given = (cable_force[i, 0], cable_force[i, 1], cable_force[i, 2])
-        arm = mul(attitude, (anchors[i, 0], anchors[i, 1], anchors[i, 2]))
-        put(cable_force[i], _pull(given, arm, least, linear, angular)[0])
+        arm = mul(attitude, row(anchors, i))
+        put(cable_force[i], _bounded_force(row(cable_force, i), arm, least, linear, angular)[0])
     return imbalance
 
 
 @kernel
-def _pull(given, arm, least, linear, angular):
+def _bounded_force(given, arm, least, linear, angular):
     """Return f_i and whether the cable is at its bound."""
     free = add(add(given, linear), cross(angular, arm))
     size = norm(given)
@@ -130,14 +176,19 @@ def _pull(given, arm, least, linear, angular):
 
 
 @kernel
-def _balance(force, moment, attitude, anchors, least, cable_force, linear, angular):
+def _balance(wrench, attitude, anchors, least, cable_force, linear, angular):
     """Return what is left of force and moment, and the blocks a, b, c of their derivative by λ and μ."""
+    force, moment = wrench
     a = b = c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for i in range(cable_force.shape[0]):
-        given = (cable_force[i, 0], cable_force[i, 1], cable_force[i, 2])
-        arm = mul(attitude, (anchors[i, 0], anchors[i, 1], anchors[i, 2]))
-        own, bound = _pull(given, arm, least, linear, angular)
-        force, moment = sub(force, own), sub(moment, cross(arm, own))
+        # The force of one cable, taken from the wrench.
+        given = row(cable_force, i)
+        arm = mul(attitude, row(anchors, i))
+        own, bound = _bounded_force(given, arm, least, linear, angular)
+        force = sub(force, own)
+        moment = sub(moment, cross(arm, own))
+
+        # Its derivative: P = 1, or 1 - u uᵀ of a cable at its bound, by λ; P X by μ.
         u = scale(1.0 if bound else 0.0, unit(given))
         p = (
             1.0 - u[0] * u[0], -u[0] * u[1], -u[0] * u[2],
@@ -147,7 +198,7 @@ def _balance(force, moment, attitude, anchors, least, cable_force, linear, angul
         x = (0.0, arm[2], -arm[1], -arm[2], 0.0, arm[0], arm[1], -arm[0], 0.0)  # x μ = μ × r
         px = matmul(p, x)
         a, b, c = _plus(a, p), _plus(b, px), _plus(c, matmul(transpose(x), px))
-    return force, moment, a, b, c
+    return (force, moment), (a, b, c)
 
 
 @kernel
@@ -185,7 +236,7 @@ def _inverse(m, damping):
 
 @kernel
 def drone_offset(n, cable_force, hanging):
-    """Return where the drone is, from its anchor, that pulls the payload by `pull` [N] through cable n at rest [m]."""
+    """Return where drone n is, from its anchor, as its cable exerts `cable_force` [N] on the payload at rest [m]."""
     middle = add(cable_force, (0.0, 0.0, 0.5 * hanging.weight[n]))
     size = norm(middle)
     return cable_end(
@@ -195,14 +246,15 @@ def drone_offset(n, cable_force, hanging):
 
 @kernel
 def place_slots(e, goal, rig, hanging):
-    """Write the slots of environment e from which drones pull as `goal.pull`, there with the payload's pulls, says.
+    """Write the slots of environment e from which drones exert `goal.cable_force` on the payload.
 
-    The pulls become those of the drones, which carry the cables too.
+    The forces become those of the drones on their cables, whose weight they carry too.
     """
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     for n in range(rig.anchors.shape[0]):
         cable_force = vec(goal.cable_force, e, n)
-        anchor, held = add(position, mul(target, row(rig.anchors, n))), add(cable_force, (0.0, 0.0, hanging.weight[n]))
+        anchor = add(position, mul(target, row(rig.anchors, n)))
+        held = add(cable_force, (0.0, 0.0, hanging.weight[n]))
         hook = add(anchor, drone_offset(n, cable_force, hanging))
         put(goal.cable_force[e, n], held)
         put(goal.slots[e, n], sub(hook, hook_arm(n, held, goal.drone_yaw[e], rig)))
@@ -212,9 +264,10 @@ def place_slots(e, goal, rig, hanging):
 def place_balanced(e, goal, rig, hanging):
     """Do as `place_formation`, for tilted targets too; return whether the team can hold the payload there.
 
-    Over a level target the formation balances. Over one tilted by θ its pulls, with 1 + `WIDER` (1 - cos θ) times their
-    level parts, are changed as little as balances weight and moment, each cable keeping `LEAST` of its widened pull;
-    the slots follow from them. Wider pulls keep cables apart whose anchors come to lie one over the other.
+    Over a level target the formation balances. Over one tilted by θ its cable forces, with 1 + `TILT_WIDENING`
+    (1 - cos θ) times their level parts, are changed as little as balances weight and moment, each cable keeping
+    `MIN_TENSION_RATIO` of its widened tension; the slots follow from them. The widening keeps cables apart whose
+    anchors come to lie one over the other.
     """
     place_formation(e, goal, rig)
     target = matrow(goal.rotation, e)
@@ -225,7 +278,7 @@ def place_balanced(e, goal, rig, hanging):
         wide = 1.0 + TILT_WIDENING * (1.0 - target[8])
         put(goal.cable_force[e, n], (wide * cable_force[0], wide * cable_force[1], cable_force[2] - hanging.weight[n]))
     weight = hanging.payload_mass * GRAVITY
-    left = solve_cable_forces((0.0, 0.0, weight), _STILL, target, rig.anchors, MIN_TENSION_RATIO, goal.cable_force[e])
+    left = solve_cable_forces((0.0, 0.0, weight), _ZERO, target, rig.anchors, MIN_TENSION_RATIO, goal.cable_force[e])
     place_slots(e, goal, rig, hanging)
     return left <= BALANCED * weight
 
@@ -235,8 +288,8 @@ def is_stable(e, goal, rig, hanging, stiffness):
     """Return whether the payload, pushed a little, would come back to a tilted goal, the drones held by springs.
 
     The potential energy of payload, cables and springs is to be convex there. Between its spring and the payload a
-    cable gives way across by L/T and along by 1/k, so that an anchor moved by x is pulled back by S x,
-    S⁻¹ = (T/L (1 - u uᵀ) + k u uᵀ)⁻¹ + 1/κ; where the payload turns, the arm of the pull turns too.
+    cable gives way across by L/T and along by 1/k, so that an anchor moved by x is drawn back by S x,
+    S⁻¹ = (T/L (1 - u uᵀ) + k u uᵀ)⁻¹ + 1/κ; where the payload turns, the arm of the force turns too.
 
     Args:
         e, goal, rig, hanging: after `place_balanced`.
@@ -245,17 +298,25 @@ def is_stable(e, goal, rig, hanging, stiffness):
     target = matrow(goal.rotation, e)
     a = b = c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for n in range(rig.anchors.shape[0]):
+        # Stiffness S of one anchor: across and along the cable.
         r = mul(target, row(rig.anchors, n))
         f = sub(vec(goal.cable_force, e, n), (0.0, 0.0, hanging.weight[n]))
         size = norm(f)
-        u, soft = scale(1.0 / size, f), 1.0 / stiffness[n]
+        u = scale(1.0 / size, f)
+        soft = 1.0 / stiffness[n]
         across = 1.0 / (hanging.length[n] / size + soft)
         along = 1.0 / (1.0 / hanging.stiffness[n] + soft) - across
         s = _plus(_diagonal(across), _outer(scale(along, u), u))
+
+        # The Hessian of the energy in blocks: a by shifts, b mixed, c by turns θ, of which the force's own arm is part.
         x = (0.0, r[2], -r[1], -r[2], 0.0, r[0], r[1], -r[0], 0.0)  # x θ = θ × r
-        sx, arm = matmul(s, x), _outer(scale(0.5, r), f)
-        a, b = _plus(a, s), _plus(b, sx)
+        sx = matmul(s, x)
+        arm = _outer(scale(0.5, r), f)
+        a = _plus(a, s)
+        b = _plus(b, sx)
         c = _plus(c, _minus(_plus(matmul(transpose(x), sx), _diagonal(dot(r, f))), _plus(arm, transpose(arm))))
+
+    # It is positive definite if its Schur complement is, by Sylvester's criterion.
     m = _minus(c, matmul(matmul(transpose(b), _inverse(a, 0.0)), b))
     determinant = dot((m[0], m[1], m[2]), cross((m[3], m[4], m[5]), (m[6], m[7], m[8])))
     return m[0] > 0.0 and m[0] * m[4] - m[1] * m[3] > 0.0 and determinant > 0.0

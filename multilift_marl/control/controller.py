@@ -1,4 +1,4 @@
-"""What flies the drones: the action interface, the references, and the rejection of disturbances, put together."""
+"""From actions to rotor thrusts: the action interface, the references and the rejection of disturbances together."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Controller:
 
     Attributes:
         action_names: names of the numbers of an action.
-        reference: what the drones are told to follow; live arrays.
+        reference: what the drones follow; live arrays.
         gains: of the controller, for the nominal drones.
         disturbance: what `control.disturbance` remembers, None without.
 
@@ -38,7 +38,8 @@ class Controller:
         self.world = world
         self.interface = ACTIONS[settings.action](settings, dt)
         self.action_names = tuple(number.name for number in self.interface.numbers)
-        self.reference, self.disturbance = Reference.zeros(e, n), None
+        self.reference = Reference.zeros(e, n)
+        self.disturbance: Disturbance | None = None
         self._setpoint = Setpoint.zeros(e, n)
         self.gains = make_gains(settings, world.system)
         self._kind = settings.disturbance
@@ -75,8 +76,8 @@ class Controller:
         )
         if rejection is None:
             return set_action, control_step
-        known, own = (state, self.reference, goal.cable_force), (rejection, g, self._rejection)
-        estimate = bind(REJECTIONS[self._kind], lo, hi, *known, *own)
+        known = (state, self.reference, goal.cable_force)
+        estimate = bind(REJECTIONS[self._kind], lo, hi, *known, rejection, g, self._rejection)
         return set_action, (*control_step[:-1], estimate, control_step[-1])
 
     def start(self, e: int) -> None:

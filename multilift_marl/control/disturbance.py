@@ -1,7 +1,6 @@
 """Rejection of unknown forces on a drone: wind, a payload heavier than thought, or whatever else moves it.
 
-The estimate is an additional pull that the drone has to overcome. It is added to the nominal pull of its cable, so that
-whatever flies with the one flies with the other.
+The estimate is added to the nominal force on the drone's cable, which every set-point feeds forward.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 
 # Bandwidth over ω_p m/(m + m_L), at most: ω_p of the position loop, m and m_L the masses of a drone and of its load.
-# The share m_L/(m + m_L) of a thrust comes back as pull of the cable, which slows any loop around the drone. Faster,
+# The share m_L/(m + m_L) of a thrust comes back through the cable, which slows any loop around the drone. Faster,
 # the rejection would drive a payload that swings slower than the drones move, in place of damping it.
 BANDWIDTH = {"integral": 0.5, "indi": 1.0}
 
@@ -33,7 +32,7 @@ class Disturbance(NamedTuple):
     velocity: np.ndarray
     """(E, N, 3) of the drone one control step ago [m/s]."""
     cable_force: np.ndarray
-    """(E, N, 3) nominal pull and estimate: what the drone flies with [N]."""
+    """(E, N, 3) nominal cable force and estimate: what the controller feeds forward [N]."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> Disturbance:
@@ -89,20 +88,21 @@ def reset_estimate(e, state, disturbance):
 
 @kernel
 def integrate_error(lo, hi, state, reference, cable_force, disturbance, g, c):
-    """Add the integral of the position error to the pulls of environments lo to hi: `integral`.
+    """Add the integral of the position error to the cable forces of environments lo to hi: `integral`.
 
     F_i = -m k_p ω ∫ (p - p_d) dt, no longer than the limit. While a rotor is at its limit the integral may only shrink.
 
     Args:
         lo, hi: the environments.
         state, reference: SystemState, Reference.
-        pull: nominal pulls (E, N, 3) [N].
+        cable_force: nominal (E, N, 3) [N].
         disturbance: Disturbance, written.
         g, c: Gains, Rejection.
     """
     for e in range(lo, hi):
         for n in range(cable_force.shape[1]):
-            saturated, low, high = False, g.thrust_min[n], g.thrust_max[n]
+            low, high = g.thrust_min[n], g.thrust_max[n]
+            saturated = False  # within 1 % of the range
             for k in range(4):
                 thrust = c.thrust_coefficient[n] * state.rotor_speed[e, n, k] ** 2
                 saturated = saturated or thrust > high - 0.01 * high or thrust < low + 0.01 * high
@@ -117,24 +117,29 @@ def integrate_error(lo, hi, state, reference, cable_force, disturbance, g, c):
 
 @kernel
 def estimate_force(lo, hi, state, reference, cable_force, disturbance, g, c):
-    """Add the measured external force to the pulls of environments lo to hi: `indi`.
+    """Add the measured external force to the cable forces of environments lo to hi: `indi`.
 
-    What moved the drone over the last control step is m Δv/Δt = F_rotors - m g e3 - (pull, load and drag that are fed
-    forward) - F. The rotors' force comes from their speeds, so their lag and limits are in it; acceleration and force
-    pass the same first-order low-pass filter, here as one number (Smeur, de Croon and Chu, Control Engineering
+    What moved the drone over the last control step is m Δv/Δt = F_rotors - m g e3 - (cable force, load and drag that
+    are fed forward) - F. The rotors' force comes from their speeds, so their lag and limits are in it; acceleration and
+    force pass the same first-order low-pass filter, here as one number (Smeur, de Croon and Chu, Control Engineering
     Practice 73, 2018; Tal and Karaman, IEEE TCST 29(3), 2021). Arguments are those of `integrate_error`.
     """
     for e in range(lo, hi):
         for n in range(cable_force.shape[1]):
-            velocity, rotors = vec(state.drone_velocity, e, n), rotor_force(e, n, state, c.thrust_coefficient[n])
-            nominal, attitude = vec(cable_force, e, n), mat(state.drone_rotation, e, n)
+            # What the controller feeds forward.
+            velocity = vec(state.drone_velocity, e, n)
+            rotors = rotor_force(e, n, state, c.thrust_coefficient[n])
+            nominal = vec(cable_force, e, n)
+            attitude = mat(state.drone_rotation, e, n)
             air = tmul(attitude, vec(reference.velocity, e, n))
             drag = mul(attitude, (g.drag[n, 0] * air[0], g.drag[n, 1] * air[1], g.drag[n, 2] * air[2]))
-            told = add(add(nominal, drag), scale(g.load_share[n], vec(reference.acceleration, e, n)))
-            moved = scale(g.mass[n] / c.dt, sub(velocity, vec(disturbance.velocity, e, n)))
-            used = add(moved, (0.0, 0.0, g.mass[n] * GRAVITY))
+            fed_forward = add(add(nominal, drag), scale(g.load_share[n], vec(reference.acceleration, e, n)))
+
+            # What the rotors exert beyond that and beyond what moves the drone, filtered and limited.
+            inertial = scale(g.mass[n] / c.dt, sub(velocity, vec(disturbance.velocity, e, n)))
+            used = add(inertial, (0.0, 0.0, g.mass[n] * GRAVITY))
             before = vec(disturbance.force, e, n)
-            gap = sub(sub(sub(rotors, used), told), before)
+            gap = sub(sub(sub(rotors, used), fed_forward), before)
             force = limit(add(before, scale(c.share[n], gap)), c.largest[n])
             put(disturbance.force[e, n], force)
             put(disturbance.velocity[e, n], velocity)

@@ -1,4 +1,4 @@
-"""Where the drones belong: the formation about the payload's target pose, and the smooth way there."""
+"""The formation about the payload's target pose, and the smoothed references to it."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ class Goal(NamedTuple):
     slot_velocity: np.ndarray
     """(E, N, 3) of each slot beside the target's, where the formation turns or changes [m/s]."""
     slot_acceleration: np.ndarray
-    """(E, N, 3) likewise [m/s²]."""
+    """(E, N, 3) of the same [m/s²]."""
     slot_jerk: np.ndarray
-    """(E, N, 3) likewise [m/s³]."""
+    """(E, N, 3) of the same [m/s³]."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> Goal:
@@ -95,7 +95,7 @@ def make_rig(system: System) -> Rig:
 
 
 class Reference(NamedTuple):
-    """What the drones are told to follow: a command, smoothed."""
+    """What the drones follow: a command, smoothed."""
 
     command: np.ndarray
     """(E, N, 3) commanded position [m]."""
@@ -124,10 +124,11 @@ class Reference(NamedTuple):
 
 @kernel
 def place_formation(e: int, goal: Goal, rig: Rig) -> None:
-    """Write slots, slot frames and pulls of environment e for its target pose."""
+    """Write slots, slot frames and cable forces of environment e for its target pose."""
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     yaw = heading(target)
-    goal.yaw[e], goal.drone_yaw[e] = yaw, yaw
+    goal.yaw[e] = yaw
+    goal.drone_yaw[e] = yaw
     c, s = cos(yaw), sin(yaw)
     for n in range(rig.slots.shape[0]):
         anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
@@ -140,13 +141,13 @@ def place_formation(e: int, goal: Goal, rig: Rig) -> None:
 
 @kernel
 def goal_arm(e, n, goal, rig, yaw):
-    """Return where the hook of drone n is from its centre as it rests at the target with heading `yaw`, world frame."""
+    """Return the hook of drone n from its centre, at rest at the target with heading `yaw`, world frame [m]."""
     return hook_arm(n, vec(goal.cable_force, e, n), yaw, rig)
 
 
 @kernel
 def hook_arm(n, cable_force, yaw, rig):
-    """Return where the hook of drone n is from its centre as it pulls by `pull` [N] with heading `yaw`, world frame."""
+    """Return the hook of drone n from its centre, at rest with a cable force [N] and heading `yaw`, world frame [m]."""
     if not rig.drones.hooked:
         return (0.0, 0.0, 0.0)
     force = add(cable_force, (0.0, 0.0, rig.drones.mass[n] * GRAVITY))
@@ -181,25 +182,30 @@ def start_reference(e, state, reference):
         reference.yaw_rate[e, n] = 0.0
 
 
+class Smoothing(NamedTuple):
+    """How references follow their commands."""
+
+    frequency: float
+    """ω of the filters [rad/s]."""
+    speed: float
+    """Largest steady speed [m/s]."""
+    dt: float
+    """Control step [s]."""
+
+
 @kernel
-def smooth(lo, hi, reference, frequency, speed, dt):
+def smooth(lo, hi, reference, smoothing):
     """Move the references of environments lo to hi one control step towards their commands.
 
     Position: a critically damped third-order filter, (s/ω + 1)³, whose input is limited so that far commands are
-    approached at `speed`; yaw: a second-order one.
-
-    Args:
-        lo, hi: the environments.
-        reference: Reference.
-        frequency: ω [rad/s].
-        speed: largest steady speed [m/s].
-        dt: control step [s].
+    approached at the smoothing's speed; yaw: a second-order one.
     """
-    w = frequency
+    w, dt = smoothing.frequency, smoothing.dt
+    reach = 3.0 * smoothing.speed / w
     for e in range(lo, hi):
         for n in range(reference.yaw.shape[1]):
             p, v, a = vec(reference.position, e, n), vec(reference.velocity, e, n), vec(reference.acceleration, e, n)
-            gap = limit(sub(vec(reference.command, e, n), p), 3.0 * speed / w)
+            gap = limit(sub(vec(reference.command, e, n), p), reach)
             jerk = sub(scale(w * w * w, gap), add(scale(3.0 * w * w, v), scale(3.0 * w, a)))
             a = add(a, scale(dt, jerk))
             v = add(v, scale(dt, a))
@@ -211,21 +217,25 @@ def smooth(lo, hi, reference, frequency, speed, dt):
 
 
 @kernel
-def to_goal_frame(lo, hi, reference, goal, left):
+def to_goal_frame(lo, hi, reference, goal, before):
     """Make the references of environments lo to hi relative to the slots and motion of their goals, which then move on.
 
     `smooth_moving` makes them absolute again. In between, references ride along: only commands are smoothed, so a
-    moving target is followed without lag. `left` (Reference) keeps them as they were, its commands the slots.
+    moving target is followed without lag. `before` (Reference) keeps them as they were, its commands the slots.
     """
     for e in range(lo, hi):
         velocity, acceleration = row(goal.velocity, e), row(goal.acceleration, e)
         for n in range(reference.yaw.shape[1]):
-            put(left.command[e, n], vec(goal.slots, e, n))
-            put(left.position[e, n], vec(reference.position, e, n))
-            put(left.velocity[e, n], vec(reference.velocity, e, n))
-            put(left.acceleration[e, n], vec(reference.acceleration, e, n))
-            left.command_yaw[e, n] = goal.drone_yaw[e]
-            left.yaw[e, n], left.yaw_rate[e, n] = reference.yaw[e, n], reference.yaw_rate[e, n]
+            # Keep slot and reference.
+            put(before.command[e, n], vec(goal.slots, e, n))
+            put(before.position[e, n], vec(reference.position, e, n))
+            put(before.velocity[e, n], vec(reference.velocity, e, n))
+            put(before.acceleration[e, n], vec(reference.acceleration, e, n))
+            before.command_yaw[e, n] = goal.drone_yaw[e]
+            before.yaw[e, n] = reference.yaw[e, n]
+            before.yaw_rate[e, n] = reference.yaw_rate[e, n]
+
+            # Make the reference relative.
             put(reference.position[e, n], sub(vec(reference.position, e, n), vec(goal.slots, e, n)))
             own_velocity = add(velocity, vec(goal.slot_velocity, e, n))
             own_acceleration = add(acceleration, vec(goal.slot_acceleration, e, n))
@@ -236,16 +246,19 @@ def to_goal_frame(lo, hi, reference, goal, left):
 
 
 @kernel
-def smooth_moving(lo, hi, reference, goal, left, frequency, speed, dt):
-    """Do as `smooth`, about goals that move; see `leave_goal`. References of slots that leap stay and are smoothed."""
+def smooth_moving(lo, hi, reference, goal, before, smoothing):
+    """Do as `smooth`, about goals that move; see `to_goal_frame`.
+
+    References of slots that leap stay where they were and are smoothed from there.
+    """
     for e in range(lo, hi):
         for n in range(reference.yaw.shape[1]):
-            if _has_leapt(e, n, goal, left, dt):
-                _stay(e, n, reference, goal, left)
+            if _has_leapt(e, n, goal, before, smoothing.dt):
+                _stay(e, n, reference, goal, before)
             else:
                 put(reference.position[e, n], add(vec(reference.position, e, n), vec(goal.slots, e, n)))
                 reference.yaw[e, n] += goal.drone_yaw[e]
-    smooth(lo, hi, reference, frequency, speed, dt)
+    smooth(lo, hi, reference, smoothing)
     for e in range(lo, hi):
         velocity, acceleration, jerk = row(goal.velocity, e), row(goal.acceleration, e), row(goal.jerk, e)
         for n in range(reference.yaw.shape[1]):
@@ -258,23 +271,23 @@ def smooth_moving(lo, hi, reference, goal, left, frequency, speed, dt):
 
 
 @kernel
-def _has_leapt(e, n, goal, left, dt):
-    """Return whether slot or heading of a drone has moved in a control step `dt` [s] as nothing that flies can."""
-    moved = norm(sub(vec(goal.slots, e, n), vec(left.command, e, n)))
-    turned = abs(wrap(goal.drone_yaw[e] - left.command_yaw[e, n]))
+def _has_leapt(e, n, goal, before, dt):
+    """Return whether slot or heading of a drone has moved farther in a control step `dt` [s] than a vehicle can."""
+    moved = norm(sub(vec(goal.slots, e, n), vec(before.command, e, n)))
+    turned = abs(wrap(goal.drone_yaw[e] - before.command_yaw[e, n]))
     return moved > LEAP_SPEED * dt or turned > LEAP_RATE * dt
 
 
 @kernel
-def _stay(e, n, reference, goal, left):
-    """Put a reference back to where it was left, its motion relative to that of its slot now."""
+def _stay(e, n, reference, goal, before):
+    """Put a reference back to where it was, its motion relative to that of its slot."""
     own_velocity = add(row(goal.velocity, e), vec(goal.slot_velocity, e, n))
     own_acceleration = add(row(goal.acceleration, e), vec(goal.slot_acceleration, e, n))
-    put(reference.position[e, n], vec(left.position, e, n))
-    put(reference.velocity[e, n], sub(vec(left.velocity, e, n), own_velocity))
-    put(reference.acceleration[e, n], sub(vec(left.acceleration, e, n), own_acceleration))
-    reference.yaw[e, n] = left.yaw[e, n]
-    reference.yaw_rate[e, n] = left.yaw_rate[e, n] - goal.drone_yaw_rate[e]
+    put(reference.position[e, n], vec(before.position, e, n))
+    put(reference.velocity[e, n], sub(vec(before.velocity, e, n), own_velocity))
+    put(reference.acceleration[e, n], sub(vec(before.acceleration, e, n), own_acceleration))
+    reference.yaw[e, n] = before.yaw[e, n]
+    reference.yaw_rate[e, n] = before.yaw_rate[e, n] - goal.drone_yaw_rate[e]
 
 
 @kernel

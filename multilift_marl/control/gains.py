@@ -104,19 +104,20 @@ def make_gains(control: ControlConfig, system: System) -> Gains:
 
 
 def limited(control: ControlConfig, name: str, bound: np.ndarray, what: str, *others: str) -> np.ndarray:
-    """Return a frequency of `control`, at most its bound (N,) [rad/s]; a warning tells where that is less than asked.
+    """Return a frequency of `control`, at most its bound (N,) [rad/s]; a warning says where that is less than set.
 
     Args:
         control: where it is None, the bound is taken.
         name: of the frequency.
         bound: of each drone.
         what: the bound is, in words.
-        others: names of what the bound depends on; nothing was asked for where these and `name` have their defaults.
+        others: names of what the bound depends on; nothing was set where these and `name` have their defaults.
     """
-    asked = getattr(control, name)
-    if asked is None:
+    frequency = getattr(control, name)
+    if frequency is None:
         return bound
-    used, fields = np.minimum(asked, bound), ControlConfig.model_fields
-    if used.min() < asked and any(getattr(control, each) != fields[each].default for each in (name, *others)):
-        warn_once("control", f"control.{name}={asked:g} is above {what}: {used.min():.3g} rad/s is used; lower it")
+    used = np.minimum(frequency, bound)
+    fields = ControlConfig.model_fields
+    if used.min() < frequency and any(getattr(control, each) != fields[each].default for each in (name, *others)):
+        warn_once("control", f"control.{name}={frequency:g} is above {what}: {used.min():.3g} rad/s is used; lower it")
     return used

@@ -1,8 +1,8 @@
-"""The geometric controller on SO(3) that flies each drone (report eqs 25-32; Lee, Leok and McClamroch, CDC 2010).
+"""The geometric controller on SO(3) of each drone (report eqs 25-32; Lee, Leok and McClamroch, CDC 2010).
 
-It has levels, each of which hands to the next: position (`fly`) → force (`wanted_force`, `follow_force`) → attitude
-(`follow_attitude`) → torque (`attitude_torque`, `rate_torque`) → rotors (`allocate`). Set-points that enter below the
-position are in `setpoints`.
+Its levels follow one another: position and velocity → force (`desired_force`) → attitude and body rates
+(`thrust_frame`, `desired_rates`) → torque (`attitude_torque`, `rate_torque`) → rotors (`allocate`). `fly` computes all
+of them, `fly_rates` begins at the body rates; `setpoints` prepares the references of the levels in between.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from math import cos, sin
 
 from multilift_marl._jit import kernel
 from multilift_marl.control.allocation import allocate
-from multilift_marl.control.formation import smooth
 from multilift_marl.control.gains import drone_gains
 from multilift_marl.math3d import (
     add,
@@ -97,7 +96,7 @@ def hook_moment(n, attitude, cable_force, acceleration, g):
     Args:
         n: the drone.
         attitude: R, 9 numbers.
-        pull: force that the drone exerts on its cable, at the hook [N].
+        cable_force: force that the drone exerts on its cable, at the hook [N].
         acceleration: of the set-point, which the load follows [m/s²].
         g: Gains.
     """
@@ -107,16 +106,16 @@ def hook_moment(n, attitude, cable_force, acceleration, g):
 
 
 @kernel
-def wanted_force(feedback, acceleration, velocity, cable_force, attitude, g):
+def desired_force(feedback, acceleration, velocity, cable_force, attitude, g):
     """Return the force [N] that a drone's rotors are to exert, world frame.
 
-    The nominal pull of the cable, the inertia of the load that hangs on it and the drag are fed forward.
+    The nominal force on the cable, the inertia of the load that hangs on it and the drag are fed forward.
 
     Args:
         feedback: acceleration that corrects the errors, negative [m/s²].
         acceleration: of the set-point [m/s²].
         velocity: of the set-point, for the drag [m/s].
-        pull: force that the drone exerts on its cable [N].
+        cable_force: force that the drone exerts on its cable [N].
         attitude: R, 9 numbers.
         g: DroneGains.
     """
@@ -128,60 +127,64 @@ def wanted_force(feedback, acceleration, velocity, cable_force, attitude, g):
 
 
 @kernel
-def follow_attitude(attitude, rates, desired, desired_rate, total, moment, g):
-    """Return the four rotor thrusts [N] that turn R to R_d (see `attitude_torque`) and hold a `hook_moment` [N m]."""
-    torque = attitude_torque(attitude, rates, desired, desired_rate, g)
-    torque = add(torque, moment)
-    return allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
+def fly(lo, hi, state, reference, cable_force, thrust, g, tilt_rates=None):
+    """Compute the rotor thrusts with which the drones of environments lo to hi follow their references.
 
-
-@kernel
-def follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, g):
-    """Return the four rotor thrusts [N] that exert force F, which changes by Ḟ [N/s], at heading ψ.
-
-    Thrust is the desired force along the actual body z axis, F · R e3 (Lee 2010), in place of eq 27's |a_d|. A
-    `hook_moment` is held beside. The last lines are those of `follow_attitude`: a call in their place takes a quarter
-    more time.
-    """
-    desired = thrust_frame(force, yaw)
-    desired_rate = desired_rates(desired, force, force_rate, yaw, yaw_rate)
-    total = max(dot(force, unit(column(attitude, 2))), 0.0)
-    torque = attitude_torque(attitude, rates, desired, desired_rate, g)
-    torque = add(torque, moment)
-    return allocate(total, torque, g.allocation, g.thrust_min, g.thrust_max)
-
-
-@kernel
-def control(lo, hi, state, reference, cable_force, thrust, g, frequency, speed, dt):
-    """One control step: `smooth` the references, then `fly` after them."""
-    smooth(lo, hi, reference, frequency, speed, dt)
-    fly(lo, hi, state, reference, cable_force, thrust, g)
-
-
-@kernel
-def fly(lo, hi, state, reference, cable_force, thrust, g):
-    """Compute the rotor thrusts that make the drones of environments lo to hi follow their references: position.
+    Position, velocity, acceleration, jerk and yaw are followed together. A reference whose position is the drone's own
+    gives a velocity controller, one whose velocity is, too, an acceleration controller: the errors are then zero.
 
     Args:
         lo, hi: the environments.
         state: SystemState.
         reference: Reference to follow.
-        pull: force that each drone is to exert on its cable (E, N, 3) [N].
+        cable_force: force that each drone is to exert on its cable (E, N, 3) [N].
         thrust: written, (E, N, 4) [N].
         g: Gains.
+        tilt_rates: (E, N, 3), whose first two are roll and pitch rate of the desired attitude [rad/s]; None: they
+            follow from the jerk.
     """
     for e in range(lo, hi):
         for n in range(thrust.shape[1]):
             d = drone_gains(g, n)
-            position_error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
+            attitude = mat(state.drone_rotation, e, n)
+            cable = vec(cable_force, e, n)
             velocity = vec(reference.velocity, e, n)
+            acceleration = vec(reference.acceleration, e, n)
+            yaw = reference.yaw[e, n]
+
+            # Position and velocity errors to the desired force.
+            position_error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
             velocity_error = sub(vec(state.drone_velocity, e, n), velocity)
             feedback = add(scale(d.k_p, position_error), scale(d.k_v, velocity_error))
-            attitude, acceleration = mat(state.drone_rotation, e, n), vec(reference.acceleration, e, n)
-            force = wanted_force(feedback, acceleration, velocity, vec(cable_force, e, n), attitude, d)
-            moment = hook_moment(n, attitude, vec(cable_force, e, n), acceleration, g)
+            force = desired_force(feedback, acceleration, velocity, cable, attitude, d)
+
+            # Force and its rate to the desired attitude and its body rates.
+            desired = thrust_frame(force, yaw)
             force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
-            rates, yaw, yaw_rate = vec(state.drone_body_rates, e, n), reference.yaw[e, n], reference.yaw_rate[e, n]
-            rotors = follow_force(attitude, rates, force, force_rate, yaw, yaw_rate, moment, d)
+            desired_rate = desired_rates(desired, force, force_rate, yaw, reference.yaw_rate[e, n])
+            if tilt_rates is not None:
+                desired_rate = (tilt_rates[e, n, 0], tilt_rates[e, n, 1], desired_rate[2])
+
+            # Thrust is the desired force along the actual body z axis, F · R e3 (Lee 2010), in place of eq 27's |a_d|.
+            total = max(dot(force, unit(column(attitude, 2))), 0.0)
+            torque = attitude_torque(attitude, vec(state.drone_body_rates, e, n), desired, desired_rate, d)
+            torque = add(torque, hook_moment(n, attitude, cable, acceleration, g))
+            rotors = allocate(total, torque, d.allocation, d.thrust_min, d.thrust_max)
+            for k in range(4):
+                thrust[e, n, k] = rotors[k]
+
+
+@kernel
+def fly_rates(lo, hi, state, setpoint, cable_force, thrust, g):
+    """Compute the rotor thrusts that turn drones at the body rates of a Setpoint, at its total thrust.
+
+    The moment of the cables at the hooks is held beside. Arguments are those of `fly`.
+    """
+    for e in range(lo, hi):
+        for n in range(thrust.shape[1]):
+            d = drone_gains(g, n)
+            torque = rate_torque(vec(state.drone_body_rates, e, n), vec(setpoint.rates, e, n), d)
+            moment = hook_moment(n, mat(state.drone_rotation, e, n), vec(cable_force, e, n), (0.0, 0.0, 0.0), g)
+            rotors = allocate(setpoint.thrust[e, n], add(torque, moment), d.allocation, d.thrust_min, d.thrust_max)
             for k in range(4):
                 thrust[e, n, k] = rotors[k]

@@ -1,18 +1,19 @@
 """The scripted team `payload_geometric`: one geometric controller for the payload, which all drones serve.
 
 Force and moment on the payload follow from its errors in position and attitude on SE(3), with integrals (Lee, IEEE TCST
-26(4), 2018; Sreenath and Kumar, RSS 2013); pulls of the cables, by minimum norm about those of the formation with every
-cable pulling, from force and moment; places of the drones, which act by the `reference` interface, from the pulls.
+26(4), 2018; Sreenath and Kumar, RSS 2013); from them the cable forces, by minimum norm about those of the formation
+with every cable taut; from these the places of the drones, which act by the `reference` interface.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.control.cable_forces import MIN_TENSION_RATIO, drone_offset, solve_cable_forces
+from multilift_marl.control.formation import Rig
 from multilift_marl.control.gains import make_gains
 from multilift_marl.math3d import (
     add,
@@ -62,13 +63,42 @@ class PayloadGains(NamedTuple):
 
 
 MAX_FORCE = 0.5  # of the payload's weight, that corrects errors
+CARRIED = 0.5  # of the tension at rest, from which on the payload counts as carried
+
+
+class PayloadLaw(NamedTuple):
+    """Constants of the control law, for one team."""
+
+    gains: PayloadGains
+    rig: Rig
+    hanging: Any
+    """CableEquilibrium of the team."""
+    inertia: tuple[float, ...]
+    """Of the payload in its frame, 9 numbers [kg m²]."""
+    stiffness: np.ndarray
+    """(N,) force of each drone for each metre from its reference [N/m]."""
+    lead_steps: float
+    """Lead of the offsets [policy steps]."""
+    max_offset: float
+    """Of a full action [m]."""
+
+
+class PayloadMemory(NamedTuple):
+    """What the law remembers from step to step."""
+
+    cable_force: np.ndarray
+    """(E, N, 3) last desired forces of the cables on the payload [N]."""
+    offset: np.ndarray
+    """(E, N, 3) last offsets of the slots [m]."""
+    fresh: np.ndarray
+    """(E,) bool, environments that have no last offsets."""
 
 
 class PayloadGeometric:
     """Centralised: it reads the true state of payload and goal in `vec`, but neither masses nor forces that are hidden.
 
-    It flies about `task.way`, and remembers only its last offsets, for the lead: the integrals are the task's. The law
-    is that of Lee (IEEE TCST 26(4), 2018), see the head of this file.
+    It acts about `task.planned`, and remembers only its last offsets, for the lead: the integrals are the task's. The
+    law is that of Lee (IEEE TCST 26(4), 2018), see the head of this file.
 
     Args:
         vec: environments with the interface `reference`; read at every `act`.
@@ -76,15 +106,18 @@ class PayloadGeometric:
     """
 
     def __init__(self, vec: MultiliftVec, gains: PayloadGains | None = None):
-        self._vec, system, control = vec, vec.world.system, vec.config.control
-        self._gains = PayloadGains() if gains is None else gains
+        system, control, task = vec.world.system, vec.config.control, vec.task
+        gains = PayloadGains() if gains is None else gains
         drone = make_gains(control, system)
-        ahead = self._gains.lead * 3.0 / control.reference_frequency / vec.task.dt
-        self._numbers = (drone.mass * drone.k_p, ahead, control.max_offset)
-        self._inertia = system.inertia_matrix
-        self._action = np.zeros((vec.num_envs, vec.num_drones, vec.action_size))
-        self._pull, self._last = np.zeros((2, vec.num_envs, vec.num_drones, 3))
-        self._fresh = np.ones(vec.num_envs, bool)
+        lead_steps = gains.lead * 3.0 / control.reference_frequency / task.dt
+        stiffness = drone.mass * drone.k_p
+        self._vec = vec
+        self._law = PayloadLaw(
+            gains, task.rig, task.hanging, system.inertia_matrix, stiffness, lead_steps, control.max_offset
+        )
+        shape = (vec.num_envs, vec.num_drones)
+        self._memory = PayloadMemory(np.zeros((*shape, 3)), np.zeros((*shape, 3)), np.ones(vec.num_envs, bool))
+        self._action = np.zeros((*shape, vec.action_size))
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (E, N, 4) in [-1, 1] for the present state of the environments, whose observations these are.
@@ -98,15 +131,12 @@ class PayloadGeometric:
                 f"payload_geometric reads the state of its {vec.num_envs} environments of {vec.num_drones} drones, but "
                 f"the observation has shape {np.shape(observation)}; give the observations of all of them"
             )
-        _steer(
-            0, vec.num_envs, vec.world.state, task.planned, task.errors, task.rig, task.hanging, self._inertia,
-            self._gains, *self._numbers, self._pull, self._last, self._fresh, self._action,
-        )  # fmt: skip
+        _act(vec.world.state, task.planned, task.errors, self._law, self._memory, self._action)
         return self._action.copy()
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget the last offsets of the environments in the mask (E,) (None: all)."""
-        self._fresh[slice(None) if mask is None else mask] = True
+        self._memory.fresh[slice(None) if mask is None else mask] = True
 
 
 @kernel
@@ -116,76 +146,83 @@ def _times(a, b):
 
 
 @kernel
-def _steer(
-    lo, hi, state, way, errors, rig, hanging, inertia, g, stiffness, ahead, max_offset, cable_force, last, fresh, action
-):
-    """Write the actions (E, N, 4) of environments lo to hi.
+def _act(state, planned, errors, law, memory, action):
+    """Write the actions (E, N, 4).
 
     Args:
-        lo, hi: the environments.
         state: SystemState.
-        way: Goal that the drones fly about.
-        errors: whose integrals count.
-        rig, hanging: Rig, Hanging.
-        inertia: of the payload in its frame, 9 numbers [kg m²].
-        g: PayloadGains.
-        stiffness: force of each drone for each metre from its reference (N,) [N/m].
-        ahead: lead of the offsets [policy steps].
-        max_offset: of a full action [m].
-        pull: (E, N, 3) written with the pulls that are wanted [N].
-        last: (E, N, 3) the last offsets, written [m].
-        fresh: (E,) bool, environments that have none; written.
+        planned: Goal that the team is to follow.
+        errors: of the task, whose integrals count.
+        law: PayloadLaw.
+        memory: PayloadMemory, written.
         action: written.
     """
+    g, rig, hanging = law.gains, law.rig, law.hanging
     mass = hanging.payload_mass
-    for e in range(lo, hi):
-        if not _carried(e, way, rig):  # nothing is to be held yet: the formation alone
-            action[e], last[e], fresh[e] = 0.0, 0.0, True
+    for e in range(action.shape[0]):
+        if not _is_carried(e, planned, rig):  # nothing is to be held yet: the formation alone
+            action[e] = 0.0
+            memory.offset[e] = 0.0
+            memory.fresh[e] = True
             continue
-        attitude, payload = matrow(way.rotation, e), matrow(state.payload_rotation, e)
-        apart = sub(row(state.payload_position, e), row(way.position, e))
-        moving = sub(row(state.payload_velocity, e), row(way.velocity, e))
-        twisted = rotation_vector(matmul(payload, transpose(attitude)))
-        spinning = sub(mul(payload, row(state.payload_body_rates, e)), row(way.angular_velocity, e))
-        wanted = add(_times(g.position, apart), _times(g.velocity, moving))
-        wanted = add(wanted, _times(g.integral, row(errors.position_integral, e)))
-        force = limit(scale(-mass, wanted), MAX_FORCE * mass * GRAVITY)
-        turning = add(scale(g.attitude, twisted), scale(g.rates, spinning))
+
+        # Errors of position, velocity, attitude and angular velocity from the plan.
+        attitude = matrow(planned.rotation, e)
+        payload = matrow(state.payload_rotation, e)
+        position_error = sub(row(state.payload_position, e), row(planned.position, e))
+        velocity_error = sub(row(state.payload_velocity, e), row(planned.velocity, e))
+        rotation_error = rotation_vector(matmul(payload, transpose(attitude)))
+        rate_error = sub(mul(payload, row(state.payload_body_rates, e)), row(planned.angular_velocity, e))
+
+        # Force and moment that correct them.
+        feedback = add(_times(g.position, position_error), _times(g.velocity, velocity_error))
+        feedback = add(feedback, _times(g.integral, row(errors.position_integral, e)))
+        force = limit(scale(-mass, feedback), MAX_FORCE * mass * GRAVITY)
+        turning = add(scale(g.attitude, rotation_error), scale(g.rates, rate_error))
         turning = add(turning, scale(g.attitude_integral, row(errors.rotation_integral, e)))
-        body = matmul(matmul(attitude, inertia), transpose(attitude))
-        moment = scale(-1.0, mul(body, turning))
+        inertia = matmul(matmul(attitude, law.inertia), transpose(attitude))
+        moment = scale(-1.0, mul(inertia, turning))
+
+        # With what the planned cable forces exert, the wrench on the payload; the nearest cable forces that exert it.
         for n in range(rig.slots.shape[0]):
-            put(cable_force[e, n], _own(e, n, way, rig, hanging))
-            arm = mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2]))
-            force, moment = add(force, vec(cable_force, e, n)), add(moment, cross(arm, vec(cable_force, e, n)))
-        solve_cable_forces(force, moment, attitude, rig.anchors, MIN_TENSION_RATIO, cable_force[e])
+            nominal = _planned_force(e, n, planned, rig, hanging)
+            arm = mul(attitude, row(rig.anchors, n))
+            force = add(force, nominal)
+            moment = add(moment, cross(arm, nominal))
+            put(memory.cable_force[e, n], nominal)
+        solve_cable_forces(force, moment, attitude, rig.anchors, MIN_TENSION_RATIO, memory.cable_force[e])
+
+        # Slots from which the drones exert them, stretch of cables and of position loops included.
         for n in range(rig.slots.shape[0]):
-            old, new = _own(e, n, way, rig, hanging), vec(cable_force, e, n)
-            offset = add(
-                sub(drone_offset(n, new, hanging), drone_offset(n, old, hanging)),
-                scale(1.0 / stiffness[n], sub(new, old)),
-            )
-            change = (0.0, 0.0, 0.0) if fresh[e] else sub(offset, vec(last, e, n))
-            put(last[e, n], offset)
-            offset = add(offset, scale(ahead, change))
-            offset = turn(way.slot_frame[e, n, 0], -way.slot_frame[e, n, 1], offset)
+            old = _planned_force(e, n, planned, rig, hanging)
+            new = vec(memory.cable_force, e, n)
+            moved = sub(drone_offset(n, new, hanging), drone_offset(n, old, hanging))
+            offset = add(moved, scale(1.0 / law.stiffness[n], sub(new, old)))
+
+            # Lead by the offset's last change, to the slot frame, to the range of actions.
+            change = (0.0, 0.0, 0.0) if memory.fresh[e] else sub(offset, vec(memory.offset, e, n))
+            put(memory.offset[e, n], offset)
+            offset = add(offset, scale(law.lead_steps, change))
+            offset = turn(planned.slot_frame[e, n, 0], -planned.slot_frame[e, n, 1], offset)
             for j in range(3):
-                action[e, n, j] = clip(offset[j] / max_offset, -1.0, 1.0)
-        fresh[e] = False
+                action[e, n, j] = clip(offset[j] / law.max_offset, -1.0, 1.0)
+        memory.fresh[e] = False
 
 
 @kernel
-def _carried(e, way, rig):
-    """Return whether the cables are meant to pull at least half of what they do at rest, in all."""
-    wanted, rest = 0.0, 0.0
+def _is_carried(e, planned, rig):
+    """Return whether the planned tensions are at least `CARRIED` of those at rest, in all."""
+    tension = 0.0
+    rest = 0.0
     for n in range(rig.slots.shape[0]):
-        wanted, rest = wanted + norm(vec(way.cable_force, e, n)), rest + norm(row(rig.force, n))
-    return wanted >= 0.5 * rest
+        tension += norm(vec(planned.cable_force, e, n))
+        rest += norm(row(rig.force, n))
+    return tension >= CARRIED * rest
 
 
 @kernel
-def _own(e, n, way, rig, hanging):
-    """Return the pull on the payload that the way needs of cable n: `way.pull` leaves the load's inertia out [N]."""
-    share = rig.force[n, 2] / GRAVITY
-    inertial = scale(share, add(row(way.acceleration, e), vec(way.slot_acceleration, e, n)))
-    return sub(add(vec(way.cable_force, e, n), inertial), (0.0, 0.0, hanging.weight[n]))
+def _planned_force(e, n, planned, rig, hanging):
+    """Return the force of cable n on the payload in the plan, which holds it without the load's inertia [N]."""
+    load_share = rig.force[n, 2] / GRAVITY
+    inertial = scale(load_share, add(row(planned.acceleration, e), vec(planned.slot_acceleration, e, n)))
+    return sub(add(vec(planned.cable_force, e, n), inertial), (0.0, 0.0, hanging.weight[n]))

@@ -24,7 +24,7 @@ class Policy(Protocol):
 
 
 class OwnPolicy:
-    """A policy of one's own, of a class that module:Class names, whose mistakes are told in one sentence.
+    """A policy of one's own, of a class that module:Class names, whose mistakes are refused in one sentence.
 
     Args:
         name: module:Class, of an installed module, one in the current folder, or the path of a .py file. What it names

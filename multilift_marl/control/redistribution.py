@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import kernel
+from multilift_marl.control.cable_forces import balance_forces
 from multilift_marl.control.gains import Gains
 from multilift_marl.math3d import clip
 from multilift_marl.rig.system import System
@@ -58,15 +59,12 @@ def redistribute(
         attitude = _tilted(tilt, AXES if tilt else AXES[:1])
         # 1. Least change of the formation's forces that balances weights and moments.
         arms = np.einsum("aij,nj->ani", attitude, system.anchors)
-        balance = _balance_matrix(arms[:, keep])
         wrench = np.zeros((len(attitude), 6))
         wrench[:, 2] = GRAVITY * system.payload_mass + weight
         wrench[:, 3:] = np.cross(arms[:, lost], [0.0, 0.0, weight])
-        nominal = system.formation_force[keep].ravel()
-        change = np.einsum("aij,aj->ai", np.linalg.pinv(balance, rcond=1e-9), wrench - balance @ nominal)
-        force = (nominal + change).reshape(len(attitude), -1, 3)
-        balanced = np.abs(np.einsum("aij,aj->ai", balance, nominal + change) - wrench).max(axis=1) < 1e-6
-        # 2. Where the drones are that pull so, each held by the spring that its position gain is.
+        force, missed = balance_forces(arms[:, keep], system.formation_force[keep], wrench)
+        balanced = missed < 1e-6
+        # 2. Where the drones are that exert them, each held by the spring that its position gain is.
         size = np.linalg.norm(force, axis=2, keepdims=True)
         stretched = system.cable_length[keep, None] + size / system.cable_stiffness[keep, None]
         moved = arms[:, keep] + stretched * force / size - system.slots[keep]
@@ -81,7 +79,9 @@ def redistribute(
         if possible.any():
             best = np.where(possible, thrust.max(axis=1), np.inf).argmin()
             found = Redistribution(float(tilt), *(np.zeros((system.num_drones, *shape)) for shape in ((3,), (), (3,))))
-            found.force[keep], found.thrust[keep], found.offset[keep] = force[best], thrust[best], offset[best]
+            found.force[keep] = force[best]
+            found.thrust[keep] = thrust[best]
+            found.offset[keep] = offset[best]
             return found
     return None
 
@@ -125,15 +125,6 @@ def _tilted(tilt: float, axes: np.ndarray) -> np.ndarray:
     x, y, zero = np.cos(axes), np.sin(axes), np.zeros_like(axes)
     k = np.moveaxis(np.array([[zero, zero, y], [zero, zero, -x], [-y, x, zero]]), 2, 0)
     return np.eye(3) + np.sin(tilt) * k + (1 - np.cos(tilt)) * k @ k
-
-
-def _balance_matrix(arms: np.ndarray) -> np.ndarray:
-    """Return G (A, 6, 3 N) by which forces (3 N,) at `arms` (A, N, 3) exert force and moment."""
-    x, y, z = np.moveaxis(arms, 2, 0)
-    zero = np.zeros_like(x)
-    moments = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 3, 1).reshape(len(arms), 3, -1)
-    forces = np.broadcast_to(np.tile(np.eye(3), arms.shape[1]), moments.shape)
-    return np.concatenate([forces, moments], axis=1)
 
 
 def _to_slots(vectors: np.ndarray, azimuth: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Scripted teams, with the interface of learned policies: the yardsticks, and what learned ones start from."""
+"""Scripted teams, with the interface of learned policies: the baselines, and what learned ones start from."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 INTEGRAL_GAIN = 0.5  # [1/s]
-WANTED = {  # what the payload is meant to do meanwhile, where a task tells
+PLANNED = {  # of what is observed, the planned value, where a task has one
     "payload_error": ("planned_position",),
     "payload_velocity": ("planned_velocity", "target_velocity"),
     "payload_rotation_error": ("planned_rotation",),
 }
 LEAD_TIME = 0.4  # [s] that a payload's acceleration follows a moved slot: the lags of reference and drone
-LEAD_GAIN = 0.87  # [-] of what the acceleration asks for; RMSE is least at 0.81 for (2, 2), at 1 for (2, 4)
-
-
+LEAD_GAIN = 0.87  # [-] of h a / g; the RMSE of `track` is least at 0.81 for the curve (2, 2), at 1 for (2, 4)
 NARROWING = 0.7  # [m] inward from the slots; 0.5 to 0.7 m pass a gap of 1 m, at 0.8 m drones collide
 
 
@@ -37,11 +35,20 @@ class Formation:
     Attributes:
         GAINS: how a script based on this one moves the slots: what is observed, its axis in the slot frame, the axis of
             the slot's offset, and metres for each unit.
+        NEEDS: observations without which the script cannot act.
+        REFUSAL: what is said where they are missing in {task}.
+
+    Raises:
+        ConfigError: the environments do not observe what the script needs.
     """
 
     GAINS: ClassVar[tuple[tuple[str, int, int, float], ...]] = ()
+    NEEDS: ClassVar[tuple[str, ...]] = ()
+    REFUSAL: ClassVar[str] = ""
 
     def __init__(self, vec: MultiliftVec):
+        if not self.fits(vec):
+            raise ConfigError(self.REFUSAL.format(task=vec.config.task))
         self._names, self._actions = vec.observation_names, vec.action_names
         self._max_offset = vec.config.control.max_offset
         self._matrix = self.matrix()
@@ -51,9 +58,9 @@ class Formation:
         matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
         for name, axis, moved, gain in self.GAINS:
             matrix[moved, self._names.index(f"{name}_{axis}")] = gain / self._max_offset
-            for wanted in WANTED.get(name, ()):
-                if (told := f"{wanted}_{axis}") in self._names:
-                    matrix[moved, self._names.index(told)] = -gain / self._max_offset
+            for planned in PLANNED.get(name, ()):
+                if f"{planned}_{axis}" in self._names:
+                    matrix[moved, self._names.index(f"{planned}_{axis}")] = -gain / self._max_offset
         return matrix
 
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -65,8 +72,8 @@ class Formation:
 
     @classmethod
     def fits(cls, vec: MultiliftVec) -> bool:
-        """Return whether the environments tell what the script needs."""
-        return True
+        """Return whether the environments observe what the script needs."""
+        return all(name in vec.observation_names for name in cls.NEEDS)
 
 
 class FormationIntegral(Formation):
@@ -82,7 +89,7 @@ class FormationFeedback(Formation):
     """The formation with its slots moved by linear feedback of what a drone observes.
 
     Level, against the payload's error from where it should be by now, the integral of that and its velocity, and
-    against the drone's own distance from its reference, which tells how wind pushes it before the payload moves; up
+    against the drone's own distance from its reference, which shows the wind's force before the payload moves; up
     and down also so that the payload turns back to its target attitude.
     """
 
@@ -137,22 +144,18 @@ class FormationGusts(Formation):
 class FormationLead(Formation):
     """The formation displaced by what the payload's acceleration to come asks of its cables.
 
-    They pull along gravity and acceleration together (the payload's flatness, Sreenath and Kumar 2013), so that drones
-    stand h a / g ahead of their slots with h the height of the formation's cables; a is that of `LEAD_TIME` ahead, from
-    the places that the target is told to pass.
-
-    Raises:
-        ConfigError: the task tells none.
+    Their forces lie along gravity and acceleration together (the payload's flatness, Sreenath and Kumar 2013), so that
+    drones are h a / g ahead of their slots with h the height of the formation's cables; a is that of `LEAD_TIME` ahead,
+    from the observed places that the target will pass.
     """
 
-    TOLD = tuple(f"target_ahead_{round(1000 * share * LEAD_TIME)}ms" for share in (1, 2))
+    AHEAD = tuple(f"target_ahead_{round(1000 * share * LEAD_TIME)}ms" for share in (1, 2))
+    NEEDS = tuple(f"{name}_0" for name in AHEAD)
+    REFUSAL = (
+        "formation_lead needs to observe where the target will go, and task {task} has no such part; take formation"
+    )
 
     def __init__(self, vec: MultiliftVec):
-        if not self.fits(vec):
-            raise ConfigError(
-                f"formation_lead needs to know where the target will go, and task {vec.config.task} does not tell; "
-                "take formation"
-            )
         lengths, angle = vec.world.system.cable_length, vec.config.cable.angle
         self._height = float(np.mean(lengths)) * cos(radians(angle))
         super().__init__(vec)
@@ -162,14 +165,9 @@ class FormationLead(Formation):
         matrix = super().matrix()
         gain = LEAD_GAIN * self._height / GRAVITY / LEAD_TIME**2 / self._max_offset
         for axis in range(2):
-            for name, weight in zip(self.TOLD, (-2, 1), strict=True):  # a second difference
+            for name, weight in zip(self.AHEAD, (-2, 1), strict=True):  # a second difference
                 matrix[axis, self._names.index(f"{name}_{axis}")] = weight * gain
         return matrix
-
-    @classmethod
-    def fits(cls, vec: MultiliftVec) -> bool:
-        """Return whether the task tells where the target will go."""
-        return all(f"{name}_0" in vec.observation_names for name in cls.TOLD)
 
 
 class FormationNarrow(Formation):
@@ -177,9 +175,6 @@ class FormationNarrow(Formation):
 
     The constant is `NARROWING` times the cosine of the drone's own heading, which is 1 but for the noise. Velocity
     counts relative to the target's.
-
-    Raises:
-        ConfigError: the task tells of no gap.
     """
 
     GAINS = (
@@ -188,43 +183,19 @@ class FormationNarrow(Formation):
         ("payload_velocity", 0, 0, -0.3),
         ("payload_velocity", 1, 1, -0.3),
     )
-
-    def __init__(self, vec: MultiliftVec):
-        if not self.fits(vec):
-            raise ConfigError(
-                f"formation_narrow is for gaps, and task {vec.config.task} tells of none; take formation_feedback"
-            )
-        super().__init__(vec)
-
-    @classmethod
-    def fits(cls, vec: MultiliftVec) -> bool:
-        """Return whether there is a gap to pass."""
-        return "clearance_0" in vec.observation_names
+    NEEDS = ("clearance_0",)
+    REFUSAL = "formation_narrow is for gaps, and task {task} has none; take formation_feedback"
 
 
 class FormationRedistributed(FormationIntegral):
     """The formation with its integral; after a loss, the slots give way, then go where the others hold the payload.
 
-    Where that is, the task computes by statics, and tells; see `control/redistribution.py`.
-
-    Raises:
-        ConfigError: the task tells of no loss.
+    Where that is, the task computes by statics and lets the drones observe; see `control/redistribution.py`.
     """
 
     GAINS = (*FormationIntegral.GAINS, *(("planned_offset", axis, axis, 1.0) for axis in range(3)))
-
-    def __init__(self, vec: MultiliftVec):
-        if not self.fits(vec):
-            raise ConfigError(
-                f"formation_redistributed is for the loss of a drone, and task {vec.config.task} tells of none; "
-                "take formation_integral"
-            )
-        super().__init__(vec)
-
-    @classmethod
-    def fits(cls, vec: MultiliftVec) -> bool:
-        """Return whether the task tells where to go after a loss."""
-        return "planned_offset_0" in vec.observation_names
+    NEEDS = ("planned_offset_0",)
+    REFUSAL = "formation_redistributed is for the loss of a drone, and task {task} has none; take formation_integral"
 
 
 LINEAR: dict[str, type[Formation]] = {
@@ -244,7 +215,7 @@ SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {
 
 
 def fitting_scripts(vec: MultiliftVec) -> list[str]:
-    """Return the names of the scripts that can fly the environments `vec`."""
+    """Return the names of the scripts that can act in the environments `vec`."""
     if vec.config.control.action != "reference":
         return []
     return [name for name, script in SCRIPTED.items() if not issubclass(script, Formation) or script.fits(vec)]
@@ -255,7 +226,7 @@ def make_scripted(name: str, vec: MultiliftVec) -> Policy:
 
     Raises:
         ConfigError: there is no such script, or the environments have another action interface than scripts have, or
-            do not tell it what it needs; or see `OwnPolicy`.
+            do not observe what it needs; or see `OwnPolicy`.
     """
     if ":" in name:
         return OwnPolicy(name, vec)

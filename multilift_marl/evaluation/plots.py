@@ -86,7 +86,7 @@ def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
     Args:
         path: of the PNG; its folder is made.
         rows: lines of metrics.csv, numbers or their text; an empty or missing value is left out. Thin lines are
-            episodes flown with exploration, dots the evaluations of the deterministic policy.
+            episodes with exploration, dots the evaluations of the deterministic policy.
     """
     rows = list(rows)
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")

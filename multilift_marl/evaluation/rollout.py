@@ -1,4 +1,4 @@
-"""Fly whole episodes with a policy and measure them: the raw numbers of every report."""
+"""Simulate whole episodes with a policy and measure them: the raw numbers of every report."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
     observation, _ = vec.reset(seed=seed)
     policy.reset()
     running = np.ones(e, bool)
-    total, length, settling = np.zeros(e), np.zeros(e), np.zeros(e)
-    square, counted, change = np.zeros((6, e)), np.zeros(e), np.zeros(e)
+    total, length, settling, counted, change = np.zeros((5, e))
+    square = np.zeros((6, e))
     final_distance, final_angle, final_tilt, final_steps = np.zeros((4, e))
     result = {name: np.zeros(e) for name in _AT_END}
     result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
@@ -108,15 +108,18 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
             running &= ~ended
         if not running.any():
             break
-        if (over := terminated | truncated).any():  # their later episodes are flown, but not counted
+        if (over := terminated | truncated).any():  # their later episodes do not count
             observation, _ = vec.reset(mask=over)
             policy.reset(over)
             previous[over] = 0.0
-    failed, steps = result["failure_cause"] > 0, np.maximum(final_steps, 1)
-    limit, rms = vec.max_steps * dt, np.sqrt(square / np.maximum(counted, 1))
+    failed = result["failure_cause"] > 0
+    steps = np.maximum(final_steps, 1)
+    limit = vec.max_steps * dt
+    rms = np.sqrt(square / np.maximum(counted, 1))
     if vec.num_drones == 1:
         del result["min_separation_m"]
-    distance, angle = final_distance / steps, final_angle / steps
+    distance = final_distance / steps
+    angle = final_angle / steps
     return result | {
         "precise_rate": ~failed & (distance <= PRECISE[0]) & (angle <= PRECISE[1]),
         "payload_position_error_m": np.where(failed, MAX_DISTANCE, distance),

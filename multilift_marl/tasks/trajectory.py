@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl._jit import inlined, kernel
-from multilift_marl.control.cable_forces import drone_offset, place_slots, spread
+from multilift_marl.control.cable_forces import distribute_wrench, drone_offset, place_slots
 from multilift_marl.control.formation import hook_arm, place_formation, wrap
 from multilift_marl.math3d import (
     add,
@@ -230,7 +230,7 @@ def evaluate_plan(e, v, dt):
         put(planned.cable_force[e, n], cable_force)
         force = sub(force, cable_force)
         moment = sub(moment, cross(mul(attitude, row(rig.anchors, n)), cable_force))
-    linear, angular = spread(force, moment, attitude, v.settings.distribution)
+    linear, angular = distribute_wrench(force, moment, attitude, v.settings.distribution)
 
     # slots where the drones exert these forces, and their motion by differences
     moved = sub(position, before)

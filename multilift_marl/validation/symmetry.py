@@ -9,9 +9,17 @@ import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
-from multilift_marl.control.formation import Goal, Reference, make_rig, place_formation, start_reference
+from multilift_marl.control.formation import (
+    Goal,
+    Reference,
+    Smoothing,
+    make_rig,
+    place_formation,
+    smooth,
+    start_reference,
+)
 from multilift_marl.control.gains import make_gains
-from multilift_marl.control.geometric import control
+from multilift_marl.control.geometric import fly
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Plot, Result
 
@@ -149,10 +157,11 @@ def controller(config: Config, world: World, target: np.ndarray, yaw: float = 0.
     reference.command[:] = goal.slots
     reference.command_yaw[:] = yaw
     gains = make_gains(option, system)
-    smoothing = option.reference_frequency, option.reference_speed, 1 / config.sim.control_hz
+    smoothing = Smoothing(option.reference_frequency, option.reference_speed, 1 / config.sim.control_hz)
 
     def steer() -> None:
-        control(0, 1, world.state, reference, goal.cable_force, world.thrust, gains, *smoothing)
+        smooth(0, 1, reference, smoothing)
+        fly(0, 1, world.state, reference, goal.cable_force, world.thrust, gains)
 
     return steer
 

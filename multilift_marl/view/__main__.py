@@ -5,12 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from typing import Any
+from typing import Annotated, Any
 
-from multilift_marl.cli.common import run_command, whole_number
-from multilift_marl.cli.policies import NamedPolicy, find_policy
+from pydantic import Field
+
+from multilift_marl.agents.policy import NamedPolicy, find_policy, load_policy
+from multilift_marl.cli.common import run_command, split_options
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.values import Between, Int, Section
 from multilift_marl.control.scripted import SCRIPTED
 from multilift_marl.view.page import HOST, Page
 from multilift_marl.view.session import Session
@@ -19,26 +22,27 @@ _USAGE = f"""Watch a team in the browser, at an address of this machine alone ({
 
   python -m multilift_marl.view task=hover run=hover [key=value ...]
 
-  task    a configuration's name or path                      (the run's own, or hover)
-  config  a rig or other configuration for that task; its vehicles, payload, cables and control are used, see
-          python train.py --help
-  run     a run folder, "latest", or the name of a shipped policy ("hover"); none: scripts only
-  policy  which controls first: run, a script, module:Class, an exported policy (.onnx), a checkpoint (.pt)
-                                                              (run, or formation)
-  import  a module of yours with tasks or vehicles (docs/plugins.md)
-  seed    evaluation seed: the episodes are those of evaluate.py        (1000)
-  port    of the address; 0 for any free one                  (8080)
-
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, cable.model=chain."""
 
-_DEFAULTS = {"task": None, "config": None, "run": None, "policy": None, "seed": 1000, "port": 8080}
+
+class Options(Section):
+    """Keys of the command beside those of the configuration."""
+
+    task: str | None = Field(None, description="a configuration's name or path; None: the run's own, or hover")
+    config: str | None = Field(
+        None, description="a rig or other configuration for that task, see python train.py --help"
+    )
+    run: str | None = Field(None, description='a run folder, "latest", or a shipped policy ("hover"); None: scripts')
+    policy: str | None = Field(
+        None, description="the first: run, a script, module:Class, .onnx, .pt; None: run, or formation"
+    )
+    seed: Int = Field(1000, ge=0, lt=2**63, description="evaluation seed: the episodes are those of evaluate.py")
+    port: Annotated[Int, Between(0, 65535)] = Field(8080, description="of the address; 0 for any free one")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until interrupted; return the exit status."""
-    return run_command(
-        _view, _USAGE, _DEFAULTS, arguments, configuration="task", names=("task", "config", "run", "policy")
-    )
+    return run_command(_view, _USAGE, Options, arguments, configuration="task")
 
 
 def _view(values: dict[str, Any]) -> int:
@@ -56,35 +60,25 @@ def make_session(values: dict[str, Any]) -> tuple[Session, int]:
     Raises:
         ConfigError, CheckpointError: a wrong value, or there is no such task, run or policy.
     """
-    own = {key: values.pop(key, default) for key, default in _DEFAULTS.items()}
-    for key, most in (("seed", 2**63 - 1), ("port", 65535)):
-        own[key] = whole_number(key, own[key], 0, most)
+    options, overrides = split_options(Options, values)
     learned: dict[str, NamedPolicy] = {}
-    if own["run"] is not None:
-        learned["run"] = _load(str(own["run"]))
-    policy = str(own["policy"]) if own["policy"] is not None else "run" if learned else None
+    if options.run is not None:
+        learned["run"] = load_policy(options.run)
+    policy = "run" if learned and options.policy is None else options.policy
     if policy is not None and policy not in ("run", *SCRIPTED):
         learned[policy] = find_policy(policy, others=learned)
-    config = _find_config(own, learned, {**values, "env.num_envs": 1, "env.num_threads": 1})
-    return Session(config, learned, policy, own["seed"]), own["port"]
+    config = _find_config(options, learned, {**overrides, "env.num_envs": 1, "env.num_threads": 1})
+    return Session(config, learned, policy, options.seed), options.port
 
 
-def _find_config(own: dict[str, Any], learned: dict[str, NamedPolicy], overrides: dict[str, Any]) -> Config:
-    task = own["task"]
-    config = own["config"]
-    if config is not None:
-        return load_config(str(config), overrides if task is None else {**overrides, "task": task})
+def _find_config(options: Options, learned: dict[str, NamedPolicy], overrides: dict[str, Any]) -> Config:
+    task = options.task
+    if options.config is not None:
+        return load_config(options.config, overrides if task is None else {**overrides, "task": task})
     trained = [policy.config for policy in learned.values() if policy.config is not None]
     if task is None and trained:
         return build_config(trained[0].model_dump(), overrides)
-    return load_config("hover" if task is None else str(task), overrides)
-
-
-def _load(run: str) -> Any:
-    from multilift_marl.agents.checkpoint import find_run
-    from multilift_marl.agents.policy import load_policy, shipped_policies
-
-    return load_policy(run if run in shipped_policies() else find_run(run))
+    return load_config("hover" if task is None else task, overrides)
 
 
 if __name__ == "__main__":
