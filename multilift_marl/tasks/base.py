@@ -271,7 +271,7 @@ class Task:
 
     def _compose(self) -> dict[str, Call]:
         """Return the stages of a step that are the task's, each a call of (lo, hi)."""
-        v, kernels, n, size = self.view, self.KERNELS, self.world.num_drones, self.action.shape[2]
+        v, kernels, size = self.view, self.KERNELS, self.action.shape[2]
         check = compose_check(kernels.check)
         stages = {
             "measure": self._bind(check, v, 0.0),
@@ -282,7 +282,7 @@ class Task:
             "observe": self._bind(compose_observation(self.EXTRA, size), v, self.observation),
         }
         true = v._replace(seen=v.state, seen_errors=v.errors)
-        stages["observe state"] = self._bind(compose_state(self.EXTRA_STATE, kernels.look, n, size), true, self.critic)
+        stages["observe state"] = self._bind(compose_state(self.EXTRA_STATE, kernels.look, size), true, self.critic)
         if kernels.plan is not None:
             stages["plan"] = self._bind(compose_plan(kernels.plan), v)
         return stages

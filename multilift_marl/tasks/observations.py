@@ -328,27 +328,26 @@ def compose_observation(extra: tuple[Component, ...], action_size: int) -> Any:
     return compose("observe", "\n".join(lines) + "\n", functions)
 
 
-def compose_state(
-    extra: tuple[Component, ...], look: Callable[..., Any] | None, num_drones: int, action_size: int
-) -> Any:
+def compose_state(extra: tuple[Component, ...], look: Callable[..., Any] | None, action_size: int) -> Any:
     """Return the kernel of (lo, hi, View, critic (E, S)) that writes the global state, in the target's heading frame.
 
     Args:
         extra: what the task adds at the end.
         look: inlined kernel of (e, View), called first; None for none.
-        num_drones, action_size: N, A.
+        action_size: numbers of an action.
     """
     functions: dict[str, Any] = {"turn": turn, "cos": cos, "sin": sin} | ({"look": look} if look else {})
-    first, rows, size = drone_numbers(num_drones, action_size)
+    first, _, size = drone_numbers(0, action_size)
     drone = _write("out", "at + ", "n", DRONE_STATE, functions)
     drone += [f"out[at + {size - action_size + k}] = v.action[e, n, {k}]" for k in range(action_size)]
     lines = ["def observe_state(lo, hi, v, critic):", "    for e in range(lo, hi):", "        out = critic[e]"]
     lines += ["        look(e, v)"] if look else []
     lines.append("        c, s = cos(v.goal.yaw[e]), -sin(v.goal.yaw[e])")  # world to the target's heading frame
     lines += [f"        {line}" for line in _write("out", "", "0", STATE, functions)]
-    lines += [f"        for n in range({rows}):", f"            at = {first} + n * {size}"]
+    lines += ["        for n in range(v.action.shape[1]):", f"            at = {first} + n * {size}"]
     lines += [f"            {line}" for line in drone]
-    lines += [f"        {line}" for line in _write("out", f"{first + rows * size} + ", "0", extra, functions)]
+    lines.append(f"        at = {first} + v.action.shape[1] * {size}")
+    lines += [f"        {line}" for line in _write("out", "at + ", "0", extra, functions)]
     return compose("observe_state", "\n".join(lines) + "\n", functions)
 
 
