@@ -1,10 +1,7 @@
 """A task of one's own, complete: the team lifts its payload by a metre and holds it there.
 
-Everything else (APIs, seeding, failures, observations, training, evaluation) works by itself. In the package, `Lift`
-would be a file in multilift_marl/tasks/ with a line in tasks/__init__.py, and CONFIG a file configs/lift.yaml.
-
-Run: python examples/new_task.py
-     python train.py import=examples/new_task.py config=lift
+In the package, `Lift` would be a file in multilift_marl/tasks/ with a line in its __init__.py, CONFIG one in configs/.
+Run: python examples/new_task.py, or python train.py import=examples/new_task.py config=lift
 """
 
 from pydantic import Field

@@ -163,7 +163,7 @@ def test_wrong_values_are_named_and_quoted(key, value, complaint):
         ("control.max_acceleration", 1e4, "must be from 0 to 1000 m/s²"),
         ("control.max_tilt_rate", 1e4, "must be from 0 to 100 rad/s"),
         ("control.max_offset", 1e4, "must be from 0 to 100 m"),
-        ("reward.position", 1e300, "must be from -1e+06 to 1e+06"),
+        ("reward.position.weight", 1e300, "must be from -1e+06 to 1e+06"),
     ],
 )
 def test_numbers_that_no_flight_can_have_are_named_with_their_bounds_and_unit(key, value, complaint):
@@ -197,7 +197,7 @@ def test_what_the_time_step_cannot_follow_is_refused(overrides, culprit, cure):
 
 @pytest.mark.parametrize("value", ["much", True, math.nan])
 def test_wrong_weight_names_its_reward_term(value):
-    assert "reward.position must be a" in refuse_values(reward__position=value)
+    assert "reward.position.weight must be a" in refuse_values(reward__position=value)
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,8 @@ def test_mappings_add_and_an_empty_one_empties(write, key):
 
     def found(*arguments):
         values = load_config(path, parse_overrides(arguments)).model_dump()[section]
-        return values[name] if name else values
+        values = values[name] if name else values
+        return {key: value["weight"] if section == "reward" else value for key, value in values.items()}
 
     assert found() == {"position": 2.0}
     assert found(f"{key}={{precision: 1.0}}") == {"position": 2.0, "precision": 1.0}

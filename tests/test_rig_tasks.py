@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from conftest import refusal
 
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.config.load import load_config
@@ -36,3 +37,27 @@ def test_a_task_alone_is_its_configuration(tmp_path, monkeypatch):
     assert evaluate(["policy=formation", "task=track", "baseline=none", "episodes=2", "env.episode_seconds=0.2"]) == 0
     report = json.loads(next(tmp_path.glob("runs/formation-track/eval/*/metrics.json")).read_text())
     assert report["config"]["train"] == load_config("track").model_dump(mode="json")["train"]
+
+
+def test_a_configuration_states_only_what_differs_from_its_bases(tmp_path):
+    (tmp_path / "heavy.yaml").write_text("payload: {mass: 2.0}\nenv: {episode_seconds: 3.0}\ntask: hover\n")
+    (tmp_path / "own.yaml").write_text("base: [pose, heavy.yaml]\ncontrol: {max_offset: 0.2}\n")
+    config = load_config(tmp_path / "own.yaml")
+    assert (config.task, config.payload.mass, config.control.max_offset) == ("pose", 2.0, 0.2)
+    assert config.env.episode_seconds == 12.0  # of a base with another task the system counts alone
+    assert config.train == load_config("pose").train
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("base: own.yaml\n", "is based on own.yaml, which is based on it"),
+        ("base: [third.yaml]\n", "is based on own.yaml, which is based on it"),
+        ("base: hoover\n", "no configuration named 'hoover'"),
+        ("base: 3\n", "must be the name of a configuration or a list of names, but is 3"),
+    ],
+)
+def test_bases_that_cannot_be_are_refused(tmp_path, content, complaint):
+    (tmp_path / "own.yaml").write_text(content)
+    (tmp_path / "third.yaml").write_text("base: own.yaml\n")
+    assert complaint in refusal(load_config, tmp_path / "own.yaml")

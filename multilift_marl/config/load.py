@@ -60,6 +60,9 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
     its place, and of `name` only the system counts, which goes over it: env.num_drones, sim, vehicle, payload, cable,
     control and wind. So a rig can be given any task.
 
+    A configuration may name others below it, `base: rigs/auto6` or a list: its own values go over theirs; of bases with
+    another task only the system counts.
+
     Args:
         name: a shipped configuration's name, one's own, or the path of a YAML file.
         overrides: values by dotted name, such as {"payload.mass": 2.0}; mappings add to what is there, but an empty one
@@ -227,13 +230,14 @@ def _leaves(section: type[Section], prefix: str) -> Iterator[tuple[str, Any, str
             yield prefix + name, field.default, field.description or ""
 
 
-def _read(name: str | Path) -> dict[str, Any]:
+def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return the values of a configuration with those of its bases below them; `above` names what is based on it."""
     path = Path(name)
     try:
         if not is_yaml(path):
             path = config_dir() / f"{name}.yaml"
             if not path.is_file():
-                return _read_own(str(name))
+                return _read_own(str(name), above)
         values = read_yaml(path)
     except ConfigError:
         raise
@@ -241,17 +245,49 @@ def _read(name: str | Path) -> dict[str, Any]:
         raise ConfigError(f"no configuration file {path}: give the path of a YAML file or a shipped name") from None
     except (OSError, ValueError) as error:  # ValueError: what is no YAML, and names with a NUL
         raise ConfigError(f"cannot read {shorten(path, 300)} as YAML: {reason(error)}") from None
-    return _locate(as_mapping(values, path, "sections such as 'env:'"), path.absolute().parent)
+    folder = path.absolute().parent
+    return _add_bases(_locate(as_mapping(values, path, "sections such as 'env:'"), folder), folder, (*above, str(path)))
 
 
-def _read_own(name: str) -> dict[str, Any]:
+def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> dict[str, Any]:
+    """Return the values of `base`, one configuration or several, with a configuration's own `values` over them.
+
+    The task is its own, else that of its first base; bases with another task give their system only.
+
+    Args:
+        values: of a configuration.
+        folder: of its file, where bases that are files are looked for.
+        above: the configurations that led here, itself the last.
+
+    Raises:
+        ConfigError: no name, an unknown one, or a configuration that is its own base.
+    """
+    own = dict(values)
+    names = own.pop("base", [])
+    names = [names] if isinstance(names, str) else names
+    if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
+        raise ConfigError(
+            f"base in {above[-1]} must be the name of a configuration or a list of names, but is {names!r}"
+        )
+    merged: dict[str, Any] = {}
+    for name in names:
+        source = str(folder / name) if is_yaml(name) else str(config_dir() / f"{name}.yaml")
+        if source in above or name in above:
+            raise ConfigError(f"{above[-1]} is based on {name}, which is based on it; take one of the two bases out")
+        part = _read(folder / name if is_yaml(name) else name, above)
+        task = own.get("task", merged.get("task", part.get("task")))
+        merged = _merge(merged, part if part.get("task") == task else _system_part(part))
+    return _merge(merged, own)
+
+
+def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
     """Return the values of a registered configuration."""
     if name not in CONFIGS:
         load_entry_points()
     if name not in CONFIGS:
         raise ConfigError(f"no configuration named '{shorten(name)}'{nearest(name, [*list_configs(), *CONFIGS])}")
     source = CONFIGS[name]
-    return _read(source) if isinstance(source, Path) else dict(source)
+    return _read(source, above) if isinstance(source, Path) else _add_bases(dict(source), Path(), (*above, name))
 
 
 def _read_preset(task: Any) -> dict[str, Any]:

@@ -57,12 +57,13 @@ def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) 
 
 def _find_key(location: tuple[Any, ...], model: type[Section]) -> tuple[type[Section], list[str]]:
     """Return the section and the path of the key in pydantic's location, which goes on into unions and lists."""
-    section, path = model, []
-    for part in map(str, location):
-        path.append(part)
-        annotation = section.model_fields[part].annotation if part in section.model_fields else None
-        if typing.get_origin(annotation) is dict and len(location) > len(path):
-            return section, [*path, str(location[len(path)])]
+    section, path, parts = model, [], [str(part) for part in location]
+    while parts:
+        path.append(parts.pop(0))
+        annotation = section.model_fields[path[-1]].annotation if path[-1] in section.model_fields else None
+        if typing.get_origin(annotation) is dict and parts:  # of names that are free
+            path.append(parts.pop(0))
+            annotation = typing.get_args(annotation)[1]
         if not (isinstance(annotation, type) and issubclass(annotation, Section)):
             break
         section = annotation

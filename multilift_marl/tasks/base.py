@@ -129,7 +129,7 @@ class Task:
             raise ConfigError(f"task {self.name} needs more drones; raise env.num_drones to {self.MIN_DRONES} or more")
         self.config, self.world, self.reference, self._sensing = config, world, reference, sensing
         self.options = validate(self.Options, config.task_options, "task_options")
-        self.weights, self.margins = resolve_reward(self.REWARD, config.reward)
+        self.weights, self.margins = resolve_reward(self.name, self.REWARD, config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
         self.planned = self.goal
@@ -318,8 +318,10 @@ def compose_plan(plan: Callable[..., Any]) -> Callable[..., Any]:
     return compose("advance_plan", source, {"plan": plan})
 
 
-def resolve_reward(terms: Mapping[str, Term], values: Mapping[str, RewardTerm]) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (T,) and margins (T, M) of reward terms, angles in radians, with configured `values` in place.
+def resolve_reward(
+    task: str, terms: Mapping[str, Term], values: Mapping[str, RewardTerm]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (T,) and margins (T, M) of a task's terms, angles in radians, with configured `values` in place.
 
     Raises:
         ConfigError: an unknown term, or another number of margins than it has.
@@ -327,7 +329,7 @@ def resolve_reward(terms: Mapping[str, Term], values: Mapping[str, RewardTerm]) 
     for name, given in values.items():
         if name not in terms:
             hint = nearest(name, terms, lambda near: f"reward.{near}")
-            raise ConfigError(f"unknown key 'reward.{name}'{hint}")
+            raise ConfigError(f"unknown key 'reward.{name}' of task {task}{hint}")
         count = len(terms[name].margins)
         if given.margin is not None and len(given.margin) != count:
             raise ConfigError(f"reward.{name}.margin lists {len(given.margin)} numbers, but the term has {count}")
