@@ -213,3 +213,13 @@ def test_a_team_trains_with_the_interface(tmp_path, action):
 def test_training_on_a_script_with_another_interface_is_refused(tmp_path):
     message = refusal(make_trainer, tmp_path, **{"control.action": "ctbr", "train.residual": "formation_integral"})
     assert "train.residual=formation" in message
+
+
+def test_the_yaw_of_a_reference_is_each_drones_own():
+    vec = make("hover", num_envs=2, num_drones=3)
+    vec.reset(seed=0)
+    action = zeros(vec)
+    action[1, 2, 3] = 0.5
+    vec.step(action)
+    commanded = vec.reference.command_yaw - vec.task.goal.drone_yaw[:, None]
+    np.testing.assert_allclose(commanded, 0.5 * vec.config.control.max_yaw * (action[..., 3] > 0), atol=1e-12)

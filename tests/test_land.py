@@ -7,8 +7,9 @@ import pytest
 from conftest import make, zeros
 from test_scripted_flights import fly_once
 
+from multilift_marl.config.load import load_config
 from multilift_marl.control.scripted import make_scripted
-from multilift_marl.tasks.land import AIRBORNE, CRASHED, LANDED, LOWER, RELEASE
+from multilift_marl.tasks.land import AIRBORNE, CRASHED, LANDED, LOWER, NEAR, RELEASE, SETTLE
 
 CALM = {"randomization.payload_mass": 0.0}
 
@@ -161,3 +162,13 @@ def test_in_return_motors_off_lose_to_staying_high_to_the_formation_to_its_integ
     assert off < 0.2 * high
     assert high < 0.8 * formation
     assert formation < integral
+
+
+def test_the_slow_last_part_of_the_descent_scales_with_the_vehicle():
+    vec = make(load_config("rigs/crazyflie2", {"task": "land"}), num_envs=1)
+    vec.reset(seed=0)
+    task, ground = vec.task, vec.task.settings.ground
+    while task.time[0] < SETTLE[0] - 0.5 * task.control_dt:
+        task.stages["plan"](0, 1)
+    assert ground.size < 0.5
+    assert task.goal.position[0, 2] - ground.payload == pytest.approx(NEAR * ground.size, rel=1e-6)

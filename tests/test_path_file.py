@@ -11,7 +11,7 @@ import multilift_marl as ml
 from multilift_marl.config.files import pin_file
 from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.control.scripted import make_scripted
-from multilift_marl.tasks.path_file import read_rows, thin_rows
+from multilift_marl.tasks.path_file import _sample_all, read_rows, thin_rows
 from multilift_marl.tasks.spline import fit_spline, sample_spline, spline_place, spline_yaw
 
 LENGTH = 8.0  # [s]
@@ -285,3 +285,10 @@ def test_an_episode_goes_on_from_saved_state(tmp_path):
     for _ in range(30):
         one, two = first.step(zeros(first))[0], second.step(zeros(second))[0]
     assert (one == two).all()
+
+
+def test_a_path_is_checked_all_along():
+    rows = np.array([[0.0, 0, 0, 1, 0], [1.0, 1, 0, 1, 0], [3.0, 2, 0, 1, 0], [3.5, 2, 1, 1, 0]])
+    t, motion = _sample_all(fit_spline(rows))
+    assert (np.diff(t) > 0).all() and t[0] == 0.0 and t[-1] == 3.5 and motion.shape[1] == len(t)
+    assert np.diff(t).max() <= 2.0 / 8

@@ -188,3 +188,16 @@ def test_a_masked_reset_leaves_the_memory_of_others_alone():
             vec.reset(mask=mask(3, 1))
         one, other = vec.step(zeros(vec)), calm.step(zeros(calm))
         assert same(one[0][[0, 2]], other[0][[0, 2]])
+
+
+def test_measured_attitudes_are_the_true_ones_turned_by_standard_noise():
+    vec = make("hover", num_envs=100, **{"randomization.observation_noise": "standard"})
+    vec.reset(seed=0)
+    true, seen = vec.world.state, vec.task.view.seen
+    for name in ("drone_rotation", "payload_rotation"):
+        turned = getattr(seen, name) @ np.swapaxes(getattr(true, name), -1, -2)
+        np.testing.assert_allclose(
+            turned @ np.swapaxes(turned, -1, -2), np.broadcast_to(np.eye(3), turned.shape), atol=1e-12
+        )
+        off = np.stack([turned[..., 2, 1], turned[..., 0, 2], turned[..., 1, 0]])
+        assert 0.008 < off.std() < 0.012

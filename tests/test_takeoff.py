@@ -10,7 +10,9 @@ from test_scripted_flights import fly_once
 import multilift_marl as ml
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.math3d import axis_angle
-from multilift_marl.tasks.takeoff import ARRIVED, FLYING, LIFT, LIFTED, PULL, STANDING, TIGHTEN
+from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.tasks.ground import resting_distance
+from multilift_marl.tasks.takeoff import ARRIVED, FLYING, LIFT, LIFTED, PULL, RESTING, TIGHTEN
 
 CALM = {"randomization.payload_mass": 0.0}
 
@@ -114,7 +116,7 @@ def cause(vec) -> str:
 
 def test_drones_may_touch_the_ground_until_they_fly():
     vec = after(0.2)
-    assert vec.task.own.stage[0] == STANDING and cause(vec) == "none"
+    assert vec.task.own.stage[0] == RESTING and cause(vec) == "none"
     vec = after(TIGHTEN[0])
     assert vec.task.own.stage[0] == FLYING and cause(vec) == "none"
     vec.world.state.drone_position[0, 1, 2] = 0.03
@@ -186,3 +188,16 @@ def test_in_return_motors_off_lose_to_standing_by_to_the_formation_to_its_integr
     assert off < 0.35 * formation
     assert off < low < 0.8 * formation
     assert formation < 0.97 * integral
+
+
+def test_drones_rest_at_their_slots_distance_or_clear_of_the_payload():
+    narrow = make("takeoff").world.system
+    np.testing.assert_allclose(resting_distance(narrow, 0.0), np.hypot(narrow.slots[:, 0], narrow.slots[:, 1]))
+    wide = make("takeoff", **{"payload.size": [1.6, 1.2, 0.1], "cable.length": 3.0, "cable.angle": 0.0}).world.system
+    clear = 1.0 + 1.5 * wide.vehicle.arm + 0.2  # half the diagonal, the drone's reach, the spread
+    np.testing.assert_allclose(resting_distance(wide, 0.2), clear)
+    level = clear - np.hypot(*wide.anchors[0, :2]) + 0.2
+    said = refusal(make, "takeoff", **{"payload.size": [1.6, 1.2, 0.1], "cable.length": 0.6, "cable.angle": 0.0,
+                                      "task_options.start_spread": 0.2 / 0.6})  # fmt: skip
+    height = 0.05 + 0.05 - drone_half_size(wide.vehicle)[2]
+    assert f"takes {np.hypot(level, height) / 0.6:.2f} of its length" in said
