@@ -14,7 +14,7 @@ UNPAID = 0.1  # a weight for terms that have none by default
 
 
 def unpaid(task: str) -> dict[str, float]:
-    return {f"reward.{name}": UNPAID for name, weight in find_task(task).REWARD.items() if weight == 0}
+    return {f"reward.{name}": UNPAID for name, term in find_task(task).REWARD.items() if term.weight == 0}
 
 
 @pytest.fixture(scope="module", params=product(TASKS, CABLES), ids="-".join)
@@ -83,8 +83,8 @@ def test_a_weight_scales_its_term_and_no_other(task, cables):
         return info["reward_terms"]
 
     plain = terms()
-    for name, weight in find_task(task).REWARD.items():
-        heavier = terms(**{f"reward.{name}": 3 * (weight or UNPAID)})
+    for name, term in find_task(task).REWARD.items():
+        heavier = terms(**{f"reward.{name}": 3 * (term.weight or UNPAID)})
         for other in plain:
             factor = 3 if other == name else 1
             np.testing.assert_allclose(heavier[other], factor * plain[other], rtol=1e-12)

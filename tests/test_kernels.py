@@ -184,7 +184,7 @@ RECORD = """
 from typing import NamedTuple
 import numpy as np
 from multilift_marl._jit import kernel
-from multilift_marl.tasks.hover import record
+from multilift_marl.tasks.starts import record
 
 class Pair(NamedTuple):
     FIELDS
@@ -195,7 +195,7 @@ print(record(Pair(1.0, 2.0)))
 
 def test_a_kernel_is_compiled_for_the_order_of_a_records_fields(package, tmp_path):
     """The type of a named tuple states the types of its fields, not their names."""
-    with open(package / "tasks" / "hover.py", "a", encoding="utf-8") as file:
+    with open(package / "tasks" / "starts.py", "a", encoding="utf-8") as file:
         file.write("\n\n@kernel\ndef record(pair):\n    return pair.left - pair.right\n")
     for fields, expected in (("left: float; right: float", -1.0), ("right: float; left: float", 1.0)):
         (tmp_path / "pair.py").write_text(RECORD.replace("FIELDS", fields))

@@ -118,8 +118,8 @@ def test_documents_name_everything_about_a_task(task):
     for text, parts in ((common, OBSERVATION), (own, kind.EXTRA)):
         for part in parts:
             assert f"| `{part.name}` | {part.size} | {part.frame} | {part.unit} | {part.meaning} |" in text, part.name
-    for term, weight in kind.REWARD.items():
-        assert f"| `{term}` | {weight:g} |" in own, term
+    for term, entry in kind.REWARD.items():
+        assert f"| `{term}` | {entry.weight:g} |" in own, term
     for option in kind.Options.model_fields:
         assert f"`{option}`" in own, option
     for cause in CAUSES[1:]:

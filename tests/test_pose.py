@@ -65,9 +65,9 @@ def test_a_new_target_comes_every_four_seconds_and_is_not_seen_before():
     other.task.own.plan.pose[:, 2:, :5] += 0.1
     for step in range(200):
         other.step(zeros(other))
-        assert same(other._observation, seen[step])
+        assert same(other.task.observation, seen[step])
     other.step(zeros(other))
-    assert not same(other._observation[..., told], seen[200][..., told])
+    assert not same(other.task.observation[..., told], seen[200][..., told])
 
 
 def test_the_payload_settles_at_every_target():
@@ -163,7 +163,7 @@ def test_observations_tell_where_the_way_is_and_how_much_time_is_left():
     assert np.linalg.norm(planned.velocity, axis=1).min() > 0.1
     for name, (x, y, z) in (("position", (planned.position - goal.position).T), ("velocity", planned.velocity.T)):
         x, y, z = x[:, None], y[:, None], np.broadcast_to(z[:, None], c.shape)
-        at, expected = names.index(f"way_{name}_0"), np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
+        at, expected = names.index(f"planned_{name}_0"), np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
         np.testing.assert_allclose(vec.task.observation[..., at : at + 3], expected, atol=1e-5)
     assert names[-1] == "time_left_0"
     np.testing.assert_allclose(vec.task.observation[..., -1], 1 - (230 - 200) / 200, atol=1e-6)

@@ -26,7 +26,9 @@ def spoiled(array, value):
     return array
 
 
-@pytest.mark.parametrize("key", ["world.rows", "reference.position", "_observation", "task.time", "world.air.filter"])
+@pytest.mark.parametrize(
+    "key", ["world.rows", "reference.position", "task.observation", "task.time", "world.air.filter"]
+)
 @pytest.mark.parametrize(
     ("spoil", "complaint"),
     [

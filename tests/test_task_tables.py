@@ -13,6 +13,7 @@ from multilift_marl.config.load import load_config
 from multilift_marl.tasks import TASKS
 from multilift_marl.tasks.hover import Hover
 from multilift_marl.tasks.observations import Component, own_velocity
+from multilift_marl.tasks.rewards import describe
 
 ROOT = Path(__file__).parents[1]
 
@@ -122,8 +123,7 @@ def reward_table() -> str:
         for term, entry in kind.REWARD.items():
             margins = ", ".join(f"{margin:g}" for margin in entry.margins)
             unit = f" {entry.unit}" if margins and entry.unit != "-" else ""
-            meaning = entry.value.__doc__.strip().rstrip(".")
-            lines.append(f"| `{name}` | `{term}` | {entry.weight:g} | {margins}{unit} | {meaning} |")
+            lines.append(f"| `{name}` | `{term}` | {entry.weight:g} | {margins}{unit} | {describe(entry.value)} |")
     return "\n".join(lines)
 
 

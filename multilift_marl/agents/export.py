@@ -180,7 +180,8 @@ def _describe_observation(policy: LearnedPolicy) -> dict[str, Any]:
     config, size = policy.config, len(policy.observation_names)
     parts, at = [], 0
     for part in list_components(len(policy.action_names), find_task(config.task).EXTRA):
-        parts.append({"first": at, **part._asdict()})
+        described = {key: getattr(part, key) for key in ("name", "size", "frame", "unit", "meaning")}
+        parts.append({"first": at, **described})
         at += part.size
     return {
         "shape": ["batch", "drones", size],

@@ -12,6 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from multilift_marl._interrupt import end_quiet_import
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import check_names, explain, load_config, parse_overrides
@@ -20,6 +22,8 @@ from multilift_marl.config.values import Section
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install, reason, shorten
 from multilift_marl.plugins import import_modules
 from multilift_marl.tasks import find_task, list_tasks
+from multilift_marl.tasks.base import resolve_reward
+from multilift_marl.tasks.rewards import describe
 
 Options = TypeVar("Options", bound=Section)
 _EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  # of all other packages: train
@@ -144,10 +148,18 @@ def _explain_configuration(values: dict[str, Any], own: Iterable[str], key: str)
     for name in list_tasks() if config is None else [config.task]:
         task = find_task(name)
         options = task.Options if config is None else validate(task.Options, config.task_options, "task_options")
-        weights = task.REWARD | ({} if config is None else config.reward)
         lines.append(f"\nTask {name}:\n{explain(options, 'task_options.')}")
-        lines += [f"  {f'reward.{term}':<32} {weight:<14} weight" for term, weight in weights.items()]
+        weights, margins = resolve_reward(name, task.REWARD, {} if config is None else config.reward)
+        for (term, entry), weight, margin in zip(task.REWARD.items(), weights, margins, strict=True):
+            lines.append(f"  {f'reward.{term}.weight':<32} {weight:<14g} [-] {describe(entry.value)}")
+            if count := len(entry.margins):
+                chosen = np.degrees(margin[:count]) if entry.unit == "deg" else margin[:count]
+                lines.append(f"  {f'reward.{term}.margin':<32} {_plain(chosen):<14} [{entry.unit}] at which it is half")
     return "\n".join(lines)
+
+
+def _plain(numbers: np.ndarray) -> str:
+    return str([float(f"{number:.6g}") for number in numbers])
 
 
 def title(values: Mapping[str, Any]) -> str:

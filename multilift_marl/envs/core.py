@@ -79,8 +79,7 @@ class MultiliftVec:
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
         self._checked = False  # whether all components were seen to be written
-        teams = Teams(self.world, self.controller, self.task, self._sensing, self._stacked)
-        self._pipelines = {shard.lo: Pipeline(teams, shard, self.control_ticks) for shard in self.world.shards}
+        self._bind()
         self._first_sense = self._sensing.bind_sense(self.task.view, 0.0) if self._sensing.has_noise else None
         delays = self._sensing.delays_observation
         self._first_delay = self._sensing.bind_delay(observation) if delays else None
@@ -241,11 +240,18 @@ class MultiliftVec:
         self.steps[mask], self._ended[mask] = 0, False
         for e in chosen:
             self.controller.start(e)
+            if not self._checked:  # NaN stands for what is not written
+                self.task.observation[e] = self.task.critic[e] = np.nan
             self._observe(e)
             if not self._checked:
                 self.task.check_written(e)
                 self._checked = True
             self._stacked[e] = np.tile(self.task.observation[e], self.config.env.history)
+
+    def _bind(self) -> None:
+        """Build the stages of every shard, from the controller and the task as they are."""
+        teams = Teams(self.world, self.controller, self.task, self._sensing, self._stacked)
+        self._pipelines = {shard.lo: Pipeline(teams, shard, self.control_ticks) for shard in self.world.shards}
 
     def _observe(self, e: int) -> None:
         """Write the first observation and global state of an episode."""

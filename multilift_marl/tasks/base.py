@@ -137,8 +137,8 @@ class Task:
         self.nominal_hanging = self.hanging = make_hanging(system)
         size = sensing.action_size
         self.action, self.previous = np.zeros((2, e, n, size))
-        self.observation = np.full((e, n, sensing.observation_size), np.nan, np.float32)  # see `check_written`
-        self.critic = np.full((e, state_size(n, size, self.EXTRA_STATE)), np.nan, np.float32)
+        self.observation = np.zeros((e, n, sensing.observation_size), np.float32)
+        self.critic = np.zeros((e, state_size(n, size, self.EXTRA_STATE)), np.float32)
         self.cause, self.time, self.good_time, self.min_separation = np.zeros(e, np.int64), *np.zeros((3, e))
         self.terms = np.zeros((e, len(self.REWARD)))
         self.rmse_after = 0.0

@@ -37,9 +37,14 @@ class Hover(Task):
         "action_rate": Term(-0.05, action_rate),
     }
 
+    def prepare(self) -> None:
+        """See `Task.prepare`."""
+        super().prepare()
+        self._ranges = make_ranges(self.options)
+
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, displacement, tilt and velocity; see `Task.start`."""
-        start_near_target(env, rng, self.view_for(start_near_target), make_ranges(self.options), self.hanging)
+        start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.hanging)
 
     def succeeded(self) -> np.ndarray:
         """Within the success region throughout the last seconds."""

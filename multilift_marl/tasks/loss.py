@@ -159,6 +159,7 @@ class Loss(Task):
         early, late = option.loss_time
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
+        self._ranges = make_ranges(option)
         world.breakable = world.breakable or option.snap
         e, gains = world.num_envs, make_gains(control, world.system)
         offsets = redistributed_slots(world.system, gains, not option.snap, control.max_offset)
@@ -167,7 +168,7 @@ class Loss(Task):
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, start, drone and time; see `Task.start`."""
-        start_near_target(env, rng, self.view_for(start_near_target), make_ranges(self.options), self.hanging)
+        start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.hanging)
         self.own.who[env] = rng.integers(self.world.num_drones)
         self.own.when[env] = rng.uniform(*self.options.loss_time)
         self.mask.lost[env], self.own.peak_tension[env] = False, 0.0

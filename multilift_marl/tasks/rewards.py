@@ -49,6 +49,11 @@ class RestBounds(NamedTuple):
         return cls(options.success_distance, radians(options.success_angle), speed, body_rate)
 
 
+def describe(value: Callable[..., Any]) -> str:
+    """Return what a reward term's function says that it pays."""
+    return (value.__doc__ or "").strip().rstrip(".")
+
+
 def compose_reward(terms: Mapping[str, Term], is_good: Callable[..., Any], update: Callable[..., Any] | None) -> Any:
     """Return the kernel of (lo, hi, View, weights (T,), margins (T, M)) that writes the terms and `good_time`.
 
