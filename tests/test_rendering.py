@@ -185,13 +185,14 @@ def test_opengl_that_does_not_work_is_named_with_its_cure(monkeypatch, chosen, m
         assert name == "mujoco.egl"
         raise RuntimeError("no\ndevice")
 
+    vec = make(num_envs=1)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     if chosen is not None:
         monkeypatch.setenv("MUJOCO_GL", chosen)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
     monkeypatch.setattr(renderer.importlib, "import_module", broken)
     with pytest.raises(RenderingError, match=message):
-        Renderer(make(num_envs=1))
+        Renderer(vec)
 
 
 @pytest.mark.parametrize("num_drones", [1, 4])

@@ -143,7 +143,13 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
     assert stored["seed"] == int(weights.parts[-2].removeprefix("seed"))
     own = {"seed", "env.num_threads", "train.threads"}
     later = recipe.keys() - stored.keys() - own  # keys that were added since
-    assert later <= {"train.critic_learning_rate", "train.warmup", "vehicle.rotor_inertia", "import"}
+    assert later <= {
+        "train.critic_learning_rate",
+        "train.warmup",
+        "vehicle.rotor_inertia",
+        "import",
+        "task_options.success_angle",
+    }
     for key in ("control.attitude_frequency", "control.position_frequency"):
         if recipe[key] is None:  # as fast as can be, which was stated by a number that was always limited
             assert stored[key] >= {"control.attitude_frequency": 30, "control.position_frequency": 6}[key]

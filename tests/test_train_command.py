@@ -127,7 +127,7 @@ def test_help_explains_every_key(capsys):
         (["config=hover"], "train.overrides.<name> {'reward.precision': 1.0}", "name (default -)", "Task track"),
         (["config=hover"], "payload.drag_area 0.09", "smaller faces)", "reward.alignment"),
         (["config=pose", "wind.wash=true"], "wind.wash True", "(default False)", "Task hover"),
-        (["config=pose", "reward.position=7"], "reward.position 7.0", "weight", "Task hover"),
+        (["config=pose", "reward.position=7"], "reward.position.weight 7", "its target", "Task hover"),
         (["config=track_circle"], "task_options.path ['circle']", "(default ['figure8'])", "Task hover"),
         (["train.warmup=0"], "train.warmup 0", "(default 12)", "Task pose"),
         ([], "env.num_envs 128", "stepped together", "(default 128)"),
