@@ -18,7 +18,7 @@ from multilift_marl.tasks.sensing import Sensing
 
 
 class Stage(NamedTuple):
-    """A part of a policy step."""
+    """A part of a policy step; it runs for one shard, several at the same time, and may write their rows only."""
 
     name: str
     call: Callable[[], None]

@@ -81,7 +81,10 @@ class Draw:
         return {name: getattr(self.parameters, name) for name in self.changing}
 
     def _draw_more(self, env: int, rng: np.random.Generator) -> None:
-        """Draw what has a stream of its own; all of it, so that no part depends on which others are switched on."""
+        """Draw what has a stream of its own; all of it, so that no part depends on which others are switched on.
+
+        The order is that of `Parameters`, then wind: a field changes the episodes of all seeds unless it is drawn last.
+        """
         for name in Parameters._fields[1:]:
             array = getattr(self.parameters, name)
             width = np.asarray(getattr(self.ranges, name))

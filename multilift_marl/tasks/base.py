@@ -195,9 +195,9 @@ class Task:
         return self._views[kernel]
 
     def succeeded(self) -> np.ndarray:
-        """Return which environments (E,) would be successes if they ended now: good for the last seconds."""
+        """Return which environments (E,) would be successes if they ended now: good for the last seconds, or all."""
         seconds: float = getattr(self.options, "success_seconds", 0.0)
-        return self.good_time >= seconds - 1e-9
+        return self.good_time >= min(seconds, self.config.env.episode_seconds) - 1e-9
 
     def place_goal(self, env: int, position: ArrayLike, rotation: ArrayLike | None = None) -> None:
         """Put the target of one environment elsewhere, the formation with it, at a start or in flight.

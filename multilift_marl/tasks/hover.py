@@ -45,7 +45,3 @@ class Hover(Task):
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, displacement, tilt and velocity; see `Task.start`."""
         start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.hanging)
-
-    def succeeded(self) -> np.ndarray:
-        """Within the success region throughout the last seconds."""
-        return self.good_time >= min(self.options.success_seconds, self.config.env.episode_seconds) - 1e-9

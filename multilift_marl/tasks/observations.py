@@ -2,6 +2,9 @@
 
 Vectors are given in the drone's slot frame (x outward from the target payload pose through the drone's slot, z up):
 in it the same situation looks the same to every drone, and an action of the `reference` interface points the same way.
+
+A new component of all tasks makes earlier policies unusable; one of a task's own goes into its `EXTRA`. What is no
+field of `SystemState` must first be computed there, and measured in `tasks/sensing.py`.
 """
 
 from __future__ import annotations
