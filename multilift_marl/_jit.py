@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import linecache
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
+from operator import itemgetter
 from typing import Any, TypeVar, TypeVarTuple, cast
 
 from numba import config, int64, njit, typeof
@@ -40,7 +41,7 @@ def _compile(function: F, **options: Any) -> F:
     return cast(F, dispatcher)
 
 
-def compose(name: str, source: str, functions: Mapping[str, Any]) -> Callable[..., Any]:
+def compose(name: str, source: str, functions: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
     """Compile the function `name` that `source` defines and that calls `functions` by their names.
 
     Numba resolves functions by name when it compiles, so a loop over the entries of a table is written out.
@@ -48,17 +49,23 @@ def compose(name: str, source: str, functions: Mapping[str, Any]) -> Callable[..
     Args:
         name: of the function.
         source: its definition.
-        functions: what it calls, by the names in `source`: kernels, or constants.
+        functions: what it calls, by the names in `source`.
     """
+    return _compose(name, source, tuple(sorted(functions.items(), key=itemgetter(0))))
+
+
+@cache
+def _compose(name: str, source: str, functions: tuple[tuple[str, Callable[..., Any]], ...]) -> Callable[..., Any]:
+    """Do as `compose`; environments of one kind share the compiled function."""
     file = f"<{name} {hashlib.sha256(source.encode()).hexdigest()[:12]}>"
     scope: dict[str, Any] = dict(functions)
     exec(compile(source, file, "exec"), scope)
     linecache.cache[file] = len(source), None, source.splitlines(keepends=True), file  # for tracebacks
     function = scope[name]
     function.__module__ = __name__
-    modules = sorted({getattr(each, "__module__", "") for each in functions.values()})
+    modules = sorted({each.__module__ for _, each in functions})
     digests = [sources_digest(module) for module in modules if module.startswith("multilift_marl.")]
-    named = [f"{key} {getattr(each, '__module__', '')}.{each.__qualname__}" for key, each in sorted(functions.items())]
+    named = [f"{key} {each.__module__}.{each.__qualname__}" for key, each in functions]
     function._sources = "\0".join([source, *digests, *named])  # read by the cache
     return _compile(function)
 
