@@ -74,11 +74,11 @@ def test_the_payload_settles_at_every_target():
     vec = ml.make_vec("pose_falcon3", num_envs=300, num_threads=1)
     vec.reset(seed=5)
     task, gains = vec.task, make_gains(vec.config.control, vec.world.system)
-    np.testing.assert_allclose(task.settings.bounds.stiffness, 0.5 * gains.mass * gains.k_p)
+    np.testing.assert_allclose(task.settings.holdable.stiffness, 0.5 * gains.mass * gains.k_p)
     for stage in (1, 2, 3):
         for e in range(300):
             set_goal_from_plan(e, stage, task.own.plan, task.goal, task.rig, task.nominal_hanging)
-            assert is_stable(e, task.goal, task.rig, task.nominal_hanging, task.settings.bounds.stiffness)
+            assert is_stable(e, task.goal, task.rig, task.nominal_hanging, task.settings.holdable.stiffness)
     assert not all(is_stable(e, task.goal, task.rig, task.nominal_hanging, np.full(3, 0.5)) for e in range(300))
 
 

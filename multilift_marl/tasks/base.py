@@ -304,7 +304,9 @@ def compose_check(check: Callable[..., Any] | None) -> Callable[..., Any]:
         update_errors(e, v.state, v.errors, v, dt)
         v.cause[e] = find_cause(e, v)
 """
-    functions = {"update_errors": update_errors, "find_cause": find_cause} | ({"before": check} if check else {})
+    functions: dict[str, Callable[..., Any]] = {"update_errors": update_errors, "find_cause": find_cause}
+    if check:
+        functions["before"] = check
     return compose("check", source if check else source.replace("        before(e, v)\n", ""), functions)
 
 

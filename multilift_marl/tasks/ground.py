@@ -15,7 +15,7 @@ from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.tasks import rewards
-from multilift_marl.tasks.rewards import tolerance
+from multilift_marl.tasks.rewards import Term, tolerance
 
 FAR = 0.5  # [m] from its target, at which a payload's pose earns half
 _SLACK_REACH = 0.9  # of its cable: the farthest that a drone stands from its anchor
@@ -187,3 +187,13 @@ def cable_rise(e, n, state, rig):
     """Return how far drone n of environment e is above its anchor [m]."""
     turned = mul(matrow(state.payload_rotation, e), row(rig.anchors, n))
     return state.drone_position[e, n, 2] - state.payload_position[e, 2] - turned[2]
+
+
+CARRIED = {
+    "position": Term(0.4, position, 0.25, "m"),
+    "precision": Term(0.25, position, 0.01, "m"),
+    "attitude": Term(0.15, attitude, 6.0, "deg"),
+    "level": Term(0.1, attitude, 1.0, "deg"),
+    "stillness": Term(0.1, steadiness, (0.2, 0.3), "m/s, rad/s"),
+}
+"""Reward terms of a payload that is to be at its target while it is carried."""

@@ -16,17 +16,15 @@ from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.failures import LOAD_GROUND, TOUCH, ignore, payload_height
 from multilift_marl.tasks.ground import (
+    CARRIED,
     Ground,
-    attitude,
     cable_chord,
     make_ground,
     move_goal,
-    position,
     pull_fraction,
     readiness,
     scale_cable_force,
     set_resting_goal,
-    steadiness,
 )
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.rewards import Term, action_rate, tolerance
@@ -118,12 +116,6 @@ def advance(e, v):
         put(goal.slot_velocity[e, n], scale(-SHORTER * lower[1], chord))
         put(goal.slot_acceleration[e, n], scale(-SHORTER * lower[2], chord))
         scale_cable_force(e, n, v, own.pull_fraction[e], ground.cable_weight)
-
-
-@kernel
-def advance_once(e, v):
-    """Do as `advance`, for a start."""
-    advance(e, v)
 
 
 @inlined
@@ -221,11 +213,7 @@ class Land(Task):
     own: LandArrays
     settings: LandSettings
     REWARD: ClassVar[dict[str, Term]] = {
-        "position": Term(0.4, position, 0.25, "m"),
-        "precision": Term(0.25, position, 0.01, "m"),
-        "attitude": Term(0.15, attitude, 6.0, "deg"),
-        "level": Term(0.1, attitude, 1.0, "deg"),
-        "stillness": Term(0.1, steadiness, (0.2, 0.3), "m/s, rad/s"),
+        **CARRIED,
         "ready": Term(0.5, readiness, 0.25, "m"),
         "slack": Term(0.5, slackness, 0.1, "-"),
         "action_rate": Term(-0.05, action_rate),
@@ -254,7 +242,7 @@ class Land(Task):
         ranges = option.pad_xy, radians(option.pad_yaw), option.start_height
         start_above_origin(env, rng, self.view_for(start_above_origin), self.hanging, ranges)
         self.own.touch[env], self.own.speed[env], self.time[env] = AIRBORNE, 0.0, 0.0
-        advance_once(env, self.view_for(advance_once))
+        advance(env, self.view_for(advance))
 
     def succeeded(self) -> np.ndarray:
         """Touched down softly, and at rest, slack and clear throughout the last seconds."""

@@ -16,7 +16,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import matmul, matrow, rotation_vector, row, sub, transpose
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, is_at_rest, stillness
+from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, stillness
 from multilift_marl.tasks.starts import hang_team
 from multilift_marl.tasks.targets import Bounds, draw_plan, make_bounds
 from multilift_marl.tasks.trajectory import Plan, advance_plan, hold_plan_pose, select_candidate, set_goal_from_plan
@@ -47,8 +47,8 @@ class PoseArrays(NamedTuple):
 class PoseSettings(NamedTuple):
     """Constants of the task."""
 
-    bounds: Bounds
-    success: RestBounds
+    bounds: RestBounds
+    holdable: Bounds
     success_seconds: float
     hold: float
     """How long each target stays [s]."""
@@ -70,12 +70,6 @@ def start_at_first_pose(e, v, hanging):
     hang_team(e, v, planned, hanging, (row(planned.position, e), matrow(planned.rotation, e)), still, still)
     plan.stage[e] = 0
     set_goal_from_plan(e, 1, plan, v.goal, v.rig, v.nominal)  # last, since it shares the slot frames with the plan
-
-
-@inlined
-def is_within_success(e, v):
-    """Payload at its target."""
-    return is_at_rest(e, v, v.settings.success)
 
 
 @inlined
@@ -136,7 +130,7 @@ class Pose(Task):
         "stillness": Term(0.1, stillness, (0.2, 0.3), "m/s, rad/s"),
         "action_rate": Term(-0.05, action_rate),
     }
-    KERNELS: ClassVar[Kernels] = Kernels(is_good=is_within_success, plan=advance_plan, update=note_reached)
+    KERNELS: ClassVar[Kernels] = Kernels(plan=advance_plan, update=note_reached)
     EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")
 
@@ -157,8 +151,8 @@ class Pose(Task):
         self.planned = Goal.zeros(e, n)._replace(slot_frame=self.goal.slot_frame)  # actions point as observations do
         heaviest = 1 + self.config.randomization.payload_mass
         self.settings = PoseSettings(
-            bounds=make_bounds(system, self.config.control, self.limits, heaviest),
-            success=RestBounds(option.success_distance, radians(option.success_angle)),
+            holdable=make_bounds(system, self.config.control, self.limits, heaviest),
+            bounds=RestBounds.of(option),
             success_seconds=option.success_seconds,
             hold=hold,
             seconds=option.way_seconds,

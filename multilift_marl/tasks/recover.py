@@ -33,7 +33,7 @@ from multilift_marl.sim.state import place_at_hook
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
 from multilift_marl.tasks.observations import Component, cable_vector
-from multilift_marl.tasks.rewards import Term, action_rate, attitude, distance, stillness
+from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, stillness
 from multilift_marl.tasks.starts import TargetOptions, check_heights, in_ball
 
 
@@ -149,8 +149,7 @@ class RecoverSettings(NamedTuple):
 
     grace: float
     """[s] in which tilt and cable angle are no failure."""
-    distance: float
-    """[m] payload within this of its target is good."""
+    bounds: RestBounds
 
 
 @inlined
@@ -158,12 +157,6 @@ def end_grace(e, v):
     """Let all failures count once the grace is over; the goals stay."""
     if v.time[e] > v.settings.grace:
         v.mask.ignored[e] = 0
-
-
-@inlined
-def is_close(e, v):
-    """Payload at its target."""
-    return v.errors.distance[e] <= v.settings.distance
 
 
 @inlined
@@ -191,7 +184,7 @@ class Recover(Task):
         "stillness": Term(0.2, stillness, (0.2, 0.3), "m/s, rad/s"),
         "action_rate": Term(-0.05, action_rate),
     }
-    KERNELS: ClassVar[Kernels] = Kernels(is_good=is_close, plan=end_grace)
+    KERNELS: ClassVar[Kernels] = Kernels(plan=end_grace)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("grace", 1, "-", "-", "share of the time left in which tilt and cable angle are no failure", grace),
         Component(
@@ -209,7 +202,7 @@ class Recover(Task):
         self._early = ignore(TILT, CABLE)
         if option.start == "crazymarl":  # a quarter of its teams start on the ground
             self._early = ignore(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
-        self.settings = RecoverSettings(option.grace, option.success_distance)
+        self.settings = RecoverSettings(option.grace, RestBounds(option.success_distance))
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target and team; see `Task.start`."""

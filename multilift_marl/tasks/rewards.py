@@ -35,7 +35,7 @@ class RestBounds(NamedTuple):
 
     distance: float
     """[m]."""
-    angle: float
+    angle: float = np.inf
     """Of the rotation from the target attitude [rad]."""
     speed: float = np.inf
     """[m/s]."""

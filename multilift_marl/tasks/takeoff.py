@@ -15,20 +15,18 @@ from multilift_marl.math3d import add, clip, ease, matrow, put, putmat, rot_z, r
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, ignore, payload_height
 from multilift_marl.tasks.ground import (
+    CARRIED,
     Ground,
-    attitude,
     cable_chord,
     cable_rise,
     make_ground,
     move_goal,
     place_on_ground,
-    position,
     pull_fraction,
     readiness,
     resting_distance,
     scale_cable_force,
     set_resting_goal,
-    steadiness,
 )
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, is_at_rest
@@ -120,12 +118,6 @@ def advance(e, v):
     v.mask.ignored[e] = IGNORED[own.stage[e]]
 
 
-@kernel
-def advance_once(e, v):
-    """Do as `advance`, for a start."""
-    advance(e, v)
-
-
 @inlined
 def _stretched(vector, level, up):
     """Return a vector, its level part and its height scaled."""
@@ -186,11 +178,7 @@ class Takeoff(Task):
     own: TakeoffArrays
     settings: TakeoffSettings
     REWARD: ClassVar[dict[str, Term]] = {
-        "position": Term(0.4, position, 0.25, "m"),
-        "precision": Term(0.25, position, 0.01, "m"),
-        "attitude": Term(0.15, attitude, 6.0, "deg"),
-        "level": Term(0.1, attitude, 1.0, "deg"),
-        "stillness": Term(0.1, steadiness, (0.2, 0.3), "m/s, rad/s"),
+        **CARRIED,
         "ready": Term(1.0, readiness, 0.1, "m"),
         "snatch": Term(-0.5, snatch),
         "action_rate": Term(-0.05, action_rate),
@@ -224,7 +212,7 @@ class Takeoff(Task):
         own.stage[env], own.pull_fraction[env], own.peak[env] = RESTING, 0.0, 0.0
         self.mask.ignored[env] = IGNORED[RESTING]
         self.time[env] = 0.0
-        advance_once(env, self.view_for(advance_once))
+        advance(env, self.view_for(advance))
 
     def succeeded(self) -> np.ndarray:
         """At the final target throughout the last seconds, and never too large a tension."""

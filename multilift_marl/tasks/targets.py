@@ -69,7 +69,7 @@ def draw_plan(e, rng, v, ranges):
         v: View of task `pose`; its plan is written, its goal overwritten.
         ranges: of x and y [m], lowest and highest z [m], of yaw [rad], of roll and pitch [rad]; the start is level.
     """
-    plan, goal, rig, hanging, bounds = v.own.plan, v.goal, v.rig, v.nominal, v.settings.bounds
+    plan, goal, rig, hanging, bounds = v.own.plan, v.goal, v.rig, v.nominal, v.settings.holdable
     xy, low, high, yaw, tilt = ranges
     vain, k = 0, 0
     while k < plan.pose.shape[1]:

@@ -139,7 +139,7 @@ def _set_course(e, k, plan, i):
 @inlined
 def _peak_acceleration(e, k, v):
     """Return the largest acceleration of a slot on the way to target k [m/s²], more if drones or cables come close."""
-    plan, planned, rig, bounds = v.own.plan, v.planned, v.rig, v.settings.bounds
+    plan, planned, rig, bounds = v.own.plan, v.planned, v.rig, v.settings.holdable
     hold_plan_pose(e, k, plan, planned, rig, v.nominal)
     plan.stage[e] = k
     most, room, dt = 0.0, 1.0, v.settings.seconds / _SAMPLES

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import FunctionType, ModuleType
+from collections.abc import Callable, Iterator
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -105,15 +105,22 @@ def _collect_names(function: Any, names: set[str], seen: set[Any]) -> None:
     if function in seen:
         return
     seen.add(function)
-    names.update(function.__code__.co_names)
-    modules = [
-        value for value in map(function.__globals__.get, function.__code__.co_names) if isinstance(value, ModuleType)
-    ]
-    for name in function.__code__.co_names:
+    own = set(_code_names(function.__code__))
+    names |= own
+    modules = [value for value in map(function.__globals__.get, own) if isinstance(value, ModuleType)]
+    for name in own:
         for value in (function.__globals__.get(name), *(getattr(module, name, None) for module in modules)):
             called = getattr(value, "py_func", value)
             if isinstance(called, FunctionType):
                 _collect_names(called, names, seen)
+
+
+def _code_names(code: CodeType) -> Iterator[str]:
+    """Return the names in a code object, and in those of comprehensions within it."""
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _code_names(constant)
 
 
 def _keep(record: Any, names: set[str]) -> Any:
