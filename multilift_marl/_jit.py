@@ -21,7 +21,9 @@ Arguments = TypeVarTuple("Arguments")
 def kernel(function: F) -> F:
     """Compile a function to machine code at its first call.
 
-    Arithmetic is exact IEEE, so results do not depend on how many environments are computed together.
+    Arithmetic is exact IEEE, so results do not depend on how many environments are computed together. A kernel of this
+    package makes no arrays, and returns none: without the counting of references that this would need, kernels compile
+    faster.
     """
     return _compile(function)
 
@@ -29,13 +31,21 @@ def kernel(function: F) -> F:
 def inlined(function: F) -> F:
     """Do as `kernel`, and merge the function into those that call it.
 
-    A call that is not merged counts references to every array that it is given, those of named tuples too.
+    A call that is not merged passes every number of every array in its arguments, those of named tuples too.
     """
     return _compile(function, inline="always")
 
 
-def _compile(function: F, **options: Any) -> F:
-    dispatcher: Any = njit(nogil=True, error_model="numpy", **options)(function)
+def _is_ours(module: str) -> bool:
+    return module.startswith("multilift_marl.")
+
+
+def _compile(function: F, makes_arrays: bool | None = None, **options: Any) -> F:
+    """Compile a function; only those of other packages may make arrays."""
+    if makes_arrays is None:
+        makes_arrays = not _is_ours(function.__module__)
+    flags: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": makes_arrays}
+    dispatcher: Any = njit(**flags, **options)(function)
     if not _UNCOMPILED:  # else it is the function itself
         dispatcher._cache = make_cache(function)
     return cast(F, dispatcher)
@@ -64,10 +74,11 @@ def _compose(name: str, source: str, functions: tuple[tuple[str, Callable[..., A
     function = scope[name]
     function.__module__ = __name__
     modules = sorted({each.__module__ for _, each in functions})
-    digests = [sources_digest(module) for module in modules if module.startswith("multilift_marl.")]
+    ours = [module for module in modules if _is_ours(module)]
+    digests = [sources_digest(module) for module in ours]
     named = [f"{key} {each.__module__}.{each.__qualname__}" for key, each in functions]
     function._sources = "\0".join([source, *digests, *named])  # read by the cache
-    return _compile(function)
+    return _compile(function, makes_arrays=len(ours) < len(modules))
 
 
 def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Callable[[], None]:

@@ -81,6 +81,7 @@ def make_cables(system: System, parameters: Parameters, inertias: Inertias) -> C
         bends=bool(system.bending_stiffness.any() or system.bending_damping.any()),
         largest=largest_substep(system),
         nodes=Nodes.zeros(e, system),
+        links=np.zeros((e, int(system.cable_segments.max()), 7)),
         motion=Motion.zeros(e, system),
     )
     update_cables(chain, system, parameters)
@@ -243,13 +244,13 @@ def write_state(rows, mask, data, cables):
     state = data.state
     nodes = cables.nodes
     common = cables.cables
-    links = np.zeros((cables.segments.max(), 7))
     for i in range(rows.state.shape[0]):
         e = rows.first + i
         if not mask[e]:
             continue
         clear_stats(e, data.stats)
         write_bodies(e, rows.state[i], state, rows)
+        links = cables.links[e]
         nodes.contact[e] = 0.0
         attitude = matrow(state.payload_rotation, e)
         spin = row(state.payload_body_rates, e)

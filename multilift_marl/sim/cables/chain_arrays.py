@@ -90,6 +90,8 @@ class Chain(NamedTuple):
     largest: int
     """Length of the longest substep, a physics step being `UNITS`."""
     nodes: Nodes
+    links: np.ndarray
+    """(E, S, 7) of a cable while its state is written: direction, stretch [m] and velocity [m/s] of each link."""
     motion: Motion
 
 
