@@ -1,7 +1,8 @@
 """What the tests share.
 
 A test that takes `task` runs for every task, one that takes `num_drones` for every N, and one that takes `cables`, the
-configuration of a cable model, for both models.
+configuration of a cable model, for both models. Marked `slow`, and left out unless asked for by `-m slow`, are
+those for other than two drones and for chains, but for `hover`, beside those that say so.
 """
 
 from __future__ import annotations
@@ -53,6 +54,16 @@ def pytest_generate_tests(metafunc):
     ):
         if name in metafunc.fixturenames and name not in own:
             metafunc.parametrize(name, values, ids=ids)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    for item in items:
+        asked = item.callspec.params if hasattr(item, "callspec") else {}
+        if asked.get("task", "hover") == "hover" or not {"num_drones", "cables"} & asked.keys():
+            continue
+        if asked.get("num_drones", 2) != 2 or asked.get("cables", CABLES["massless"]) != CABLES["massless"]:
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture

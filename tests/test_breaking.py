@@ -17,6 +17,7 @@ def make_world(model: str, num_envs: int = 1, num_drones: int = 1, load_factor: 
     return World(make_system(num_drones, **settings), num_envs, num_threads)
 
 
+@pytest.mark.slow
 @MODELS
 def test_a_cable_breaks_when_its_tension_exceeds_the_breaking_load_and_not_before(model):
     world = make_world(model)

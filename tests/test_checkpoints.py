@@ -27,6 +27,7 @@ from multilift_marl.errors import CheckpointError
 SHIPPED = Path(policy.__file__).parents[1] / "policies"
 
 
+@pytest.mark.slow
 def test_killed_while_saving_it_can_always_be_resumed(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.step()

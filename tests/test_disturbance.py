@@ -123,6 +123,7 @@ def test_the_bandwidth_leaves_room_for_load_and_position_loop(kind):
     assert bandwidth(**{"control.disturbance_frequency": 0.7}) == pytest.approx(0.7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("rig", RIGS)
 def test_a_swinging_payload_of_another_mass_comes_to_rest(rig, kind):
@@ -130,6 +131,7 @@ def test_a_swinging_payload_of_another_mass_comes_to_rest(rig, kind):
     assert decay.min() > 0.07  # report4 damps its swing by no more without any rejection
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.2, 0.4])
 @pytest.mark.parametrize("rig", ["falcon4", "report4"])
 def test_drones_stay_within_3_cm_on_the_circle_in_wind_and_gusts(rig, rate):

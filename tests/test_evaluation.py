@@ -221,6 +221,7 @@ def test_command_line_errors_of_scripts(capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_command_films_the_first_episode(run, tmp_path):
     import imageio.v3 as iio
 
@@ -230,6 +231,7 @@ def test_command_films_the_first_episode(run, tmp_path):
     assert len(frames) == 10 and frames.std() > 10
 
 
+@pytest.mark.slow
 def test_command_films_from_the_camera_asked_for(run, tmp_path, monkeypatch):
     from multilift_marl import rendering
 

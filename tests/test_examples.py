@@ -12,12 +12,14 @@ HERE = ("cleanrl_ppo", "torchrl_wrapper")  # need no more than the package's own
 check = load_script("examples/check")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HERE)
 def test_example_trains(name, tmp_path):
     result = check.try_out(sys.executable, name, tmp_path, num_envs=2)
     assert result["weights"] > 1000 and result["moved"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "after, complaint",
     [

@@ -172,6 +172,7 @@ def fly(folder):
     )
 
 
+@pytest.mark.slow
 def test_the_example_flies_without_torch(exported):
     done = fly(exported)
     assert done.stdout.startswith("hover: 2 episodes, success ") and done.stdout.endswith(" cm\n"), done.stderr

@@ -175,6 +175,7 @@ def test_the_feedback_script_holds_a_payload_in_turbulence_that_the_integral_doe
     assert success["formation_feedback"] > 0.8 > 0.4 > success["formation_integral"]
 
 
+@pytest.mark.slow
 def test_the_script_for_gusts_holds_poses_in_turbulence_that_the_feedback_script_does_not():
     config = load_config("pose_wind")
     success = {

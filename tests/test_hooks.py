@@ -55,6 +55,7 @@ def test_a_team_rests_in_its_slots_under_rotor_thrusts_that_hold_the_moments(hoo
     assert np.abs(world.state.drone_body_rates).max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_the_controller_holds_a_resting_team(model):
     vec = make("hover", num_envs=1, **STILL, **{"cable.hook": ASIDE, "cable.model": model})

@@ -80,6 +80,7 @@ def kernels(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*.kernel"))
 
 
+@pytest.mark.slow
 def test_no_compiled_kernel_outlives_a_constant_it_was_compiled_with(package, tmp_path):
     assert run(WEIGHTS, tmp_path)[0] == pytest.approx(1)
     constants = package / "rig" / "vehicles.py"
@@ -89,6 +90,7 @@ def test_no_compiled_kernel_outlives_a_constant_it_was_compiled_with(package, tm
     assert run(WEIGHTS, tmp_path)[0] == pytest.approx(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "old", "new", "result"),
     [
@@ -116,6 +118,7 @@ def test_kernels_are_read_back_not_compiled_again_and_the_first_time_says_so(pac
     assert written == {path: path.stat().st_mtime_ns for path in kernels(package)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["emptied", "cut", "flipped", "foreign"])
 def test_a_damaged_file_counts_as_missing(package, tmp_path, damage):
     run(NORM, tmp_path)

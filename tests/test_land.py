@@ -45,6 +45,7 @@ def touch_down(velocity, aside=(0.0, 0.0), height=0.004):
 # Starts
 
 
+@pytest.mark.slow
 def test_land_starts_are_as_documented():
     vec = make("land", num_envs=2000)
     vec.reset(seed=0)
@@ -139,6 +140,7 @@ def test_success_is_at_rest_slack_and_clear_throughout_the_last_second(spoil):
     assert (task.good_time[0] > 0) == (spoil == "nothing")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", ["formation", "formation_integral"])
 def test_scripts_land(script):
     vec = make("land", num_envs=64)
@@ -146,6 +148,7 @@ def test_scripts_land(script):
     assert success.mean() >= 0.9 and failure.mean() <= 0.1
 
 
+@pytest.mark.slow
 def test_in_return_motors_off_lose_to_staying_high_to_the_formation_to_its_integral():
     def score(script=None, **gains):
         vec = make("land", num_envs=32)

@@ -101,6 +101,7 @@ def test_a_weak_drone_carries_less_of_a_body_whose_weight_and_moments_stay_balan
 # Physics and control
 
 
+@pytest.mark.slow
 def test_each_drone_of_a_mixed_team_moves_as_it_does_alone():
     rng = np.random.default_rng(0)
     thrust = rng.uniform(0.2, 0.8, (5, 4)) * [[PRESETS[name].rotor_thrust_max] for name in ALL]
@@ -165,6 +166,7 @@ def fly(vec, script: str) -> tuple[np.ndarray, np.ndarray]:
     return info["success"] & ~failed, failed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model, teams", [("massless", 16), ("chain", 2)])
 def test_a_mixed_team_hovers(model, teams):
     def vec():
@@ -243,6 +245,7 @@ def test_an_impossible_team_is_refused_by_name(overrides, complaint):
     assert re.match(complaint, message), message
 
 
+@pytest.mark.slow
 def test_a_mixed_team_opens_every_task(task, cables):
     vec = make(task, num_envs=1, **{"vehicle.preset": MIX}, **cables)
     vec.reset(seed=0)

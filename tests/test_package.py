@@ -142,6 +142,7 @@ def blocks(language, document):
     return re.findall(rf"```{language}\n(.*?)```", document.read_text(), re.DOTALL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", [b for d in DOCUMENTS for b in blocks("python", d)])
 def test_python_of_documents_runs(code, tmp_path):
     done = python(code, tmp_path)
@@ -207,6 +208,7 @@ def of_documents():
     return sorted(first, key=lambda command: ("train.py" not in command, "resume" in command, command)), alone
 
 
+@pytest.mark.slow
 def test_commands_that_train_and_what_follows_them_run(tmp_path, monkeypatch, registries):
     seen = of_documents()[0]
     assert sum("train.py" in command for command in seen) > 4
@@ -215,6 +217,7 @@ def test_commands_that_train_and_what_follows_them_run(tmp_path, monkeypatch, re
         run(command, tmp_path, monkeypatch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", of_documents()[1])
 def test_commands_of_documents_run(command, tmp_path, monkeypatch, registries):
     monkeypatch.setattr(plots, "_save", lambda figure, path: None)  # most of the time; see test_evaluation.py

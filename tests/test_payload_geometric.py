@@ -88,6 +88,7 @@ def test_it_is_no_base_of_a_residual():
     assert "train.residual" in message and "formation_integral" in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", ["hover", "pose"])
 def test_it_holds_attitude_and_earns_better_than_the_integral_formation(config):
     flights = {
@@ -103,6 +104,7 @@ def test_it_holds_attitude_and_earns_better_than_the_integral_formation(config):
     assert (ours["return"] > theirs["return"]).mean() > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "num_drones, overrides",
     [

@@ -68,6 +68,7 @@ def arguments(values):
 # Modules
 
 
+@pytest.mark.slow
 def test_a_users_task_vehicle_and_policy_are_trained_and_judged_from_the_command_line(folder):
     small = SMALL | {"train.frames": 256, "eval.episodes": 2}
     assert train(["import=mine", "task=near", "vehicle.preset=heavy", *arguments(small)]) == 0

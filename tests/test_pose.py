@@ -100,6 +100,7 @@ def test_success_needs_the_last_second_of_every_target():
     assert same(info["success"], expected)
 
 
+@pytest.mark.slow
 def test_the_best_script_solves_nine_of_ten_easy_episodes():
     for script in ("formation_integral", "payload_geometric"):
         vec = make("pose_easy", num_envs=64)
@@ -120,6 +121,7 @@ def test_pose_pays_every_positive_weight_in_full_at_rest_at_the_goal():
     assert paid == pytest.approx({name: max(term.weight, 0.0) for name, term in vec.task.REWARD.items()})
 
 
+@pytest.mark.slow
 def test_returns_rank_motors_off_holding_the_start_and_the_scripts():
     def score(script="formation", off=False, **options):
         vec = make("pose", num_envs=48, **{f"task_options.{key}": value for key, value in options.items()})

@@ -43,12 +43,14 @@ def fly(config: str, varied: tuple[str, ...], **overrides) -> None:
         assert not info["diverged"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", list_configs())
 def test_every_key_alone_in_every_configuration(config):
     for key in keys(config):
         fly(config, (key,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_pair_of_keys(kind):
     config, overrides = KINDS[kind]

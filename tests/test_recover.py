@@ -66,6 +66,7 @@ def test_success_is_within_a_centimetre_at_the_end():
     assert vec.task.succeeded().tolist() == [True, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", ["recover", "recover_crazymarl"])
 def test_the_formation_recovers_from_most_starts(config):
     vec = starts(config, 32)

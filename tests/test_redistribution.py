@@ -47,6 +47,7 @@ def test_less_thrust_or_room_means_more_tilt():
     assert solve("loss", thrust_share=0.4)[1] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "angle"), [("loss", 40.0), ("loss_6", 1.5), ("loss_snap", 5.0)])
 def test_a_team_that_redistributes_comes_to_rest_as_computed(name, angle):
     script = partial(make_scripted, "formation_redistributed")

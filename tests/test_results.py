@@ -24,6 +24,7 @@ import search_gains  # noqa: E402
 import tables  # noqa: E402
 
 
+@pytest.mark.slow
 def test_tables_are_those_of_the_results():
     assert tables.summary() in (ROOT / "README.md").read_text(encoding="utf-8")
     assert tables.table() in (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
@@ -36,6 +37,7 @@ def test_tables_are_those_of_the_results():
     assert reported > 3
 
 
+@pytest.mark.slow
 def test_tables_are_written_between_their_marks(tmp_path, monkeypatch):
     (tmp_path / "docs").mkdir()
     whole = {}
@@ -173,6 +175,7 @@ def test_the_search_begins_with_the_gains_of_its_script(script):
     np.testing.assert_array_equal(begun(vec).matrix(), LINEAR[script](vec).matrix())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "script"), [("hover_wind", "formation_integral"), ("pose_wind", "formation_feedback")]
 )
@@ -185,6 +188,7 @@ def test_the_search_counts_as_success_what_the_task_does(name, script):
     assert evaluated.angle > np.median(reported["payload_attitude_error_deg"])
 
 
+@pytest.mark.slow
 def test_the_search_prints_gains_that_a_script_can_have(capsys):
     keys = {"config": "hover", "minutes": 1e-3, "env.num_envs": 4, "env.episode_seconds": 2.0}
     assert search_gains.main(keys) == 0

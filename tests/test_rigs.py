@@ -52,6 +52,7 @@ def test_recipes_that_repeat_a_rig_say_the_same(recipe, rig):
         assert getattr(trained, section) == getattr(shipped, section)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIGS)
 def test_scripted_teams_fly_every_rig(name):
     vec = ml.make_vec(name, num_envs=8, num_threads=1)

@@ -27,6 +27,7 @@ def best_by_search(vehicle, thrust, torque, low, high):
     return shares[0], float(np.clip(thrust, *range_of_thrust(shares[0])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_roll_and_pitch_come_first_then_thrust(name):
     vehicle, rng = PRESETS[name], np.random.default_rng(3)
@@ -65,6 +66,7 @@ def test_upside_down_drones_come_back_after_a_short_fall(name, angle, most):
     assert not lost.any() and 0.5 * most < fall[angle] < most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drones, success", [(4, 0.8), (2, 0.9)])
 def test_crazyflies_recover_without_a_policy(drones, success):
     payload = {"payload.shape": "point", "payload.mass": 0.01} if drones == 2 else {"payload.mass": 0.02}

@@ -204,6 +204,7 @@ def fly(config: Config, seconds: float = 1.0, longest: int = 2000) -> str:
     return ""
 
 
+@pytest.mark.slow
 @settings(max_examples=DRAWS, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))
 @given(drawn())
 def test_what_validation_lets_through_flies(draw: tuple[str, dict[str, Any]]) -> None:

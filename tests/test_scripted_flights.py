@@ -28,6 +28,7 @@ def fly_once(vec: MultiliftVec, act, seed: int = 0) -> tuple[np.ndarray, np.ndar
     return total, success.astype(bool), failure.astype(bool)
 
 
+@pytest.mark.slow
 def test_in_return_motors_off_lose_to_holding_the_start_to_the_formation_to_its_integral():
     def score(script=None, **gains):
         vec = make("hover", num_envs=64)
@@ -48,6 +49,7 @@ def test_in_return_motors_off_lose_to_holding_the_start_to_the_formation_to_its_
     assert (formation > hold).mean() > 0.8 and (integral > formation).mean() > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["box", "point"])
 @pytest.mark.parametrize("num_drones", [1, 2, 3, 6, 16])
 def test_the_formation_flies_any_number_of_drones(num_drones, cables, shape):
@@ -56,6 +58,7 @@ def test_the_formation_flies_any_number_of_drones(num_drones, cables, shape):
     assert not failure.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "num_drones, overrides",
     [(4, {}), (3, {"payload.shape": "point"}), (4, {"payload.shape": "point"}), (4, {"payload.anchors": OFF_CENTRE})],

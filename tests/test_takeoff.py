@@ -166,12 +166,14 @@ def test_errors_on_the_way_do_not_count_as_success():
     assert (vec.task.good_time == 0).all() and vec.task.errors.distance.max() < 0.05
 
 
+@pytest.mark.slow
 def test_the_integral_formation_takes_off():
     vec = make("takeoff", num_envs=64)
     _, success, failure = fly_once(vec, make_scripted("formation_integral", vec).act)
     assert not failure.any() and success.mean() >= 0.9
 
 
+@pytest.mark.slow
 def test_in_return_motors_off_lose_to_standing_by_to_the_formation_to_its_integral():
     def score(script=None, raised=0.0, **gains):
         vec = make("takeoff", num_envs=32, **{"control.max_offset": 0.5})

@@ -21,6 +21,7 @@ from multilift_marl.errors import ConfigError
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow
 def test_interrupt_saves_and_resume_finishes(tmp_path):
     arguments = [f"{key}={value}" for key, value in SMALL.items() if key != "train.frames"]
     command = [sys.executable, str(ROOT / "train.py"), "config=hover", "train.frames=1e8", *arguments]

@@ -22,6 +22,7 @@ from multilift_marl.config.load import load_config
 from multilift_marl.errors import ConfigError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -67,6 +68,7 @@ def test_same_seed_same_weights_other_seed_others(tmp_path):
     assert not torch.equal(weights[0], weights[2])
 
 
+@pytest.mark.slow
 def test_a_few_iterations_improve_the_return(tmp_path):
     trainer = make_trainer(
         tmp_path,

@@ -77,6 +77,7 @@ def test_pulls_of_the_way_give_the_payload_the_motion_of_the_way(num_drones):
     np.testing.assert_allclose(moment, change, atol=0.01 * np.abs(change).max() + 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pose", "pose_falcon3"])
 def test_drones_and_cables_stay_apart_and_no_drone_leans_far_on_the_way(name):
     vec = ml.make_vec(name, num_envs=64, num_threads=1)
@@ -107,6 +108,7 @@ def test_drones_and_cables_stay_apart_and_no_drone_leans_far_on_the_way(name):
     assert upright > cos(pi / 4)
 
 
+@pytest.mark.slow
 def test_ways_that_would_swing_a_drone_about_take_another_course():
     vec = ml.make_vec("pose_falcon3", num_envs=512, num_threads=1)
     vec.reset(seed=0)
@@ -144,6 +146,7 @@ def test_ways_that_would_swing_a_drone_about_take_another_course():
     assert np.sort(chosen, axis=None)[-20:].mean() < 0.85 * np.sort(before, axis=None)[-20:].mean()
 
 
+@pytest.mark.slow
 def test_drones_and_cables_stay_apart_on_every_course():
     vec = ml.make_vec("pose", num_envs=1000, num_threads=1)
     vec.reset(seed=0)

@@ -40,6 +40,7 @@ def test_spectrum_and_autocorrelation_are_each_others_transform(component, heigh
         assert found == pytest.approx(correlation(component, height, lag), abs=2e-3 * scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [3.0, 30.0])
 @pytest.mark.parametrize("timestep, every", [(5e-4, 400), (4e-3, 50), (0.2, 1)])
 def test_variance_and_autocorrelation_do_not_depend_on_the_time_step(height, timestep, every):

@@ -24,6 +24,7 @@ def fast(name):
     return EXPERIMENTS[name](True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_agrees_with_theory(name):
     rows = fast(name).rows
@@ -80,6 +81,7 @@ def soften_the_ground(model):
     model.pair_solref[:] = [0.2, 1.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "change", "complaint"),
     [
@@ -97,6 +99,7 @@ def test_a_wrong_model_is_noticed(name, change, complaint, monkeypatch):
     assert any(quantity.startswith(complaint) for quantity in failed)
 
 
+@pytest.mark.slow
 def test_wrong_stiffness_is_noticed(tmp_path, monkeypatch, capsys):
     right = cables.limit_solref
     monkeypatch.setattr(cables, "limit_solref", lambda *arguments: 1.001 * right(*arguments))
@@ -123,6 +126,7 @@ def test_loads_left_out_of_the_balance_are_noticed(monkeypatch):
     assert conservation.momentum_drift(conservation.make_team("chain"), 0.1)[0] > 1e-9
 
 
+@pytest.mark.slow
 def test_a_flight_without_feed_forward_is_not_good_enough(monkeypatch):
     monkeypatch.setattr(flight, "carrying_forces", lambda system, acceleration, velocity: 0.0)
     assert any(row.quantity.startswith("mean payload") for row in EXPERIMENTS["flight"](True).rows if not row.passed)

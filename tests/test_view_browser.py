@@ -109,6 +109,7 @@ def _pages(port):
         return [page for page in json.load(answer) if page["type"] == "page"]
 
 
+@pytest.mark.slow
 def test_the_panel_holds_every_control(tab):
     tab.wait(
         "hover, 4 drones, episode ", "Pause", "One step", "Reset", "Next episode", "Speed", "Policy",
@@ -116,6 +117,7 @@ def test_the_panel_holds_every_control(tab):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_scene_shows_payload_target_cables_and_drones(tab):
     tab.wait("of 8 s")
     hold(tab)
@@ -128,6 +130,7 @@ def test_the_scene_shows_payload_target_cables_and_drones(tab):
         assert found >= least, f"{found} pixels of {name}"
 
 
+@pytest.mark.slow
 def test_a_push_by_its_button_moves_the_payload_in_the_picture(tab):
     tab.wait("of 8 s")
     hold(tab)

@@ -54,6 +54,7 @@ def test_wash_at_a_rotor_is_twice_the_induced_velocity_of_momentum_theory():
     np.testing.assert_allclose(below(world, (x, y, 10 - 1e-9)), [0, 0, -2 * induced], rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("breadth", [0.0, 0.2])
 @pytest.mark.parametrize("depth", [0.05, 0.7, 3.0])
 def test_the_jets_momentum_is_the_thrust_at_any_depth(depth, breadth):

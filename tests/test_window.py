@@ -60,6 +60,7 @@ def test_both_single_team_apis_offer_it():
         assert api.metadata["render_modes"] == ["rgb_array", "human"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("xvfb-run"), reason="no virtual display on this machine")
 def test_a_window_shows_every_step():
     command = ["xvfb-run", "-a", "-s", "-screen 0 1280x720x24", sys.executable, "-c", WATCH]

@@ -180,6 +180,7 @@ def step_once(model, start, solver: int, tolerance: float, iterations: int) -> n
     return data.qvel.copy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "preset, num_drones",
     [("hover", 4), ("recover_crazymarl", 3), ("loss", 4), ("takeoff", 8), ("takeoff", 16), ("track_auto6", 6)],
