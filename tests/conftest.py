@@ -21,6 +21,8 @@ import multilift_marl as ml
 from multilift_marl import plugins, tasks
 from multilift_marl.config.load import CONFIGS
 from multilift_marl.control.formation import place_formation
+from multilift_marl.control.gains import DroneGains, Gains
+from multilift_marl.control.gains import drone_gains as gains_of_a_drone
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
 from multilift_marl.rig import vehicles
@@ -112,6 +114,11 @@ def make(task: str = "hover", num_envs: int = 4, num_drones: int = 4, num_thread
 def wide(task: str) -> dict[str, float]:
     """Return offsets with which drones of any task can fail: those of `takeoff` and `land` are small."""
     return {"control.max_offset": 0.5} if task in ("takeoff", "land") else {}
+
+
+def drone_gains(gains: Gains, n: int) -> DroneGains:
+    """Return the gains of drone n; compiled, kernels hand no arrays to Python."""
+    return gains_of_a_drone.py_func(gains, n)
 
 
 def make_system(num_drones: int = 1, **overrides) -> System:

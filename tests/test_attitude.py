@@ -7,11 +7,11 @@ from math import pi
 
 import numpy as np
 import pytest
-from conftest import floats, make_system, with_vehicle
+from conftest import drone_gains, floats, make_system, with_vehicle
 
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.allocation import allocate
-from multilift_marl.control.gains import drone_gains, make_gains
+from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import attitude_torque, desired_rates
 from multilift_marl.math3d import axis_angle, thrust_frame
 from multilift_marl.rig.vehicles import PRESETS, Vehicle

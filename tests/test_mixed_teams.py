@@ -7,11 +7,11 @@ import re
 import mujoco
 import numpy as np
 import pytest
-from conftest import floats, load, make, make_system, refuse_system, same, zeros
+from conftest import drone_gains, floats, load, make, make_system, refuse_system, same, zeros
 
 import multilift_marl as ml
 from multilift_marl.config.schema import ControlConfig
-from multilift_marl.control.gains import drone_gains, make_gains
+from multilift_marl.control.gains import make_gains
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.rig.payload import formation_forces
 from multilift_marl.rig.vehicles import PRESETS

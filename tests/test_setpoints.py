@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import GRAVITY, floats, free_world, load, make_system
+from conftest import GRAVITY, drone_gains, floats, free_world, load, make_system
 
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import Reference
-from multilift_marl.control.gains import Gains, drone_gains, make_gains
+from multilift_marl.control.gains import Gains, make_gains
 from multilift_marl.control.geometric import attitude_torque, fly, fly_rates, rate_torque
 from multilift_marl.control.setpoints import Setpoint, smooth_velocity, track_own_state
 from multilift_marl.math3d import axis_angle

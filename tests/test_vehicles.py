@@ -8,11 +8,11 @@ from math import exp, pi, sqrt
 
 import numpy as np
 import pytest
-from conftest import GRAVITY, floats, free_world, load, make_system, refuse_system
+from conftest import GRAVITY, drone_gains, floats, free_world, load, make_system, refuse_system
 
 from multilift_marl.config.schema import ControlConfig, VehicleConfig
 from multilift_marl.control.allocation import allocate
-from multilift_marl.control.gains import DroneGains, drone_gains, make_gains
+from multilift_marl.control.gains import DroneGains, make_gains
 from multilift_marl.control.geometric import attitude_torque
 from multilift_marl.math3d import axis_angle
 from multilift_marl.rig.vehicles import PRESETS, resolve_vehicles

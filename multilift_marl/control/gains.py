@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import inlined
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.errors import warn_once
 from multilift_marl.math3d import row
@@ -65,7 +65,7 @@ class DroneGains(NamedTuple):
     drag: tuple[float, float, float]
 
 
-@kernel
+@inlined
 def drone_gains(g, n):
     """Return the DroneGains of drone n."""
     return DroneGains(

@@ -177,8 +177,8 @@ def sense(lo, hi, state, seen, memory, noise, attitude):
             put(seen.drone_body_rates[e, n], add(vec(state.drone_body_rates, e, n), _off(e, n, 3, memory, noise)))
         put(seen.payload_position[e], add(row(state.payload_position, e), _off(e, count, 0, memory, noise)))
         put(seen.payload_velocity[e], add(row(state.payload_velocity, e), _off(e, count, 1, memory, noise)))
-        seen.payload_rotation[e] = state.payload_rotation[e]
-        seen.payload_body_rates[e] = state.payload_body_rates[e]
+        putmat(seen.payload_rotation[e], matrow(state.payload_rotation, e))
+        put(seen.payload_body_rates[e], row(state.payload_body_rates, e))
         if attitude:
             turned = _turned(_off(e, count, 2, memory, noise), matrow(state.payload_rotation, e))
             putmat(seen.payload_rotation[e], turned)
@@ -201,10 +201,10 @@ def delay_observations(lo, hi, observation, memory, first, last):
     held = memory.observations
     for e in range(lo, hi):
         now = memory.seen[e]
-        held[e, now % held.shape[1]] = observation[e]
         then = now - min(memory.observation_delay[e], now)
         for n in range(observation.shape[1]):
             for k in range(observation.shape[2]):
+                held[e, now % held.shape[1], n, k] = observation[e, n, k]
                 if not first <= k < last:
                     observation[e, n, k] = held[e, then % held.shape[1], n, k]
         memory.seen[e] = now + 1
@@ -216,10 +216,9 @@ def delay_actions(lo, hi, action, memory, applied):
     held = memory.actions
     for e in range(lo, hi):
         now = memory.sent[e]
-        held[e, now % held.shape[1]] = action[e]
         then = now - memory.action_delay[e]
-        if then >= 0:
-            applied[e] = held[e, then % held.shape[1]]
-        else:
-            applied[e] = 0.0
+        for n in range(action.shape[1]):
+            for k in range(action.shape[2]):
+                held[e, now % held.shape[1], n, k] = action[e, n, k]
+                applied[e, n, k] = held[e, then % held.shape[1], n, k] if then >= 0 else 0.0
         memory.sent[e] = now + 1
