@@ -35,6 +35,7 @@ def ensemble(request):
     return np.concatenate(seen).reshape(-1, vec.observation_size).astype(float), np.concatenate(states), vec
 
 
+@pytest.mark.slow
 def test_no_number_of_an_observation_is_constant(ensemble):
     observation, _, vec = ensemble
     spread = np.ptp(observation, axis=0)

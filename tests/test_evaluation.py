@@ -177,6 +177,7 @@ def run(tmp_path_factory):
     return trainer.folder
 
 
+@pytest.mark.slow
 def test_command_writes_metrics_plots_and_table(run, tmp_path, capsys):
     arguments = [f"run={run}", "episodes=4", "seed=1000", f"out={tmp_path}", "env.num_drones=3", "payload.mass=1.2"]
     assert evaluate(arguments) == 0

@@ -142,6 +142,7 @@ def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones, cabl
         assert terminated or truncated
 
 
+@pytest.mark.slow
 def test_vector_environments_tell_exactly_what_gymnasiums_own_do(task, cables):
     """Ours against SyncVectorEnv of single environments numbered as the batch's, over failures and time-outs."""
     count, seed, keywords = 3, 7, {"env.episode_seconds": 4.0, **cables}

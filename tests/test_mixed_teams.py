@@ -177,6 +177,7 @@ def test_a_mixed_team_hovers(model, teams):
     assert success.mean() > 0.9 and not failed.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_mixed_teams_are_deterministic_and_can_be_saved(model):
     def vec(num_threads=1, num_envs=3):

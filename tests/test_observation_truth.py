@@ -237,6 +237,7 @@ OWN: dict[str, Callable[[Moment, list[Moment]], dict[str, np.ndarray]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_every_number_of_an_observation_is_what_the_documents_say(task):
     hooks = {"cable.hook": [0.01, -0.005, -0.03]}

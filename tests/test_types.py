@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 SCRIPT = """
 from collections.abc import Callable
@@ -69,6 +71,7 @@ def mypy(cwd, *files):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_the_package_is_sound():
     mypy(ROOT)
 
