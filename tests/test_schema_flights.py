@@ -77,7 +77,7 @@ def base(name: str) -> tuple[dict[str, Any], dict[str, Any]]:
 def choices(key: str) -> list[Any]:
     """Return the values of a key that has only a few; none of one that is a number."""
     if key == "vehicle.preset":
-        return ["falcon", "crazyflie", "crazyflie_id", "hummingbird", "iris"]
+        return ["falcon", "crazyflie", "crazyflie_id", "hummingbird", "iris", "x500"]
     if key == "vehicle.rotor_spin":
         return [[-1, 1, -1, 1], [1, -1, 1, -1]]
     if key == "vehicle.rotor_azimuth":

@@ -20,6 +20,7 @@ from conftest import (
 )
 
 from multilift_marl.math3d import rot_z
+from multilift_marl.rig.vehicles import PRESETS
 from multilift_marl.sim import World
 from multilift_marl.sim.air import AIR_DENSITY, SPREADING, ground_gain, make_air, wash_at
 
@@ -172,7 +173,7 @@ def test_four_rotors_in_a_square_feel_the_ground_as_sanchez_cuevas_says(preset):
 
 
 def test_ground_effect_vanishes_with_height_and_is_bounded_below():
-    for preset in ("falcon", "crazyflie", "crazyflie_id", "hummingbird", "iris"):
+    for preset in PRESETS:
         c = make_air(make_system(1, **{"vehicle.preset": preset}))
         gains = [ground_gain(z * c.rotor_radius[0], 0, c) for z in (0.5, 1, 2, 4, 8, 16, 1000)]
         assert gains == sorted(gains, reverse=True) and 1 < gains[-2] < 1.002 and abs(gains[-1] - 1) < 1e-6

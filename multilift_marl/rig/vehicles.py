@@ -217,8 +217,35 @@ _IRIS = Vehicle(
     rotor_azimuth=(_IRIS_FRONT, float(np.pi) - _IRIS_FRONT, float(np.pi) + _IRIS_FRONT, float(2 * np.pi) - _IRIS_FRONT),
 )
 
+# PX4/PX4-gazebo-models, models/x500_base/model.sdf (body; rotors at (± 0.174, ± 0.174, 0.06) m), models/x500/model.sdf
+# (rotors' numbers); PX4's default vehicle. Inertia: body and rotors, the rotors as points, about the centre of mass,
+# which is 2 mm above the body's. No idle speed. Drag as above; rolling moment off, as above. Rotor inertia: of a bar of
+# 16 g as long as the rotor's box, 0.279 m; there it is half as long.
+_X500_ROTOR = 0.016076923076923075
+_X500_MASS = 2.0 + 4 * _X500_ROTOR
+_X500_LIFT = 2.0 * 4 * _X500_ROTOR / _X500_MASS * 0.06**2  # m_1 m_2 / m z² of body and rotors, z apart
+_X500 = Vehicle(
+    name="x500",
+    mass=_X500_MASS,
+    inertia=(
+        0.02166666666666667 + 4 * _X500_ROTOR * 0.174**2 + _X500_LIFT,
+        0.02166666666666667 + 4 * _X500_ROTOR * 0.174**2 + _X500_LIFT,
+        0.04000000000000001 + 8 * _X500_ROTOR * 0.174**2,
+    ),
+    arm=0.174 * 2**0.5,
+    thrust_coefficient=8.54858e-6,
+    torque_ratio=0.016,
+    rotor_time_constant_up=0.0125,
+    rotor_time_constant_down=0.025,
+    rotor_speed_min=0.0,
+    rotor_thrust_max=8.54858e-6 * 1000.0**2,
+    drag=_rotor_drag(_X500_MASS, 8.54858e-6, 8.06428e-5),
+    rotor_radius=0.2792307692307692 / 2,
+    rotor_inertia=_X500_ROTOR * (0.2792307692307692**2 + 0.016923076923076923**2) / 12,
+)
+
 PRESETS: dict[str, Vehicle] = {
-    vehicle.name: vehicle for vehicle in (_FALCON, _CRAZYFLIE, _CRAZYFLIE_ID, _HUMMINGBIRD, _IRIS)
+    vehicle.name: vehicle for vehicle in (_FALCON, _CRAZYFLIE, _CRAZYFLIE_ID, _HUMMINGBIRD, _IRIS, _X500)
 }
 
 
