@@ -76,6 +76,7 @@ def test_the_package_is_sound():
     mypy(ROOT)
 
 
+@pytest.mark.slow
 def test_scripts_see_real_types(tmp_path):
     (tmp_path / "fly.py").write_text(SCRIPT)
     mypy(tmp_path, "fly.py")

@@ -63,7 +63,7 @@ def as_mapping(values: Any, source: Path, expected: str) -> dict[str, Any]:
 def pin_file(reference: str) -> str:
     """Return the absolute path of a file with the hash of its content: "/home/me/path.csv#sha256=1f3a…".
 
-    A run folder or a checkpoint then names what was flown, wherever it is read. A reference that has a hash is returned
+    A run folder or a checkpoint then names what was used, wherever it is read. A reference that has a hash is returned
     as it is; one of a file that is missing has none.
 
     Raises:

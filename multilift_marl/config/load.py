@@ -113,7 +113,7 @@ def resolve_config(
     task: str | Config, *, num_envs: int | None = None, num_threads: int | None = None,
     num_drones: int | None = None, seed: int | None = None, **overrides: Any,
 ) -> Config:  # fmt: skip
-    """Return the configuration that every door builds from; None means the configured value.
+    """Return the configuration that every API builds from; None means the configured value.
 
     Raises:
         ConfigError: see `load_config`; or one value was given twice, differently.

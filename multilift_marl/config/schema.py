@@ -138,7 +138,7 @@ class CableConfig(Section):
     """The cables; lists hold one value for each drone."""
 
     model: Literal["massless", "chain"] = Field(
-        "massless", description="massless: pull-only Kelvin-Voigt element; chain: masses, springs and dampers"
+        "massless", description="massless: tension-only Kelvin-Voigt element; chain: masses, springs and dampers"
     )
     length: Annotated[PerDrone | None, Between(1e-3, 1000, "m")] = Field(
         None, description="[m] natural length; None: 1 m, more if a point load needs it"
@@ -226,11 +226,15 @@ class RandomizationConfig(Section):
         0.0, ge=0, description="[N] constant horizontal force, magnitude uniform up to this"
     )
     cable_length: Share = Field(0.0, description="[-] length of each cable scaled by 1 ± this, uniform")
-    cable_stiffness: Share = Field(0.0, description="[-] stiffness of each cable, likewise")
-    vehicle_mass: Share = Field(0.0, description="[-] mass and inertia of each drone, likewise")
-    vehicle_thrust_coefficient: Share = Field(0.0, description="[-] of each drone's rotors, likewise")
-    vehicle_rotor_time_constant: Share = Field(0.0, description="[-] of each drone's rotors, up and down, likewise")
-    vehicle_drag: Share = Field(0.0, description="[-] drag of each drone, likewise")
+    cable_stiffness: Share = Field(0.0, description="[-] stiffness of each cable scaled by 1 ± this, uniform")
+    vehicle_mass: Share = Field(0.0, description="[-] mass and inertia of each drone scaled by 1 ± this, uniform")
+    vehicle_thrust_coefficient: Share = Field(
+        0.0, description="[-] of each drone's rotors, scaled by 1 ± this, uniform"
+    )
+    vehicle_rotor_time_constant: Share = Field(
+        0.0, description="[-] of each drone's rotors, up and down, scaled by 1 ± this, uniform"
+    )
+    vehicle_drag: Share = Field(0.0, description="[-] drag of each drone scaled by 1 ± this, uniform")
     wind: Annotated[Float, Between(0, 60, "m/s")] = Field(
         0.0, ge=0, description="[m/s] horizontal mean wind, beside wind.velocity, uniform up to this"
     )

@@ -42,9 +42,9 @@ class MultiliftVec:
         failure_causes: names of the values of `info["failure_cause"]`.
         max_steps: policy steps of an episode.
         control_ticks: control steps of a policy step.
-        seeds, episodes, steps: of the episodes in progress: seed, number, policy steps flown (E,) int64.
+        seeds, episodes, steps: of the episodes in progress: seed, number, policy steps so far (E,) int64.
         world: the physics; `world.state` is the true state.
-        pilot: what flies the drones; `reference` is its reference.
+        controller: of the drones; `reference` is its reference.
         task: the task; `task.goal` and `task.errors` say where the payload should be.
 
     Raises:
@@ -141,7 +141,7 @@ class MultiliftVec:
         self.world.run(lambda shard: self._pipelines[shard.lo].run())
         self.world.check_warnings()
         self.steps += 1
-        if begin.any():  # these have flown on, which nobody sees
+        if begin.any():  # these were simulated on, unseen
             self.reset(mask=begin)
         diverged = self.world.diverged
         if diverged.any():
@@ -302,7 +302,7 @@ def make_vec(
 
     Args:
         task: a configuration's name, the path of one, or a Config.
-        num_envs: E; None for the configured value, likewise the next three.
+        num_envs: E; None for the configured value, as for the next three.
         num_threads: threads that step them; 0 for one on each CPU. Results do not depend on it.
         num_drones: N.
         seed: seed of the first reset.

@@ -1,4 +1,4 @@
-"""The Gymnasium doors: a team flown as one agent, alone or E of them on the batched core."""
+"""The Gymnasium APIs: a team as one agent, alone or E of them on the batched core."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Args:
         task: a configuration's name, the path of one, or a Config.
         render_mode: None, "rgb_array" for `render`, or "human" for a window that shows every step.
-        num_drones: N; None for the configured value, likewise the next.
+        num_drones: N; None for the configured value, as for the next.
         seed: of the first reset; None draws one, unless the configuration states it.
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
 
@@ -131,7 +131,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Args:
         task: a configuration's name, the path of one, or a Config.
-        num_envs: E; None for the configured value, likewise the next three.
+        num_envs: E; None for the configured value, as for the next three.
         num_threads: threads that step them; 0 for one on each CPU. Results do not depend on it.
         num_drones: N.
         seed: of the first reset; None draws one, unless the configuration states it.
@@ -244,15 +244,15 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _told(self, info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
         """Return the core's info in Gymnasium's form: a mask beside every entry, and nothing outside the mask."""
-        told: dict[str, Any] = {key: info[key] & mask for key in ("success", "failure", "diverged")}
-        told["failure_cause"] = np.where(mask, self._causes[info["failure_cause"]], None)
+        values: dict[str, Any] = {key: info[key] & mask for key in ("success", "failure", "diverged")}
+        values["failure_cause"] = np.where(mask, self._causes[info["failure_cause"]], None)
         terms = {name: np.where(mask, value, 0.0) for name, value in info["reward_terms"].items()}
-        told["reward_terms"] = terms | {f"_{name}": mask.copy() for name in terms}
+        values["reward_terms"] = terms | {f"_{name}": mask.copy() for name in terms}
         drawn = {}
         for name, value in info["randomization"].items():
             drawn[name] = np.where(mask.reshape(-1, *(1,) * (value.ndim - 1)), value, np.zeros_like(value))
-        told["randomization"] = drawn | {f"_{name}": mask.copy() for name in drawn}
-        return told | {f"_{key}": mask.copy() for key in told}
+        values["randomization"] = drawn | {f"_{name}": mask.copy() for name in drawn}
+        return values | {f"_{key}": mask.copy() for key in values}
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

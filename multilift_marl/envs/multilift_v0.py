@@ -1,4 +1,4 @@
-"""The PettingZoo door: one environment, one agent for each drone."""
+"""The PettingZoo API: one environment, one agent for each drone."""
 
 from __future__ import annotations
 
@@ -157,13 +157,15 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
 
     def _infos(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
         """Return a dict for each agent; nothing in it is shared, so that wrappers may write into theirs."""
-        told: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
-        told["failure_cause"] = int(info["failure_cause"][0])
+        values: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
+        values["failure_cause"] = int(info["failure_cause"][0])
         terms = info["reward_terms"].values()
-        told |= {name: float(array[0]) for name, array in zip(self._term_names, terms, strict=True)}
-        told |= {f"randomization.{name}": array[0] for name, array in info["randomization"].items()}
-        rows = {key: row for key, row in told.items() if isinstance(row, np.ndarray)}  # numbers cannot be written into
-        return {name: told | {key: row.copy() for key, row in rows.items()} for name in self.possible_agents}
+        values |= {name: float(array[0]) for name, array in zip(self._term_names, terms, strict=True)}
+        values |= {f"randomization.{name}": array[0] for name, array in info["randomization"].items()}
+        rows = {
+            key: row for key, row in values.items() if isinstance(row, np.ndarray)
+        }  # numbers cannot be written into
+        return {name: values | {key: row.copy() for key, row in rows.items()} for name in self.possible_agents}
 
     def _mismatch(self, actions: dict[str, Any]) -> ValueError:
         for name in self.possible_agents:
@@ -181,7 +183,7 @@ def parallel_env(
 
     Args:
         task: a configuration's name, the path of one, or a Config.
-        num_drones: N; None for the configured value, likewise the next.
+        num_drones: N; None for the configured value, as for the next.
         seed: of the first reset; None draws one, unless the configuration states it.
         render_mode: None, "rgb_array" or "human".
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.

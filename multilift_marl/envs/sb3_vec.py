@@ -33,7 +33,7 @@ class MultiliftSB3VecEnv(VecEnv):
 
     Args:
         task: a configuration's name, the path of one, or a Config.
-        num_envs: E; None for the configured value, likewise the next two.
+        num_envs: E; None for the configured value, as for the next two.
         num_threads: threads that step them; 0 for one on each CPU. Results do not depend on it.
         num_drones: N.
         seed: of the first reset; None draws one, unless the configuration states it.

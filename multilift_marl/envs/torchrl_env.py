@@ -1,4 +1,4 @@
-"""The TorchRL door: a natively batched EnvBase with masked resets."""
+"""The TorchRL API: a natively batched EnvBase with masked resets."""
 
 from __future__ import annotations
 
@@ -93,9 +93,9 @@ class MultiliftEnv(EnvBase):
             return tensordict
         fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
         started = done.new_zeros(()) if done.all() else done
-        told = set(fresh.keys(True, True))
+        known = set(fresh.keys(True, True))
         for key, value in tensordict.items(True, True):
-            if key not in told:
+            if key not in known:
                 fresh.set(key, value.masked_fill(started.reshape(-1, *(1,) * (value.dim() - 1)), 0))
         return fresh
 

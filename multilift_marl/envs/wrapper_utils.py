@@ -38,7 +38,7 @@ class FrameRenderer:
 
     Args:
         vec: the environments.
-        render_mode: None, "rgb_array" for pictures, or "human" for a window that shows every step as it is flown.
+        render_mode: None, "rgb_array" for pictures, or "human" for a window that shows every step.
         modes: those of the face.
 
     Raises:
@@ -70,7 +70,7 @@ class FrameRenderer:
         return self._renderer.frame(env)
 
     def show(self) -> None:
-        """Show what has just been flown, if the render mode is "human".
+        """Show the step just made, if the render mode is "human".
 
         Raises:
             RenderingError: there is no display.
@@ -109,8 +109,8 @@ def solo_info(vec: MultiliftVec, info: dict[str, Any]) -> dict[str, Any]:
         `success`, `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms`
         {name: float} and `randomization` {name: array}.
     """
-    told: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
-    told["failure_cause"] = vec.failure_causes[info["failure_cause"][0]]
-    told["reward_terms"] = dict(zip(vec.reward_terms, vec.task.terms[0].tolist(), strict=True))
-    told["randomization"] = {name: array[0].copy() for name, array in info["randomization"].items()}
-    return told
+    values: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
+    values["failure_cause"] = vec.failure_causes[info["failure_cause"][0]]
+    values["reward_terms"] = dict(zip(vec.reward_terms, vec.task.terms[0].tolist(), strict=True))
+    values["randomization"] = {name: array[0].copy() for name, array in info["randomization"].items()}
+    return values

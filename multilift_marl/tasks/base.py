@@ -66,7 +66,7 @@ class Kernels(NamedTuple):
     """After every policy step, before failures are looked for."""
     update: Callable[..., Any] | None = None
     """After the reward."""
-    look: Callable[..., Any] | None = None
+    preview: Callable[..., Any] | None = None
     """Before the global state and the observations are written: computes what several components need."""
 
 
@@ -282,7 +282,7 @@ class Task:
             "observe": self._bind(compose_observation(self.EXTRA, size), v, self.observation),
         }
         true = v._replace(seen=v.state, seen_errors=v.errors)
-        stages["observe state"] = self._bind(compose_state(self.EXTRA_STATE, kernels.look, size), true, self.critic)
+        stages["observe state"] = self._bind(compose_state(self.EXTRA_STATE, kernels.preview, size), true, self.critic)
         if kernels.plan is not None:
             stages["plan"] = self._bind(compose_plan(kernels.plan), v)
         return stages

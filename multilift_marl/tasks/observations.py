@@ -1,7 +1,7 @@
 """What each drone observes, and the global state for a critic: tables of components, each with what computes it.
 
 Vectors are given in the drone's slot frame (x outward from the target payload pose through the drone's slot, z up):
-in it the same situation looks the same to every drone, and an action of the `reference` interface points the same way.
+the same situation has the same numbers for every drone, and an action of the `reference` interface the same direction.
 
 A new component of all tasks makes earlier policies unusable; one of a task's own goes into its `EXTRA`. What is no
 field of `SystemState` must first be computed there, and measured in `tasks/sensing.py`.
@@ -331,20 +331,20 @@ def compose_observation(extra: tuple[Component, ...], action_size: int) -> Any:
     return compose("observe", "\n".join(lines) + "\n", functions)
 
 
-def compose_state(extra: tuple[Component, ...], look: Callable[..., Any] | None, action_size: int) -> Any:
+def compose_state(extra: tuple[Component, ...], preview: Callable[..., Any] | None, action_size: int) -> Any:
     """Return the kernel of (lo, hi, View, critic (E, S)) that writes the global state, in the target's heading frame.
 
     Args:
         extra: what the task adds at the end.
-        look: inlined kernel of (e, View), called first; None for none.
+        preview: inlined kernel of (e, View), called first; None for none.
         action_size: numbers of an action.
     """
-    functions: dict[str, Any] = {"turn": turn, "cos": cos, "sin": sin} | ({"look": look} if look else {})
+    functions: dict[str, Any] = {"turn": turn, "cos": cos, "sin": sin} | ({"preview": preview} if preview else {})
     first, _, size = drone_numbers(0, action_size)
     drone = _write("out", "at + ", "n", DRONE_STATE, functions)
     drone += [f"out[at + {size - action_size + k}] = v.action[e, n, {k}]" for k in range(action_size)]
     lines = ["def observe_state(lo, hi, v, critic):", "    for e in range(lo, hi):", "        out = critic[e]"]
-    lines += ["        look(e, v)"] if look else []
+    lines += ["        preview(e, v)"] if preview else []
     lines.append("        c, s = cos(v.goal.yaw[e]), -sin(v.goal.yaw[e])")  # world to the target's heading frame
     lines += [f"        {line}" for line in _write("out", "", "0", STATE, functions)]
     lines += ["        for n in range(v.action.shape[1]):", f"            at = {first} + n * {size}"]

@@ -1,7 +1,7 @@
 """Paths that a payload is to follow: circle, figure-eight, lemniscate, helix, smooth random ones, and those of files.
 
 A path is a curve over its own time τ, turned by a heading and moved to a centre; it starts at rest: τ runs slower than
-time at first, smoothly to the third derivative. The path of a file is flown as it is written, in its own time, neither
+time at first, smoothly to the third derivative. The path of a file is followed as written, in its own time, neither
 turned nor moved. Velocity, acceleration and jerk are central differences of five points.
 """
 

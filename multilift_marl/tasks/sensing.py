@@ -43,7 +43,7 @@ class Memory(NamedTuple):
     actions: np.ndarray
     """(E, K, N, A) the last ones, at their number modulo K."""
     observations: np.ndarray
-    """(E, K, N, D) likewise."""
+    """(E, K, N, D) as the array before."""
 
 
 class Sensing:

@@ -40,7 +40,7 @@ class CableEquilibrium(NamedTuple):
     """Numbers of a team that hangs in equilibrium."""
 
     length: np.ndarray
-    """(N,) of the cables [m]; likewise the next ones."""
+    """(N,) of the cables [m], as the next ones."""
     stiffness: np.ndarray
     weight: np.ndarray
     segments: np.ndarray

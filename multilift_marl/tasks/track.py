@@ -150,7 +150,7 @@ def advance_target(e, v):
 
 
 @inlined
-def look_ahead(e, v):
+def preview_target(e, v):
     """Compute how the target moves in the next seconds."""
     for i in range(len(AHEAD)):
         there = place(e, v.time[e] + AHEAD[i], v.own.path, v.settings.table)
@@ -248,7 +248,7 @@ class Track(Task):
         "heading": Term(0.0, heading, 0.5, "deg"),
         "action_rate": Term(-0.05, action_rate),
     }
-    KERNELS: ClassVar[Kernels] = Kernels(never, plan=advance_target, update=note_worst, look=look_ahead)
+    KERNELS: ClassVar[Kernels] = Kernels(never, plan=advance_target, update=note_worst, preview=preview_target)
     EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")
 
