@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import make, refusal, same, zeros
 
+from multilift_marl._jit import compose, inlined, kernel
 from multilift_marl.config.load import load_config
 from multilift_marl.tasks import TASKS
 from multilift_marl.tasks.hover import Hover
@@ -130,3 +131,19 @@ def reward_table() -> str:
 def test_the_documents_state_every_reward_term():
     """A weight or a margin does not change unnoticed."""
     assert reward_table() in (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
+
+
+@inlined
+def doubled_sum(values):
+    return (values + values).sum()
+
+
+@kernel
+def doubled(values):
+    return values + values
+
+
+def test_kernels_from_outside_the_package_may_make_arrays():
+    source = "def total(values):\n    return doubled_sum(values)\n"
+    assert compose("total", source, {"doubled_sum": doubled_sum})(np.ones(3)) == 6.0
+    assert doubled(np.ones(3)).tolist() == [2.0, 2.0, 2.0]
