@@ -50,7 +50,7 @@ def test_a_term_is_its_weight_without_error_and_half_of_it_at_its_margin(resting
 
 def test_weight_and_margins_are_configuration():
     bare = make("hover", num_envs=1, **{"reward.position": 0.7})
-    long = make("hover", num_envs=1, **{"reward.position.weight": 0.7, "reward.position.margin": [0.5]})
+    long = make("hover", num_envs=1, **{"reward.position.weight": 0.7, "reward.position.margin": 0.5})
     both = make("hover", num_envs=1, **{"reward.stillness.margin": [1.0, 2.0], "reward.attitude.margin": [12.0]})
     for vec in (bare, long, both):
         vec.reset(seed=0)
@@ -72,6 +72,8 @@ def test_weight_and_margins_are_configuration():
         ("reward.position.wieght", 1.0, "unknown key 'reward.position.wieght'"),
         ("reward.position", "much", "reward.position"),
         ("reward.position.margin", [0.0], "reward.position.margin"),
+        ("reward.position.margin", 0.0, "reward.position.margin"),
+        ("reward.position.margin", "wide", "reward.position.margin must be a list, but is 'wide'"),
         ("reward.position.margin", [0.1, 0.2], "reward.position.margin lists 2 numbers, but the term has 1"),
         ("reward.action_rate.margin", [0.1], "reward.action_rate.margin lists 1 numbers, but the term has 0"),
     ],

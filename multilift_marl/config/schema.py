@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import pi
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, create_model, model_validator
+from pydantic import AfterValidator, Field, create_model, field_validator, model_validator
 
 from multilift_marl.config.files import pin_files, pin_vehicles
 from multilift_marl.config.values import (
@@ -338,13 +338,19 @@ class RewardTerm(Section):
 
     weight: Annotated[Float, Between(-1e6, 1e6)] | None = Field(None, description="[-] None: the task's own")
     margin: tuple[Annotated[Float, Between(1e-6, 1e6)], ...] | None = Field(
-        None, description="errors at which it is half its value, in the term's units; None: the task's own"
+        None,
+        description="errors, one or a list, that halve its value, in the term's units; None: the task's own",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _from_number(cls, value: Any) -> Any:
         return value if isinstance(value, dict | RewardTerm) else {"weight": value}
+
+    @field_validator("margin", mode="before")
+    @classmethod
+    def _one_margin(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, int | float) else value
 
 
 if TYPE_CHECKING:

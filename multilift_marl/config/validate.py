@@ -49,10 +49,25 @@ def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) 
     if kind in ("missing", "too_long"):
         count = error["ctx"]["max_length"] if kind == "too_long" else 1 + max(e["loc"][-1] for e in about)
         return f"{key}{source} must be a list of {count} numbers, but is {shorten(repr(value))}"
+    if kind == "tuple_type":
+        wanted = _list_in_words(section.model_fields[path[-1]].annotation)
+        return f"{key}{source} must be {wanted}, but is {shorten(repr(value))}"
     if kind in ("model_type", "dict_type", "model_attributes_type"):
         return f"{key}{source} must be a section with keys of its own, but is {shorten(repr(value))}"
     message = error["msg"].removeprefix("Value error, ").replace("Input should", "must").replace("should", "must")
     return f"{key}{source} {message}, but is {shorten(repr(value))}"
+
+
+def _list_in_words(annotation: Any) -> str:
+    """Return what the first kind of list in an annotation holds."""
+    waiting = [annotation]
+    while waiting:
+        kind = waiting.pop(0)
+        inner = typing.get_args(kind)
+        if typing.get_origin(kind) is tuple:
+            return "a list" if Ellipsis in inner else f"a list of {len(inner)} numbers"
+        waiting.extend(inner)
+    return "a list"
 
 
 def _find_key(location: tuple[Any, ...], model: type[Section]) -> tuple[type[Section], list[str]]:
