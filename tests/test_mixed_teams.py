@@ -104,8 +104,8 @@ def test_a_weak_drone_carries_less_of_a_body_whose_weight_and_moments_stay_balan
 @pytest.mark.slow
 def test_each_drone_of_a_mixed_team_moves_as_it_does_alone():
     rng = np.random.default_rng(0)
-    thrust = rng.uniform(0.2, 0.8, (5, 4)) * [[PRESETS[name].rotor_thrust_max] for name in ALL]
-    places = np.array([[3.0 * n, 0.0, 0.1 + 0.1 * n] for n in range(5)])
+    thrust = rng.uniform(0.2, 0.8, (len(ALL), 4)) * [[PRESETS[name].rotor_thrust_max] for name in ALL]
+    places = np.array([[3.0 * n, 0.0, 0.1 + 0.1 * n] for n in range(len(ALL))])
 
     def moved(names, chosen):
         system = make_system(len(names), **{"vehicle.preset": names}, **APART)
@@ -117,7 +117,7 @@ def test_each_drone_of_a_mixed_team_moves_as_it_does_alone():
         world.step(thrust[chosen][None], 25)
         return world.state.drone_position[0], world.state.drone_rotation[0], world.state.rotor_speed[0]
 
-    team = moved(ALL, list(range(5)))
+    team = moved(ALL, list(range(len(ALL))))
     for n, name in enumerate(ALL):
         for together, alone in zip(team, moved([name], [n]), strict=True):
             np.testing.assert_allclose(together[n], alone[0], rtol=1e-9, atol=1e-12)
