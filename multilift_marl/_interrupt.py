@@ -7,14 +7,17 @@ import signal
 import sys
 from typing import Any
 
+_SCRIPTS = [os.path.abspath(f"{__file__}/../../{name}") for name in ("train.py", "evaluate.py")]
 _MODULES = ("multilift_marl.cli.", "multilift_marl.view", "multilift_marl.export")
 
 
 def _begin_quiet_import() -> None:
     """Until `end_quiet_import`, let Ctrl-C end the process with one word, if it is a command of this package."""
-    program = os.path.basename(sys.argv[0]) if sys.argv else ""
+    path = os.path.abspath(sys.argv[0]) if sys.argv else ""
+    program = os.path.basename(path)
     module = program == "-m" and any(word.startswith(_MODULES) for word in sys.orig_argv)
-    if (module or program.startswith("multilift-")) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    ours = module or program.startswith("multilift-") or path in _SCRIPTS
+    if ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)
 
 
