@@ -250,16 +250,6 @@ def thrust_frame(force, yaw):
 
 
 @kernel
-def any_nonzero(matrix):
-    """Return whether a matrix holds a number other than zero."""
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            if matrix[i, j] != 0.0:
-                return True
-    return False
-
-
-@kernel
 def segment_distance(p1, q1, p2, q2):
     """Return the distance between the segments p1 q1 and p2 q2 (Ericson, Real-Time Collision Detection, 5.1.9)."""
     d1, d2, r = sub(q1, p1), sub(q2, p2), sub(p1, p2)

@@ -1,8 +1,8 @@
 """What the tests share.
 
 A test that takes `task` runs for every task, one that takes `num_drones` for every N, and one that takes `cables`, the
-configuration of a cable model, for both models. Marked `slow`, and left out unless asked for by `-m slow`, are
-those for other than two drones and for chains, but for `hover`, beside those that say so.
+configuration of a cable model, for both models. For tasks other than `hover`, all but two drones on massless cables are
+marked `slow`; tests so marked are left out unless asked for by `-m slow`.
 """
 
 from __future__ import annotations

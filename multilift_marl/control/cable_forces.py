@@ -19,7 +19,6 @@ from multilift_marl._jit import kernel
 from multilift_marl.control.formation import hook_arm, place_formation
 from multilift_marl.math3d import (
     add,
-    any_nonzero,
     cross,
     dot,
     matmul,
@@ -272,7 +271,7 @@ def place_balanced(e, goal, rig, hanging):
     """
     place_formation(e, goal, rig)
     target = matrow(goal.rotation, e)
-    if target[8] > 1.0 - 1e-12 or not any_nonzero(rig.anchors):
+    if target[8] > 1.0 - 1e-12 or rig.is_point:
         return True
     for n in range(rig.anchors.shape[0]):
         cable_force = vec(goal.cable_force, e, n)

@@ -87,11 +87,14 @@ class Rig(NamedTuple):
     force: np.ndarray
     """(N, 3) [N]."""
     drones: Drones
+    is_point: bool
+    """Whether all cables end at the payload's centre of mass: it has no attitude to speak of."""
 
 
 def make_rig(system: System) -> Rig:
     """Return the formation of `system`."""
-    return Rig(system.anchors, system.slots, system.slot_azimuth, system.hook_force, make_drones(system))
+    point = not system.anchors.any()
+    return Rig(system.anchors, system.slots, system.slot_azimuth, system.hook_force, make_drones(system), point)
 
 
 class Reference(NamedTuple):

@@ -196,7 +196,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         options = dict(options or {})
         mask = options.pop("reset_mask", None)
         observation, info = self.vec.reset(seed, mask, options)
-        return self._joint(observation), self._told(info, np.ones(self.num_envs, bool) if mask is None else mask)
+        return self._joint(observation), self._masked(info, np.ones(self.num_envs, bool) if mask is None else mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all environments by one policy step and reset those that have ended, as `autoreset_mode` says.
@@ -219,10 +219,10 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             final = np.full(self.num_envs, None, dtype=object)
             for e in np.flatnonzero(over):
                 final[e] = observation[e].reshape(-1)
-            infos = {"final_obs": final, "final_info": self._told(info, over)}
+            infos = {"final_obs": final, "final_info": self._masked(info, over)}
             infos |= {f"_{key}": over.copy() for key in infos}
             observation, info = self.vec.reset(mask=over)
-        infos |= self._told(info, np.ones(self.num_envs, bool))
+        infos |= self._masked(info, np.ones(self.num_envs, bool))
         return self._joint(observation), mean_reward(reward), terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...]:
@@ -242,7 +242,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _joint(self, observation: np.ndarray) -> np.ndarray:
         return observation.reshape(self.num_envs, -1)
 
-    def _told(self, info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    def _masked(self, info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
         """Return the core's info in Gymnasium's form: a mask beside every entry, and nothing outside the mask."""
         values: dict[str, Any] = {key: info[key] & mask for key in ("success", "failure", "diverged")}
         values["failure_cause"] = np.where(mask, self._causes[info["failure_cause"]], None)

@@ -162,10 +162,8 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         terms = info["reward_terms"].values()
         values |= {name: float(array[0]) for name, array in zip(self._term_names, terms, strict=True)}
         values |= {f"randomization.{name}": array[0] for name, array in info["randomization"].items()}
-        rows = {
-            key: row for key, row in values.items() if isinstance(row, np.ndarray)
-        }  # numbers cannot be written into
-        return {name: values | {key: row.copy() for key, row in rows.items()} for name in self.possible_agents}
+        arrays = {key: value for key, value in values.items() if isinstance(value, np.ndarray)}  # can be written into
+        return {name: values | {key: array.copy() for key, array in arrays.items()} for name in self.possible_agents}
 
     def _mismatch(self, actions: dict[str, Any]) -> ValueError:
         for name in self.possible_agents:

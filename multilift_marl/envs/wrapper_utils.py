@@ -39,7 +39,7 @@ class FrameRenderer:
     Args:
         vec: the environments.
         render_mode: None, "rgb_array" for pictures, or "human" for a window that shows every step.
-        modes: those of the face.
+        modes: those of the API.
 
     Raises:
         ValueError: an unknown render mode.

@@ -223,15 +223,11 @@ _IRIS = Vehicle(
 # 16 g as long as the rotor's box, 0.279 m; there it is half as long.
 _X500_ROTOR = 0.016076923076923075
 _X500_MASS = 2.0 + 4 * _X500_ROTOR
-_X500_LIFT = 2.0 * 4 * _X500_ROTOR / _X500_MASS * 0.06**2  # m_1 m_2 / m z² of body and rotors, z apart
+_X500_ROLL = 0.02166666666666667 + 4 * _X500_ROTOR * (0.174**2 + 2.0 / _X500_MASS * 0.06**2)  # m_1 m_2 / m z²: z apart
 _X500 = Vehicle(
     name="x500",
     mass=_X500_MASS,
-    inertia=(
-        0.02166666666666667 + 4 * _X500_ROTOR * 0.174**2 + _X500_LIFT,
-        0.02166666666666667 + 4 * _X500_ROTOR * 0.174**2 + _X500_LIFT,
-        0.04000000000000001 + 8 * _X500_ROTOR * 0.174**2,
-    ),
+    inertia=(_X500_ROLL, _X500_ROLL, 0.04000000000000001 + 8 * _X500_ROTOR * 0.174**2),
     arm=0.174 * 2**0.5,
     thrust_coefficient=8.54858e-6,
     torque_ratio=0.016,

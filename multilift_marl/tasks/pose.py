@@ -59,7 +59,6 @@ class PoseSettings(NamedTuple):
     inertia: tuple[float, ...]
     """Of the payload in its frame, 9 numbers [kg m²]."""
     distribution: WrenchDistribution
-    is_point: bool
 
 
 @kernel
@@ -159,7 +158,6 @@ class Pose(Task):
             length=length,
             inertia=system.inertia_matrix,
             distribution=make_wrench_distribution(self.rig.anchors),
-            is_point=not self.rig.anchors.any(),
         )
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:

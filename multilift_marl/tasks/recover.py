@@ -13,7 +13,6 @@ from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import (
     add,
-    any_nonzero,
     axis_angle,
     clip,
     matmul,
@@ -72,7 +71,7 @@ def _tilted(rng, angle, yaw):
 def _throw(e, rng, state, goal, rig, hanging, throw):
     """Write a team whose cables hang slack, each drone somewhere near its slot's direction."""
     payload = add(row(goal.position, e), in_ball(rng, throw.radius))
-    attitude = _tilted(rng, 0.5 * throw.tilt, goal.yaw[e]) if any_nonzero(rig.anchors) else matrow(goal.rotation, e)
+    attitude = matrow(goal.rotation, e) if rig.is_point else _tilted(rng, 0.5 * throw.tilt, goal.yaw[e])
     put(state.payload_position[e], payload)
     put(state.payload_velocity[e], in_ball(rng, throw.speed))
     putmat(state.payload_rotation[e], attitude)

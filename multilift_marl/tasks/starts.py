@@ -12,22 +12,7 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import (
-    add,
-    any_nonzero,
-    axis_angle,
-    matmul,
-    matrow,
-    mul,
-    norm,
-    put,
-    putmat,
-    rot_z,
-    row,
-    scale,
-    sub,
-    vec,
-)
+from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.rig.constants import Drones, make_drones
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
@@ -190,6 +175,6 @@ def start_near_target(e, rng, v, ranges, hanging):
     tilt = axis_angle(scale(1.0 / max(norm(axis), 1e-9), axis), rng.uniform(0.0, ranges.tilt))
     velocity = in_ball(rng, ranges.speed)
     attitude = matrow(goal.rotation, e)
-    if any_nonzero(rig.anchors):  # a point has no attitude: it counts as aligned
+    if not rig.is_point:  # a point has no attitude: it counts as aligned
         attitude = matmul(tilt, attitude)
     hang_team(e, v, goal, hanging, (add(row(goal.position, e), moved), attitude), velocity, moved)

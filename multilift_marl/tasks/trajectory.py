@@ -177,7 +177,7 @@ def advance_plan(e, v):
         plan.stage[e] = stage
         set_goal_from_plan(e, stage + 1, plan, v.goal, v.rig, v.nominal)
     evaluate_plan(e, v, v.control_dt)
-    if v.settings.is_point:  # its attitude is that of the plan
+    if v.rig.is_point:  # its attitude is that of the plan
         putmat(v.state.payload_rotation[e], matrow(v.planned.rotation, e))
 
 
