@@ -183,6 +183,7 @@ def test_numbers_that_no_flight_can_have_are_named_with_their_bounds_and_unit(ke
         ({"randomization.payload_force": 5e3}, "randomization.payload_force", "lower it or raise payload.mass"),
         ({"payload.mass": 4e-4, "randomization.payload_force": 0.0}, "payload.drag_area", "raise payload.mass"),
         ({"payload.inertia": [1e-6] * 3}, "payload", "raise payload.inertia"),
+        ({"payload.inertia": [1e-6] * 3, "sim.timestep": 1e-5}, "faster than 500 rad/s", "raise payload.inertia"),
         ({"cable.stiffness": 10.0}, "cable.stiffness", "raise cable.stiffness"),
         ({"cable.length": 0.01}, "cable.length", "raise cable.length"),
         ({"cable.length": 1.0, "randomization.cable_length": 0.99}, "randomization.cable_length", "lower"),

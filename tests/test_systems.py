@@ -51,6 +51,23 @@ def test_neighbours_too_close_at_rest(overrides):
     )
 
 
+@pytest.mark.parametrize(
+    "drawn",
+    [{"randomization.payload_mass": 0.3}, {"randomization.cable_stiffness": 0.3}, {"randomization.cable_length": 0.05}],
+    ids=lambda drawn: next(iter(drawn)),
+)
+def test_neighbours_too_close_on_the_least_stretched_cables_that_are_drawn(drawn):
+    fixed = dict.fromkeys(("payload_mass", "cable_stiffness", "cable_length"), 0.0)
+    soft = {"payload.shape": "point", "payload.mass": 0.5, "cable.angle": 30, "cable.stiffness": 100.0}
+    soft |= {f"randomization.{name}": value for name, value in fixed.items()}
+    usual = make_system(2, **soft | {"cable.length": 1.0})
+    stretch = np.linalg.norm(usual.slots[0] - usual.slots[1]) - 1.0  # the cables make a triangle of equal sides
+    soft["cable.length"] = 0.351 - stretch
+    system = make_system(2, **soft)
+    assert np.isclose(np.linalg.norm(system.slots[0] - system.slots[1]), 0.351)
+    assert re.match(r"neighbouring drones 0 and 1 may rest 0\.3\d m apart", refuse_system(2, **soft | drawn))
+
+
 def heaviest(num_drones: int) -> float:
     """Return the payload mass at which the team's thrust is 1.18 times the weight of drones and payload."""
     vehicle = PRESETS["falcon"]

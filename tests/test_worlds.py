@@ -145,6 +145,18 @@ def test_a_diverged_simulation_keeps_sound_numbers_and_spares_the_others(force):
     assert all(np.isfinite(saved[key]).all() for key in saved if key.startswith("state."))
 
 
+def test_strong_damping_of_a_soft_cable_is_no_divergence():
+    system = make_system(2, **{"payload.shape": "point", "payload.mass": 0.4, "cable.stiffness": 47.6})
+    world = World(system, 1)
+    world.reset()
+    world.state.drone_velocity[0, :, 2] = 0.5
+    world.load(mask(1, 0))
+    world.step(hover_thrust(world))
+    stretch = np.linalg.norm(world.state.drone_position[0] - world.state.payload_position[0], axis=-1) - 1.0
+    assert world.state.cable_tension.min() > 5 * (47.6 * stretch).max()  # it is the damper's
+    assert not world.diverged.any()
+
+
 def test_reset_heals_a_diverged_simulation():
     system = make_system(4)
     world, fresh = World(system, 3, 1), World(system, 3, 1)

@@ -22,6 +22,7 @@ MAX_BENDING = 500.0  # [-] rate of bending in physics steps: substeps are as sho
 MAX_WIND = 60.0  # [m/s] mean wind and gusts together; bodies diverge at 100 m/s
 MAX_LOAD = 200.0  # [-] thrust over weight of a drone, hidden force over weight of the payload
 MAX_SPIN_UP = 50.0  # [rad/s] by which one physics step may change a body rate; rates diverge at 500 rad/s
+MAX_SWING = 500.0  # [rad/s] of a payload between its cables: tilted by 1 rad, it swings as fast as diverges
 MAX_STRAIN = 0.1  # [-] of a resting cable; cables diverge at 0.2
 MAX_LIGHTNESS = 100.0  # [-] time step over the period of a chain's nodes, across their links, which substeps resolve
 MIN_LENGTH = 0.15  # [-] of a cable over the span of its drone
@@ -79,12 +80,23 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
             "cable.segments, or raise cable.density"
         )
     if n > 1:
-        apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1) + 1e9 * np.eye(n)
+        _check_separation(system, ranges)
+
+
+def _check_separation(system: System, ranges: RandomizationConfig) -> None:
+    """Refuse drones that rest too close, nominally or with the lightest payload on the shortest and stiffest cables."""
+    strain = np.linalg.norm(system.formation_force, axis=1) / (system.cable_stiffness * system.cable_length)
+    least = strain * (1 - ranges.payload_mass) / ((1 + ranges.cable_stiffness) * (1 - ranges.cable_length))
+    shorter = 1 - (1 - ranges.cable_length) * (1 + least) / (1 + strain)
+    for verb, share in (("would", 0.0 * shorter), ("may", shorter)):
+        slots = system.slots - share[:, None] * (system.cable_ends - system.anchors)
+        apart = np.linalg.norm(slots[:, None] - slots[None], axis=-1) + 1e9 * np.eye(system.num_drones)
         i, j = (int(k) for k in np.unravel_index(np.argmin(apart - system.min_separation), apart.shape))
         if apart[i, j] < system.min_separation[i, j]:
+            lower = "lower randomization.cable_length, " if verb == "may" and ranges.cable_length else ""
             raise ConfigError(
-                f"neighbouring drones {i} and {j} would rest {apart[i, j]:.2f} m apart, closer than the separation "
-                f"limit of {system.min_separation[i, j]:.2f} m; spread payload.anchors or raise cable.length or "
+                f"neighbouring drones {i} and {j} {verb} rest {apart[i, j]:.2f} m apart, closer than the separation "
+                f"limit of {system.min_separation[i, j]:.2f} m; {lower}spread payload.anchors or raise cable.length or "
                 "cable.angle"
             )
 
@@ -261,11 +273,12 @@ def _check_payload(ranges: RandomizationConfig, wind: float, system: System) -> 
     reach = np.linalg.norm(system.anchors, axis=1)
     stiffest = (1 + ranges.payload_mass) * float(reach @ np.linalg.norm(system.formation_force, axis=1))
     swing = np.sqrt(stiffest / least)
-    if swing * step > 1:
+    if swing * step > 1 or swing > MAX_SWING:
+        fast = f"sim.timestep={step:g} s resolves" if swing * step > 1 else f"{MAX_SWING:g} rad/s"
         raise ConfigError(
             f"a payload whose least moment of inertia is {least:.3g} kg m² turns to and fro between its cables at "
-            f"{swing:.3g} rad/s, faster than sim.timestep={step:g} s resolves; raise payload.inertia or payload.size, "
-            "or lower sim.timestep"
+            f"{swing:.3g} rad/s, faster than {fast}; raise payload.inertia or payload.size"
+            + (", or lower sim.timestep" if swing < MAX_SWING else "")
         )
 
 

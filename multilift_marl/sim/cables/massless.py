@@ -128,11 +128,11 @@ def update_models(
 
 def bind_steps(batch: Batch, rows: Rows, data: SimData, cables: MasslessCables) -> tuple[None, Callable[[], None]]:
     """Return what to call before and after MuJoCo's step of a batch."""
-    return None, bind(read_state, rows, batch.bind("sensordata"), data, cables)
+    return None, bind(read_state, rows, batch.bind("sensordata"), batch.bind("ten_length"), data, cables)
 
 
 @kernel
-def read_state(rows, tension, data, cables):
+def read_state(rows, tension, length, data, cables):
     """Read the physical state out of `batch.state` and mark environments that have diverged.
 
     A diverged environment keeps its last sound state.
@@ -140,6 +140,7 @@ def read_state(rows, tension, data, cables):
     Args:
         rows: Rows of the environments.
         tension: cable tensions of the last physics step (environments, N) [N].
+        length: distances of the cables' ends at its beginning (environments, N) [m].
         data: SimData, written.
         cables: MasslessCables.
     """
@@ -149,7 +150,7 @@ def read_state(rows, tension, data, cables):
     for i in range(rows.state.shape[0]):
         e = rows.first + i
         line = rows.state[i]
-        if diverged[e] or not _is_sound(e, line, tension[i], cables, rows):
+        if diverged[e] or not _is_sound(e, line, tension[i], length[i], cables, rows):
             diverged[e] = True
             continue
         at = rows.qpos + rows.payload_nq
@@ -178,7 +179,7 @@ def read_state(rows, tension, data, cables):
 
 
 @kernel
-def _is_sound(e, line, tension, cables, rows):
+def _is_sound(e, line, tension, length, cables, rows):
     """Return whether a simulation's numbers are finite and within physical bounds."""
     v = rows.qvel
     for j in range(rows.payload_nv):
@@ -190,7 +191,10 @@ def _is_sound(e, line, tension, cables, rows):
         for j in range(6):
             if not abs(line[v + 6 * n + j]) < (MAX_SPEED if j < 3 else MAX_RATE):
                 return False
-        if not tension[n] < MAX_STRETCH * cables.cables.stiffness[e, n] * cables.cables.length[e, n]:
+        if not isfinite(tension[n]):
+            return False
+        # The ends of a slack or broken cable may be anywhere.
+        if tension[n] > 0.0 and not length[n] < (1.0 + MAX_STRETCH) * cables.cables.length[e, n]:
             return False
     for j in range(rows.payload_nq + 7 * tension.shape[0]):
         if not isfinite(line[rows.qpos + j]):
