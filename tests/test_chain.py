@@ -246,6 +246,22 @@ def test_ropes_of_any_weight_stay_calm(density, segments):
     assert np.abs(chords(world) - world.system.cable_length).max() < 0.005
 
 
+def test_a_chain_drawn_short_moves_as_one_made_short():
+    # Its light links bend 125 times as fast as those of the usual length, which substeps must follow.
+    bending = {"payload__shape": "point", "cable__bending_damping": 5e-4, "cable__bending_stiffness": 1e-3}
+    drawn, made = make_world(1, **bending), make_world(1, cable__length=0.2, **bending)
+    drawn.set_parameters(np.ones(1, bool), cable_length=np.full((1, 1), 0.2))
+    for name in ("payload_position", "drone_position", "rotor_speed"):
+        getattr(drawn.state, name)[:] = getattr(made.state, name)
+    for world in (drawn, made):
+        world.state.payload_velocity[0] = [0.6, 0, 1.0]  # slack, and folding
+        load(world)
+        world.step(hover_thrust(made), 100)
+        assert calm(world)
+    np.testing.assert_allclose(drawn.nodes.position, made.nodes.position, atol=1e-9)
+    np.testing.assert_allclose(drawn.state.payload_position, made.state.payload_position, atol=1e-9)
+
+
 def test_a_light_chain_of_stiff_segments_moves_as_a_massless_cable():
     paths = []
     for overrides in ({}, {**CHAIN, "cable.density": 1e-4, "cable.segments": 20}):

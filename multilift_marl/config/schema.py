@@ -65,7 +65,7 @@ class VehicleConfig(Section):
     inertia: Annotated[Moments | tuple[Moments, ...] | None, Between(1e-9, 1e7, "kg m²")] = Field(
         None, description="[kg m²] principal moments"
     )
-    arm: Annotated[PerDrone | None, Between(1e-3, 10, "m")] = Field(
+    arm: Annotated[PerDrone | None, Between(0.01, 10, "m")] = Field(
         None, description="[m] from the centre of mass to a rotor axis"
     )
     rotor_azimuth: Annotated[FourPerDrone | None, Between(-360, 360, "deg")] = Field(

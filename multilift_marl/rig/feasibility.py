@@ -20,12 +20,12 @@ from multilift_marl.rig.vehicles import AIR_DENSITY, GRAVITY, Vehicle, check_rot
 MIN_THRUST_TO_WEIGHT = 1.18
 MAX_BENDING = 500.0  # [-] rate of bending in physics steps: substeps are as short as its inverse
 MAX_WIND = 60.0  # [m/s] mean wind and gusts together; bodies diverge at 100 m/s
-MAX_LOAD = 200.0  # [-] thrust over weight of a drone, hidden force over weight of the payload
+MAX_LOAD = 50.0  # [-] thrust over weight of a drone, hidden force over weight of the payload
 MAX_SPIN_UP = 50.0  # [rad/s] by which one physics step may change a body rate; rates diverge at 500 rad/s
-MAX_SWING = 500.0  # [rad/s] of a payload between its cables: tilted by 1 rad, it swings as fast as diverges
+MAX_SWING = 100.0  # [rad/s] of a payload at rest between its cables: five times the tension is as fast as diverges
 MAX_STRAIN = 0.1  # [-] of a resting cable; cables diverge at 0.2
 MAX_LIGHTNESS = 100.0  # [-] time step over the period of a chain's nodes, across their links, which substeps resolve
-MIN_LENGTH = 0.15  # [-] of a cable over the span of its drone
+MIN_LENGTH = 0.15  # [-] of a cable less its hook's distance from the centre of the drone, over the span of that
 _OWN_SPEED = 3.0  # [m/s] of a payload through the air, beside the wind's
 
 
@@ -72,11 +72,13 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
             f"cable {i} would break at rest: {tight[i]:.1f} N under the heaviest payload, but cable.breaking_load is "
             f"{system.breaking_load[i]:g} N; raise it or lower payload.mass"
         )
-    if system.bending_rate * system.timestep > MAX_BENDING:
-        stiff = replace(system, bending_damping=0 * system.bending_damping).bending_rate == system.bending_rate
-        name = "bending_stiffness" if stiff else "bending_damping"
+    shortest = (1 - ranges.cable_length) * system.cable_length
+    if (fastest := system.bending_rate(shortest)) * system.timestep > MAX_BENDING:
+        undamped = replace(system, bending_damping=0 * system.bending_damping)
+        name = "bending_stiffness" if undamped.bending_rate(shortest) == fastest else "bending_damping"
+        lower = "randomization.cable_length, " if ranges.cable_length else ""
         raise ConfigError(
-            f"cable.{name}={getattr(system, name).max():g} is too stiff for links so light; lower it or "
+            f"cable.{name}={getattr(system, name).max():g} is too stiff for links so light; lower it, {lower}or "
             "cable.segments, or raise cable.density"
         )
     if n > 1:
@@ -293,12 +295,12 @@ def _check_cables(ranges: RandomizationConfig, system: System) -> None:
             f"cable {i} would stretch by {100 * strain[i]:.3g} % at rest under the heaviest payload, more than "
             f"{100 * MAX_STRAIN:g} %; raise cable.stiffness={system.cable_stiffness[i]:g} N/m or lower payload.mass"
         )
-    least = MIN_LENGTH * np.array([vehicle.span for vehicle in system.vehicles])
+    least = MIN_LENGTH * np.array([vehicle.span for vehicle in system.vehicles]) + np.linalg.norm(system.hooks, axis=1)
     if np.any(shortest < least):
         i = int(np.argmin(shortest - least))
         raise ConfigError(
-            f"cable {i} may be {shortest[i]:.3g} m long, less than {MIN_LENGTH:g} × the span of its drone, "
-            f"{system.vehicles[i].span:.3g} m; raise cable.length or lower randomization.cable_length"
+            f"cable {i} may be {shortest[i]:.3g} m long, less than {least[i]:.3g} m, {MIN_LENGTH:g} × the span of its "
+            "drone and the distance of cable.hook; raise cable.length or lower randomization.cable_length"
         )
     if not system.cable_mass.any():
         return

@@ -104,17 +104,23 @@ class System:
         """Force of each resting drone on its cable: `formation_force` and the cable's weight (N, 3) [N]."""
         return self.formation_force + GRAVITY * self.cable_mass[:, None] * [0, 0, 1]
 
-    @property
-    def bending_rate(self) -> float:
-        """Rate of the fastest bending of any chain [1/s], twice where it swings; 0 without chains.
+    def bending_rate(self, cable_length: np.ndarray) -> np.ndarray:
+        """Return the rate of the fastest bending of any chain [1/s], twice where it swings; 0 without chains.
 
         Nodes m that move to and fro across links l have ω² = 16 κ/(m l²), and by damping alone the rate 16 β/(m l²).
+
+        Args:
+            cable_length: (..., N) [m], whose nodes weigh as much more than the nominal ones as they are longer.
+
+        Returns:
+            (...).
         """
         if not self.cable_mass.any():
-            return 0.0
-        inertia = self.cable_mass / (self.cable_segments - 1) * (self.cable_length / self.cable_segments) ** 2
-        swing = 2 * np.sqrt(16 * self.bending_stiffness / inertia).max()
-        return float(max(swing, (16 * self.bending_damping / inertia).max()))
+            return np.zeros(cable_length.shape[:-1])
+        node_mass = self.cable_mass / (self.cable_segments - 1) * (cable_length / self.cable_length)
+        inertia = node_mass * (cable_length / self.cable_segments) ** 2
+        swing = 2 * np.sqrt(16 * self.bending_stiffness / inertia).max(axis=-1)
+        return np.maximum(swing, (16 * self.bending_damping / inertia).max(axis=-1))
 
     @property
     def resting_tension(self) -> np.ndarray:

@@ -79,7 +79,7 @@ def make_cables(system: System, parameters: Parameters, inertias: Inertias) -> C
         bending_stiffness=system.bending_stiffness,
         bending_damping=system.bending_damping,
         bends=bool(system.bending_stiffness.any() or system.bending_damping.any()),
-        largest=largest_substep(system),
+        largest=np.zeros(e, int),
         nodes=Nodes.zeros(e, system),
         links=np.zeros((e, int(system.cable_segments.max()), 7)),
         motion=Motion.zeros(e, system),
@@ -91,6 +91,7 @@ def make_cables(system: System, parameters: Parameters, inertias: Inertias) -> C
 def update_cables(cables: Chain, system: System, parameters: Parameters) -> None:
     """Write what depends on parameters."""
     n = cables.segments
+    cables.largest[:] = largest_substep(system, parameters.cable_length)
     cables.length[:] = parameters.cable_length / n
     cables.stiffness[:] = n * parameters.cable_stiffness
     cables.node_mass[:] = system.cable_mass * (parameters.cable_length / system.cable_length) / (n - 1)

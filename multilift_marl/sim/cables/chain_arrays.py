@@ -87,8 +87,8 @@ class Chain(NamedTuple):
     """(N,) [N m s/rad]."""
     bends: bool
     """Whether any cable resists bending."""
-    largest: int
-    """Length of the longest substep, a physics step being `UNITS`."""
+    largest: np.ndarray
+    """(E,) int, length of the longest substep, a physics step being `UNITS`."""
     nodes: Nodes
     links: np.ndarray
     """(E, S, 7) of a cable while its state is written: direction, stretch [m] and velocity [m/s] of each link."""
@@ -149,7 +149,15 @@ class Workspace(NamedTuple):
         return cls(*(np.zeros(shape) for shape in shapes))
 
 
-def largest_substep(system: System) -> int:
-    """Return the longest substep that bending, which is explicit, allows: a power of two, of `UNITS` to a step."""
-    longest = min(_SUBSTEP, system.timestep, 1 / max(system.bending_rate, 1e-9))
-    return 2 ** max(0, int(np.log2(longest * UNITS / system.timestep)))
+def largest_substep(system: System, cable_length: np.ndarray) -> np.ndarray:
+    """Return the longest substeps that bending, which is explicit, allows: powers of two, of `UNITS` to a step.
+
+    Args:
+        system: of the chains.
+        cable_length: the true ones (..., N) [m].
+
+    Returns:
+        (...) int.
+    """
+    longest = np.minimum(min(_SUBSTEP, system.timestep), 1 / np.maximum(system.bending_rate(cable_length), 1e-9))
+    return 2 ** np.maximum(0, np.log2(longest * UNITS / system.timestep).astype(int))

@@ -71,7 +71,7 @@ def advance_chains(rows, data, chain, work):
 
         # Substeps, each halved until it is stable, and doubled again where the next one would be.
         left = UNITS
-        size = chain.largest
+        size = chain.largest[e]
         while left > 0:
             size = min(size, left)
             if chain.bends:
@@ -87,7 +87,7 @@ def advance_chains(rows, data, chain, work):
             add_turning(e, h, state, chain, work)
             _move(e, h, state, chain, work)
             left -= size
-            if size < chain.largest and steepness(e, 2.0 * h, chain, work) < _MARGIN:
+            if size < chain.largest[e] and steepness(e, 2.0 * h, chain, work) < _MARGIN:
                 size *= 2
 
         # The cables' mean forces, for MuJoCo.
