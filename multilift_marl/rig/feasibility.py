@@ -22,6 +22,7 @@ MAX_BENDING = 500.0  # [-] rate of bending in physics steps: substeps are as sho
 MAX_WIND = 60.0  # [m/s] mean wind and gusts together; bodies diverge at 100 m/s
 MAX_LOAD = 50.0  # [-] thrust over weight of a drone, hidden force over weight of the payload
 MAX_SPIN_UP = 50.0  # [rad/s] by which one physics step may change a body rate; rates diverge at 500 rad/s
+MAX_NUTATION = 200.0  # [rad/s] of a drone, also about twice its yaw rate when two rotors stop at once
 MAX_SWING = 100.0  # [rad/s] of a payload at rest between its cables: five times the tension is as fast as diverges
 MAX_STRAIN = 0.1  # [-] of a resting cable; cables diverge at 0.2
 MAX_LIGHTNESS = 100.0  # [-] time step over the period of a chain's nodes, across their links, which substeps resolve
@@ -239,11 +240,12 @@ def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, sys
             "vehicle.rotor_thrust_max, vehicle.arm or vehicle.torque_ratio"
         )
     gyroscopic = 2 * vehicle.rotor_inertia * vehicle.rotor_speed_max / inertia.min()
-    if gyroscopic * step > 1:
+    if gyroscopic * step > 1 or gyroscopic > MAX_NUTATION:
+        fast = f"sim.timestep={step:g} s resolves" if gyroscopic * step > 1 else f"{MAX_NUTATION:g} rad/s"
         raise ConfigError(
             f"rotors of vehicle.rotor_inertia={vehicle.rotor_inertia:g} kg m² at {vehicle.rotor_speed_max:.3g} rad/s "
             f"let a drone of vehicle.inertia {list(vehicle.inertia)} kg m² nutate at {gyroscopic:.3g} rad/s, faster "
-            f"than sim.timestep={step:g} s resolves; lower vehicle.rotor_inertia or raise vehicle.thrust_coefficient"
+            f"than {fast}; lower vehicle.rotor_inertia or raise vehicle.thrust_coefficient"
         )
     rolling = 4 * vehicle.rolling_moment * vehicle.rotor_speed_max + abs(system.air.roll_moment)
     spin_up = rolling * (wind + _OWN_SPEED) / inertia.min() * step
