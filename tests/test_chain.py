@@ -8,6 +8,7 @@ from conftest import GRAVITY, hover_thrust, load, make_system, same, steady, wit
 
 from multilift_marl.sim import World
 from multilift_marl.sim.cables.catenary import SLACK, hang
+from multilift_marl.sim.cables.chain_dynamics import common_force
 from multilift_marl.validation.chains import exponential
 from multilift_marl.validation.conservation import totals
 
@@ -285,6 +286,17 @@ def test_a_bent_chain_pushes_its_ends_apart():
         world.step(hover_thrust(world), 50)
         speeds.append(world.state.payload_velocity[0, 2])
     assert speeds[1] < speeds[0] - 0.05  # the bent chain pushes payload and drone apart
+
+
+def test_contact_that_lasts_is_what_two_steps_have_in_common():
+    for before, last, expected in (
+        (2.0, 3.0, 2.0),
+        (3.0, 2.0, 2.0),
+        (-3.0, -2.0, -2.0),
+        (2.0, -3.0, 0.0),
+        (0.0, 3.0, 0.0),
+    ):
+        assert common_force(np.array([[last], [before]]), 0) == expected
 
 
 def test_the_payload_comes_to_rest_on_the_ground():

@@ -178,7 +178,7 @@ def test_numbers_that_no_flight_can_have_are_named_with_their_bounds_and_unit(ke
         ({"vehicle.drag": [200.0, 0.0, 0.0]}, "vehicle.drag", "lower the drag"),
         ({"vehicle.inertia": [1e-6, 1e-6, 1e-6]}, "vehicle.inertia", "raise vehicle.inertia"),
         ({"vehicle.thrust_coefficient": 1e-12}, "vehicle.rotor_inertia", "raise vehicle.thrust_coefficient"),
-        ({"vehicle.rotor_inertia": 1e-3}, "faster than 200 rad/s", "lower vehicle.rotor_inertia"),
+        ({"vehicle.rotor_inertia": 2e-4, "sim.timestep": 1e-3}, "faster than 200 rad/s", "lower vehicle.rotor_inertia"),
         ({"wind.roll_moment": 50.0}, "wind.roll_moment", "lower them"),
         ({"wind.velocity": [40.0, 0, 0], "wind.gust": [40.0, 0, 0]}, "wind.gust", "lower them"),
         ({"randomization.payload_force": 5e3}, "randomization.payload_force", "lower it or raise payload.mass"),

@@ -34,6 +34,13 @@ def test_actors_give_each_drone_its_action_in_any_order(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_an_untrained_actor_acts_as_its_base(kind):
+    base, observation = torch.randn(4, 11), torch.randn(6, 5, 11)
+    actor = Actor(kind, 11, 4, (16, 16), 0.3, base)
+    torch.testing.assert_close(actor(observation)[0], torch.einsum("ak,enk->ena", base, observation))
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("num_drones", [1, 3, 8])
 def test_actors_fly_any_number_of_drones(kind, num_drones):
     mean, deviation = make_actor(kind)(torch.randn(2, num_drones, 11))

@@ -76,6 +76,13 @@ def test_the_spline_passes_all_rows_and_is_smooth_there():
         np.testing.assert_allclose(bend[0], bend[1], atol=1e-2 * speeds[1])
         left, right = (sample_spline(table, np.array([at + side * 1e-9]))[3] for side in (-1, 1))
         np.testing.assert_allclose(left, right, atol=1e-5 * speeds[2])  # the jerk, too
+    lengths = np.diff(t)
+    slopes = []  # of the jerk, a parabola in each piece, at its two ends
+    for begin, length in zip(t, lengths, strict=False):
+        first, middle, last = sample_spline(table, begin + length * np.array([1e-9, 0.5, 1 - 1e-9]))[3]
+        slopes.append(np.array([4 * middle - 3 * first - last, first - 4 * middle + 3 * last]) / length)
+    for before, after in zip(slopes, slopes[1:], strict=False):
+        np.testing.assert_allclose(before[1], after[0], atol=1e-5 * np.abs(slopes).max())
 
 
 def test_the_spline_begins_and_ends_at_rest_and_stays():
@@ -127,6 +134,7 @@ def test_rounded_rows_do_not_become_jerk():
     assert (thin_rows(exact, 0.0) == exact).all()
     lone = exact[::50]  # 1 s apart
     assert (thin_rows(lone, 0.1) == lone).all()
+    assert (thin_rows(lone, 3.0)[:, 0] == [0, 3, 8]).all()  # the last two as far apart, too
 
 
 @pytest.mark.parametrize("change, words", [

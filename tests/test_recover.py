@@ -40,7 +40,12 @@ def test_crazymarl_starts_are_its_samplers():
     assert (load[:, 2] == 0.0055).mean() == pytest.approx(0.25, abs=0.05)
     apart = np.linalg.norm(drones[:, 0] - drones[:, 1], axis=-1)
     assert apart.min() >= 0.19
-    assert np.linalg.norm(drones - load[:, None], axis=-1).max() <= 0.3 + 1e-9
+    distance = np.linalg.norm(drones - load[:, None], axis=-1)
+    assert distance.max() <= 0.3 + 1e-9
+    expected = np.random.default_rng(0).normal(0.3, 0.1, 100_000).clip(0.05, 0.3)
+    high = load[:, 2] > 0.5  # else the ground lifts drones
+    for quantile in (0.1, 0.25, 0.4):
+        assert np.quantile(distance[high], quantile) == pytest.approx(np.quantile(expected, quantile), abs=0.01)
     assert state.drone_velocity.std() == pytest.approx(0.2, rel=0.05)
     assert state.drone_body_rates.std() == pytest.approx(np.deg2rad(20), rel=0.05)
     assert (vec.task.goal.position == [0, 0, 1.5]).all()

@@ -130,18 +130,18 @@ def _gather_bodies(e, line, state, chain, rows, work):
         at = rows.force + body_dof(b, rows)
         touch = chain.nodes.contact[e, b]
         force = (line[at], line[at + 1], line[at + 2])
-        force = add(force, (_common(touch, 0), _common(touch, 1), _common(touch, 2)))
+        force = add(force, (common_force(touch, 0), common_force(touch, 1), common_force(touch, 2)))
         put(work.force[b], sub(force, (0.0, 0.0, bodies.mass[e, b] * GRAVITY)))
         if turns:
             torque = (line[at + 3], line[at + 4], line[at + 5])
-            torque = add(torque, (_common(touch, 3), _common(touch, 4), _common(touch, 5)))
+            torque = add(torque, (common_force(touch, 3), common_force(touch, 4), common_force(touch, 5)))
             put(work.torque[b], sub(torque, cross(center, tmul(attitude, force))))
         for j in range(6):
             motion.impulse[e, b, j] = 0.0
 
 
 @kernel
-def _common(touch, j):
+def common_force(touch, j):
     """Return the smaller one of a contact's two last values, 0 where their signs differ."""
     last = touch[0, j]
     before = touch[1, j]
