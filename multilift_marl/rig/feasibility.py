@@ -20,7 +20,8 @@ from multilift_marl.rig.vehicles import AIR_DENSITY, GRAVITY, Vehicle, check_rot
 MIN_THRUST_TO_WEIGHT = 1.18
 MAX_BENDING = 500.0  # [-] rate of bending in physics steps: substeps are as short as its inverse
 MAX_WIND = 60.0  # [m/s] mean wind and gusts together; bodies diverge at 100 m/s
-MAX_LOAD = 50.0  # [-] thrust over weight of a drone, hidden force over weight of the payload
+MAX_THRUST = 50.0  # [-] of a drone over its weight
+MAX_LOAD = 200.0  # [-] hidden force over weight of the payload
 MAX_SPIN_UP = 50.0  # [rad/s] by which one physics step may change a body rate; rates diverge at 500 rad/s
 MAX_NUTATION = 200.0  # [rad/s] of a drone, also about twice its yaw rate when two rotors stop at once
 MAX_SWING = 100.0  # [rad/s] of a payload at rest between its cables: five times the tension is as fast as diverges
@@ -219,9 +220,9 @@ def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, sys
     step, lightest = system.timestep, vehicle.mass * (1 - ranges.vehicle_mass)
     strongest = vehicle.rotor_thrust_max * (1 + ranges.vehicle_thrust_coefficient)
     inertia = np.array(vehicle.inertia) * (1 - ranges.vehicle_mass)
-    if 4 * strongest > MAX_LOAD * lightest * GRAVITY:
+    if 4 * strongest > MAX_THRUST * lightest * GRAVITY:
         raise ConfigError(
-            f"vehicle.rotor_thrust_max={vehicle.rotor_thrust_max:g} N lifts more than {MAX_LOAD:g} × the weight of a "
+            f"vehicle.rotor_thrust_max={vehicle.rotor_thrust_max:g} N lifts more than {MAX_THRUST:g} × the weight of a "
             f"drone of vehicle.mass={vehicle.mass:g} kg; lower the thrust or raise the mass"
         )
     drag = max(vehicle.drag) * (1 + ranges.vehicle_drag)
