@@ -24,6 +24,10 @@ class RenderingError(RuntimeError):
     """Pictures were asked for and cannot be made."""
 
 
+class FlightError(RuntimeError):
+    """Flight software that does not start, answer or do as it is told."""
+
+
 def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str, otherwise: str = "") -> str:
     """Return "; did you mean 'x'?" for the closest of `names`, or the list of them where none is close.
 

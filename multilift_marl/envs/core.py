@@ -248,6 +248,11 @@ class MultiliftVec:
                 self._checked = True
             self._stacked[e] = np.tile(self.task.observation[e], self.config.env.history)
 
+    def use_controller(self, controller: Controller) -> None:
+        """Let another controller of this world fly the drones from the next reset on."""
+        self.controller, self.reference = controller, controller.reference
+        self._bind()
+
     def _bind(self) -> None:
         """Build the stages of every shard, from the controller and the task as they are."""
         teams = Teams(self.world, self.controller, self.task, self._sensing, self._stacked)

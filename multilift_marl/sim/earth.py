@@ -16,6 +16,8 @@ SEMI_MAJOR = 6378137.0  # [m]
 FLATTENING = 1 / 298.257223563
 _ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
+_LOCAL_RADIUS = 6371000.0  # [m] of PX4's sphere
+
 # International standard atmosphere (ISO 2533), troposphere
 SEA_PRESSURE = 101325.0  # [Pa]
 SEA_TEMPERATURE = 288.15  # [K]
@@ -110,6 +112,25 @@ class Site:
                 [cos(lat) * cos(lon), cos(lat) * sin(lon), sin(lat)],
             ]
         )
+
+
+def project_local(geodetic: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return the local frame of PX4: NED places (..., 3) [m] of latitude, longitude [deg] and altitude [m] (..., 3).
+
+    It is the azimuthal equidistant projection of a sphere of 6371 km about the estimator's origin (Snyder 1987, 25),
+    so that its metres are those of the ellipsoid to 0.3 % only.
+
+    Args:
+        geodetic: places.
+        origin: latitude, longitude [deg] and altitude [m] (3,).
+    """
+    lat, lon = np.radians(geodetic[..., 0]), np.radians(geodetic[..., 1])
+    lat0, lon0 = np.radians(origin[0]), np.radians(origin[1])
+    angle = np.arccos(np.clip(np.sin(lat0) * np.sin(lat) + np.cos(lat0) * np.cos(lat) * np.cos(lon - lon0), -1.0, 1.0))
+    scale = _LOCAL_RADIUS / np.sinc(angle / np.pi)
+    north = scale * (np.cos(lat0) * np.sin(lat) - np.sin(lat0) * np.cos(lat) * np.cos(lon - lon0))
+    east = scale * np.cos(lat) * np.sin(lon - lon0)
+    return np.stack([north, east, origin[2] - geodetic[..., 2]], axis=-1)
 
 
 def _to_earth(geodetic: np.ndarray) -> np.ndarray:

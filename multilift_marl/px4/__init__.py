@@ -1,0 +1,1 @@
+"""Teams flown by PX4 autopilots in lockstep with the simulation; see docs/flight.md."""

@@ -1,0 +1,69 @@
+"""MAVLink 2 messages of PX4, by pymavlink; only those that are wanted are decoded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from typing import Any
+
+from multilift_marl.errors import ConfigError
+
+os.environ.setdefault("MAVLINK20", "1")
+try:
+    from pymavlink.dialects.v20 import common as mavlink
+except ImportError as error:
+    raise ConfigError('PX4 needs pymavlink, which is not installed; pip install "multilift_marl[px4]"') from error
+
+_MAGIC, _HEADER, _CHECKSUM, _SIGNATURE = 0xFD, 10, 2, 13
+
+
+class MAVLink(mavlink.MAVLink):
+    """Encodes and decodes messages of one sender."""
+
+    def __init__(self, srcSystem: int, srcComponent: int):
+        super().__init__(None, srcSystem=srcSystem, srcComponent=srcComponent)
+        self.robust_parsing = True
+
+
+class Splitter:
+    """Cuts a stream of bytes into messages; what is no message is skipped.
+
+    Args:
+        wanted: numbers of the messages that are decoded; others cost next to nothing.
+
+    Attributes:
+        skipped: bytes that were no message.
+    """
+
+    def __init__(self, wanted: Collection[int]):
+        self.skipped = 0
+        self._wanted = wanted
+        self._decoder = MAVLink(255, 0)
+        self._rest = b""
+
+    def split(self, data: bytes) -> list[Any]:
+        """Return the wanted messages that are complete with `data`, in order."""
+        data = self._rest + data
+        messages, at = [], 0
+        while True:
+            start = data.find(_MAGIC, at)
+            self.skipped += (len(data) if start < 0 else start) - at
+            if start < 0:
+                self._rest = b""
+                return messages
+            if len(data) - start < _HEADER:
+                break
+            size = _HEADER + data[start + 1] + _CHECKSUM + (_SIGNATURE if data[start + 2] & 1 else 0)
+            if len(data) - start < size:
+                break
+            number = int.from_bytes(data[start + 7 : start + 10], "little")
+            if number in self._wanted:
+                try:
+                    messages.append(self._decoder.decode(bytearray(data[start : start + size])))
+                except mavlink.MAVError:  # a checksum that is wrong: no message begins here
+                    self.skipped += 1
+                    at = start + 1
+                    continue
+            at = start + size
+        self._rest = data[start:]
+        return messages

@@ -1,0 +1,214 @@
+"""N autopilots in lockstep with a world of one environment: sensors and set-points to them, rotor thrusts from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from multilift_marl.config.config import Config
+from multilift_marl.control.actions import Call
+from multilift_marl.control.controller import Controller
+from multilift_marl.control.formation import Goal
+from multilift_marl.errors import FlightError
+from multilift_marl.px4.launch import Autopilots, rig_parameters
+from multilift_marl.px4.link import SimulatorLink
+from multilift_marl.px4.offboard import OFFBOARD, OffboardLink
+from multilift_marl.rig.system import System
+from multilift_marl.sim.earth import Site, project_local, swap_enu_ned, swap_yaw
+from multilift_marl.sim.sensors import Sensors, SensorSuite
+from multilift_marl.sim.world import World
+
+SETPOINT_RATE = 50.0  # [Hz]
+HEARTBEAT_RATE = 2.0  # [Hz]
+READY_WITHIN = 60.0  # [s] of the simulation, until all are armed
+_SETTLE = 10.0  # [s] of the simulation, at rest, before arming: estimators converge
+
+
+class AutopilotTeam:
+    """The autopilots of a rig's drones; a context that ends them.
+
+    Args:
+        system: the rig.
+        build: PX4's build folder, None where others start the autopilots.
+        dt: a tick, of all sensors the shortest period [s].
+        timeout: [s] of real time, for PX4 to connect and to answer.
+        log: whether they write flight logs.
+        seed: of the sensors' errors.
+
+    Attributes:
+        time: of the simulation since the autopilots began [s].
+        links, offboard: of each autopilot.
+        autopilots: their processes; None where others started them.
+    """
+
+    def __init__(
+        self, system: System, build: Path | None, dt: float, timeout: float = 30.0, log: bool = False, seed: int = 0,
+        suite: SensorSuite | None = None, site: Site | None = None,
+    ):  # fmt: skip
+        self.site = site or Site()
+        self.links: list[SimulatorLink] = []
+        self.offboard: list[OffboardLink] = []
+        self.autopilots: Autopilots | None = None
+        self._suite, self._seed, self._dt = suite or SensorSuite(), seed, dt
+        self._time_us, self._ticks = 1_000_000, 0
+        self._thrust_max = np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])
+        self._mass = system.drone_mass
+        self._sensors: Sensors | None = None
+        self._stack = ExitStack()
+        with ExitStack() as opened:
+            opened.callback(self.close)
+            for i in range(system.num_drones):
+                for kind, links in ((lambda i: SimulatorLink(i, timeout), self.links), (OffboardLink, self.offboard)):
+                    links.append(kind(i))
+                    self._stack.callback(links[-1].close)
+            if build is not None:
+                parameters = [rig_parameters(system, i) for i in range(system.num_drones)]
+                self.autopilots = self._stack.enter_context(Autopilots(build, parameters, log))
+            for link in self.links:
+                link.accept()
+            opened.pop_all()
+
+    @property
+    def time(self) -> float:
+        """Of the simulation since the autopilots began [s]."""
+        return self._ticks * self._dt
+
+    def board(self, world: World) -> None:
+        """Fly the drones of another world from now on; sensors keep their errors and what they remember."""
+        sensors = Sensors(self._suite, world.state, self._dt, self.site)
+        if self._sensors is None:
+            sensors.reset(0, np.random.SeedSequence(self._seed))
+        else:
+            for own, before in zip(sensors.readings, self._sensors.readings, strict=True):
+                own[:] = before
+        self._sensors = sensors
+
+    def tick(self, world: World, send: Callable[[int], None]) -> None:
+        """Exchange sensors for rotor thrusts, once.
+
+        Args:
+            world: that has been boarded; its thrusts are written.
+            send: called with each drone that a set-point is due for.
+
+        Raises:
+            FlightError: an autopilot does not answer, or has ended.
+        """
+        sensors = self._sensors
+        assert sensors is not None
+        if self._ticks:
+            sensors.read()
+        self._ticks += 1
+        self._time_us += round(self._dt * 1e6)
+        try:
+            for link in self.links:
+                link.send(self._time_us, sensors, self.site)
+            if self._is_due(SETPOINT_RATE):
+                self._speak(send)
+            for link in self.links:
+                link.receive(self._time_us)
+        except FlightError:
+            if self.autopilots is not None:
+                self.autopilots.check()
+            raise
+        for i, link in enumerate(self.links):
+            world.thrust[0, i] = link.controls * self._thrust_max[i]
+
+    def _is_due(self, rate: float) -> bool:
+        return self._ticks % max(1, round(1 / (rate * self._dt))) == 0
+
+    def _speak(self, send: Callable[[int], None]) -> None:
+        for i, autopilot in enumerate(self.offboard):
+            autopilot.hear()
+            if self._is_due(HEARTBEAT_RATE):
+                autopilot.heartbeat()
+            if np.isfinite(autopilot.origin).all():
+                send(i)
+
+    def prepare(self, world: World) -> None:
+        """Let the autopilots start, converge at rest and arm, in offboard mode.
+
+        Raises:
+            FlightError: one was not armed in time, with what it said.
+        """
+        here = world.state.drone_position[0].copy()
+        zero = np.zeros((len(here), 3))
+
+        def stay(i: int) -> None:
+            self.send_place(i, here[i], zero[i], zero[i], 0.0)
+
+        steps = world.system.control_interval
+        while not all(each.armed and each.mode == OFFBOARD for each in self.offboard):
+            self.tick(world, stay)
+            world.step(world.thrust, steps)
+            if self.time > _SETTLE and self._is_due(HEARTBEAT_RATE):
+                for autopilot in self.offboard:
+                    if autopilot.mode != OFFBOARD:
+                        autopilot.set_mode(OFFBOARD)
+                    elif not autopilot.armed:
+                        autopilot.arm()
+            if self.time > READY_WITHIN:
+                late = next(each for each in self.offboard if not (each.armed and each.mode == OFFBOARD))
+                said = "; ".join(late.said) or "it said nothing"
+                raise FlightError(f"PX4 {late.index} was not armed within {READY_WITHIN:g} s: {said}")
+
+    def send_place(
+        self, i: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float
+    ) -> None:
+        """Send drone i where to be: world frame, yaw from east."""
+        local = project_local(self.site.to_geodetic(position), self.offboard[i].origin)
+        vectors = swap_enu_ned(np.stack([velocity, acceleration]))
+        self.offboard[i].send_position(self._time_us, local, vectors[0], vectors[1], float(swap_yaw(yaw)))
+
+    def error(self, world: World) -> np.ndarray:
+        """Return how far the drones are from where their autopilots believe to be (N,) [m]."""
+        places = self.site.to_geodetic(world.state.drone_position[0])
+        local = [project_local(place, each.origin) for place, each in zip(places, self.offboard, strict=True)]
+        return np.linalg.norm(np.array(local) - [each.position for each in self.offboard], axis=1)
+
+    def close(self) -> None:
+        """End the autopilots and close all ports."""
+        self._stack.close()
+
+    def __enter__(self) -> AutopilotTeam:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+class AutopilotController(Controller):
+    """The action interface with autopilots in place of the geometric controller.
+
+    Args:
+        config: `control` says how actions become set-points.
+        world: of one environment.
+        team: the autopilots, which have boarded it.
+    """
+
+    def __init__(self, config: Config, world: World, team: AutopilotTeam):
+        super().__init__(config, world)
+        self._team = team
+
+    def bind(
+        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
+    ) -> tuple[Call, tuple[Call, ...]]:
+        """See `Controller.bind`; the autopilots fly in place of the last call."""
+        set_action, steps = super().bind(lo, hi, action, goal, plan)
+        cable_force = goal.cable_force if self.disturbance is None else self.disturbance.cable_force
+
+        def send(i: int) -> None:
+            reference = self.reference
+            # Thrust is the acceleration and gravity times the drone's mass: what it carries counts as acceleration.
+            carried = cable_force[0, i] / self.gains.mass[i]
+            self._team.send_place(
+                i, reference.position[0, i], reference.velocity[0, i], reference.acceleration[0, i] + carried,
+                reference.yaw[0, i],
+            )  # fmt: skip
+
+        def autopilots() -> None:
+            self._team.tick(self.world, send)
+
+        return set_action, (*steps[:-1], autopilots)
