@@ -65,15 +65,28 @@ def fly_episodes(
         count = min(_BATCH, episodes - done)
         part = build_config(config.model_dump(), {"env.num_envs": count})
         vec = MultiliftVec(part, purpose, first_env=first + done)
-        parts.append(_fly_batch(vec, make_policy(vec), seed))
+        observation, _ = vec.reset(seed=seed)
+        parts.append(measure_episodes(vec, make_policy(vec), observation))
         if progress is not None:
             progress(done + count)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.ndarray]:
+def measure_episodes(
+    vec: MultiliftVec, policy: Policy, observation: np.ndarray, on_step: Callable[[MultiliftVec], None] | None = None
+) -> dict[str, np.ndarray]:
+    """Fly the episodes that have begun to their ends, and return what `fly_episodes` does of them.
+
+    Args:
+        vec: environments after a reset.
+        policy: of these environments.
+        observation: that the reset returned.
+        on_step: called with the environments after every step.
+
+    Raises:
+        ValueError: the policy's actions do not fit the environment.
+    """
     e, dt = vec.num_envs, vec.task.dt
-    observation, _ = vec.reset(seed=seed)
     policy.reset()
     running = np.ones(e, bool)
     total, length, settling, counted, change = np.zeros((5, e))
@@ -85,6 +98,8 @@ def _fly_batch(vec: MultiliftVec, policy: Policy, seed: int) -> dict[str, np.nda
     for step in range(vec.max_steps):
         action = policy.act(observation)
         observation, reward, terminated, truncated, info = vec.step(action)
+        if on_step is not None:
+            on_step(vec)
         errors = vec.task.errors
         total += running * reward.mean(axis=1, dtype=np.float64)
         length += running
@@ -186,19 +201,34 @@ def trace_episode(
     policy = make_policy(vec)
     observation, _ = vec.reset(seed=seed)
     policy.reset()
-    rows = []
-    for step in range(vec.max_steps):
+    tracer = Tracer()
+    for _ in range(vec.max_steps):
         observation, _, terminated, truncated, _ = vec.step(policy.act(observation))
-        state, task = vec.world.state, vec.task
-        rows.append(
-            (
-                (step + 1) * task.dt, state.payload_position[0].copy(), task.goal.position[0].copy(),
-                state.drone_position[0].copy(), task.errors.distance[0], np.rad2deg(task.errors.angle[0]),
-                state.cable_tension[0].copy(),
-            )
-        )  # fmt: skip
+        tracer(vec)
         if on_step is not None:
             on_step(vec)
         if terminated[0] or truncated[0]:
             break
-    return Trace(*(np.array(column) for column in zip(*rows, strict=True)))
+    return tracer.trace()
+
+
+class Tracer:
+    """Records the first environment of what it is called with after every step."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[Any, ...]] = []
+
+    def __call__(self, vec: MultiliftVec) -> None:
+        """Record the step that has just been made."""
+        state, task = vec.world.state, vec.task
+        self._rows.append(
+            (
+                (len(self._rows) + 1) * task.dt, state.payload_position[0].copy(), task.goal.position[0].copy(),
+                state.drone_position[0].copy(), task.errors.distance[0], np.rad2deg(task.errors.angle[0]),
+                state.cable_tension[0].copy(),
+            )
+        )  # fmt: skip
+
+    def trace(self) -> Trace:
+        """Return what was recorded, at least one step."""
+        return Trace(*(np.array(column) for column in zip(*self._rows, strict=True)))

@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +86,7 @@ class Autopilots:
         folder: of their files, one folder each.
     """
 
-    def __init__(self, build: Path, parameters: list[Mapping[str, float]], log: bool = False):
+    def __init__(self, build: Path, parameters: Sequence[Mapping[str, float]], log: bool = False):
         self._temporary = tempfile.TemporaryDirectory(prefix="px4-", ignore_cleanup_errors=True)
         self.folder = Path(self._temporary.name)
         self._processes: list[subprocess.Popen[bytes]] = []
@@ -103,10 +103,11 @@ class Autopilots:
         values = {**USUAL, **({"SDLOG_MODE": 0} if log else {}), **parameters}
         environment = {**os.environ, "PX4_SIM_MODEL": "none_iris", "PX4_SIM_HOSTNAME": "127.0.0.1"}
         environment |= {f"PX4_PARAM_{name}": f"{value:.9g}" for name, value in values.items()}
-        command = [build / "bin" / "px4", "-i", str(index), "-d", build / "etc", "-s", "etc/init.d-posix/rcS"]
+        px4, etc = str(build / "bin" / "px4"), str(build / "etc")
+        command = [px4, "-i", str(index), "-d", etc, "-s", "etc/init.d-posix/rcS", "-w", str(folder)]
         with (folder / "px4.log").open("wb") as output:
             process = subprocess.Popen(
-                [*command, "-w", folder], cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=output,
+                command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=output,
                 stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
         self._processes.append(process)

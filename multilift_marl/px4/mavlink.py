@@ -10,10 +10,11 @@ from multilift_marl.errors import ConfigError
 
 os.environ.setdefault("MAVLINK20", "1")
 try:
-    from pymavlink.dialects.v20 import common as mavlink
+    from pymavlink.dialects.v20 import common as mavlink  # type: ignore[import-untyped]
 except ImportError as error:
     raise ConfigError('PX4 needs pymavlink, which is not installed; pip install "multilift_marl[px4]"') from error
 
+__all__ = ["MAVLink", "Splitter", "mavlink"]
 _MAGIC, _HEADER, _CHECKSUM, _SIGNATURE = 0xFD, 10, 2, 13
 
 
@@ -44,7 +45,8 @@ class Splitter:
     def split(self, data: bytes) -> list[Any]:
         """Return the wanted messages that are complete with `data`, in order."""
         data = self._rest + data
-        messages, at = [], 0
+        messages: list[Any] = []
+        at = 0
         while True:
             start = data.find(_MAGIC, at)
             self.skipped += (len(data) if start < 0 else start) - at

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,12 +18,14 @@ from multilift_marl.px4.launch import Autopilots, rig_parameters
 from multilift_marl.px4.link import SimulatorLink
 from multilift_marl.px4.offboard import OFFBOARD, OffboardLink
 from multilift_marl.rig.system import System
+from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.earth import Site, project_local, swap_enu_ned, swap_yaw
 from multilift_marl.sim.sensors import Sensors, SensorSuite
 from multilift_marl.sim.world import World
 
 SETPOINT_RATE = 50.0  # [Hz]
 HEARTBEAT_RATE = 2.0  # [Hz]
+_LATE = 0.1  # [s] that a simulation may catch up with
 READY_WITHIN = 60.0  # [s] of the simulation, until all are armed
 _SETTLE = 10.0  # [s] of the simulation, at rest, before arming: estimators converge
 
@@ -37,6 +40,8 @@ class AutopilotTeam:
         timeout: [s] of real time, for PX4 to connect and to answer.
         log: whether they write flight logs.
         seed: of the sensors' errors.
+        suite, site: which sensors, and where on Earth; usual ones by default.
+        speed: largest real-time factor; 0 for as fast as it goes.
 
     Attributes:
         time: of the simulation since the autopilots began [s].
@@ -46,24 +51,26 @@ class AutopilotTeam:
 
     def __init__(
         self, system: System, build: Path | None, dt: float, timeout: float = 30.0, log: bool = False, seed: int = 0,
-        suite: SensorSuite | None = None, site: Site | None = None,
+        suite: SensorSuite | None = None, site: Site | None = None, speed: float = 0.0,
     ):  # fmt: skip
         self.site = site or Site()
         self.links: list[SimulatorLink] = []
         self.offboard: list[OffboardLink] = []
         self.autopilots: Autopilots | None = None
         self._suite, self._seed, self._dt = suite or SensorSuite(), seed, dt
+        self._clock = Clock(speed)
         self._time_us, self._ticks = 1_000_000, 0
         self._thrust_max = np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])
-        self._mass = system.drone_mass
+        self._mass, self._load_share = system.drone_mass, system.hook_force[:, 2] / GRAVITY
         self._sensors: Sensors | None = None
         self._stack = ExitStack()
         with ExitStack() as opened:
             opened.callback(self.close)
             for i in range(system.num_drones):
-                for kind, links in ((lambda i: SimulatorLink(i, timeout), self.links), (OffboardLink, self.offboard)):
-                    links.append(kind(i))
-                    self._stack.callback(links[-1].close)
+                self.links.append(SimulatorLink(i, timeout))
+                self._stack.callback(self.links[i].close)
+                self.offboard.append(OffboardLink(i))
+                self._stack.callback(self.offboard[i].close)
             if build is not None:
                 parameters = [rig_parameters(system, i) for i in range(system.num_drones)]
                 self.autopilots = self._stack.enter_context(Autopilots(build, parameters, log))
@@ -115,6 +122,7 @@ class AutopilotTeam:
             raise
         for i, link in enumerate(self.links):
             world.thrust[0, i] = link.controls * self._thrust_max[i]
+        self._clock.wait(self.time)
 
     def _is_due(self, rate: float) -> bool:
         return self._ticks % max(1, round(1 / (rate * self._dt))) == 0
@@ -137,7 +145,7 @@ class AutopilotTeam:
         zero = np.zeros((len(here), 3))
 
         def stay(i: int) -> None:
-            self.send_place(i, here[i], zero[i], zero[i], 0.0)
+            self.send(i, np.stack([here[i], zero[i], zero[i]]), zero[i], 0.0)
 
         steps = world.system.control_interval
         while not all(each.armed and each.mode == OFFBOARD for each in self.offboard):
@@ -154,13 +162,23 @@ class AutopilotTeam:
                 said = "; ".join(late.said) or "it said nothing"
                 raise FlightError(f"PX4 {late.index} was not armed within {READY_WITHIN:g} s: {said}")
 
-    def send_place(
-        self, i: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float
-    ) -> None:
-        """Send drone i where to be: world frame, yaw from east."""
-        local = project_local(self.site.to_geodetic(position), self.offboard[i].origin)
-        vectors = swap_enu_ned(np.stack([velocity, acceleration]))
-        self.offboard[i].send_position(self._time_us, local, vectors[0], vectors[1], float(swap_yaw(yaw)))
+    def send(self, i: int, motion: np.ndarray, cable_force: np.ndarray, yaw: float) -> None:
+        """Send a set-point to drone i.
+
+        PX4's thrust is its acceleration set-point and gravity, times the drone's mass alone: the force on the cable,
+        and what accelerates its share of the payload, are added to the acceleration.
+
+        Args:
+            i: the drone.
+            motion: position, velocity, acceleration (3, 3), world frame.
+            cable_force: nominal force of the drone on its cable (3,) [N], world frame.
+            yaw: from east [rad].
+        """
+        position, velocity, acceleration = motion
+        thrust = acceleration + (self._load_share[i] * acceleration + cable_force) / self._mass[i]
+        place = project_local(self.site.to_geodetic(position), self.offboard[i].origin)
+        vectors = swap_enu_ned(np.stack([velocity, thrust]))
+        self.offboard[i].send_position(self._time_us, place, vectors[0], vectors[1], float(swap_yaw(yaw)))
 
     def error(self, world: World) -> np.ndarray:
         """Return how far the drones are from where their autopilots believe to be (N,) [m]."""
@@ -177,6 +195,29 @@ class AutopilotTeam:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+class Clock:
+    """Holds a simulation back to a real-time factor; where it is late, it goes on from there.
+
+    Args:
+        speed: the factor; 0 for none.
+    """
+
+    def __init__(self, speed: float):
+        self.speed = speed
+        self._begin = 0.0
+
+    def wait(self, seconds: float) -> None:
+        """Wait until `seconds` of the simulation may have passed."""
+        if not self.speed:
+            return
+        now = time.perf_counter()
+        left = self._begin + seconds / self.speed - now
+        if left > 0:
+            time.sleep(left)
+        elif left < -_LATE:
+            self._begin -= left
 
 
 class AutopilotController(Controller):
@@ -200,13 +241,9 @@ class AutopilotController(Controller):
         cable_force = goal.cable_force if self.disturbance is None else self.disturbance.cable_force
 
         def send(i: int) -> None:
-            reference = self.reference
-            # Thrust is the acceleration and gravity times the drone's mass: what it carries counts as acceleration.
-            carried = cable_force[0, i] / self.gains.mass[i]
-            self._team.send_place(
-                i, reference.position[0, i], reference.velocity[0, i], reference.acceleration[0, i] + carried,
-                reference.yaw[0, i],
-            )  # fmt: skip
+            own = self.reference
+            motion = np.stack([own.position[0, i], own.velocity[0, i], own.acceleration[0, i]])
+            self._team.send(i, motion, cable_force[0, i], own.yaw[0, i])
 
         def autopilots() -> None:
             self._team.tick(self.world, send)
