@@ -19,14 +19,27 @@ from multilift_marl.config.config import Config
 from multilift_marl.config.load import check_names, explain, load_config, parse_overrides
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Section
-from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install, reason, shorten
+from multilift_marl.errors import (
+    CheckpointError,
+    ConfigError,
+    FlightError,
+    RenderingError,
+    pip_install,
+    reason,
+    shorten,
+)
 from multilift_marl.plugins import import_modules
 from multilift_marl.tasks import find_task, list_tasks
 from multilift_marl.tasks.base import resolve_reward
 from multilift_marl.tasks.rewards import describe
 
 Options = TypeVar("Options", bound=Section)
-_EXTRAS = {"onnx": "export", "onnxscript": "export", "onnxruntime": "export"}  # of all other packages: train
+_EXTRAS = {
+    "onnx": "export",
+    "onnxscript": "export",
+    "onnxruntime": "export",
+    "pymavlink": "px4",
+}  # of all other packages: train
 
 
 def run_command(
@@ -60,7 +73,7 @@ def run_command(
             status = main(values)
         sys.stdout.flush()
         return status
-    except (ConfigError, CheckpointError, RenderingError) as error:
+    except (ConfigError, CheckpointError, FlightError, RenderingError) as error:
         return _refuse(str(error))
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]

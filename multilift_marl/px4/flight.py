@@ -67,6 +67,9 @@ class Flight:
         seed: evaluation seed; the episode is the first of `evaluate.py`.
         say: is told what goes on.
 
+    Attributes:
+        start: state in which the task began.
+
     Raises:
         ConfigError: what autopilots cannot fly.
     """
@@ -78,6 +81,7 @@ class Flight:
         self._landing = self._make(self._part("land", {"pad_xy": 0.0, "pad_yaw": 0.0}))
         self._landing.reset(seed=seed)
         self.start: dict[str, np.ndarray] = {}
+        self._begun: dict[str, np.ndarray] = {}
 
     def fly(self, make_policy: Maker) -> Flown:
         """Fly, and return the task as measured.
@@ -154,18 +158,16 @@ class Flight:
 
     def _take_over(self, vec: MultiliftVec, world: World) -> np.ndarray:
         """Begin an episode in the state of another world, and return its first observation."""
-        self.start = {name: array.copy() for name, array in world.state._asdict().items() if name not in _FOLLOWING}
-        observation, _ = vec.reset(seed=self.seed, options={"state": self.start, "randomization": self._drawn()})
+        self._begun = {name: array.copy() for name, array in world.state._asdict().items() if name not in _FOLLOWING}
+        observation, _ = vec.reset(seed=self.seed, options={"state": self._begun, "randomization": self._drawn()})
         self.team.board(vec.world)
         return observation
 
     def _fly_task(self, world: World, make_policy: Maker) -> Flown:
         observation = self._take_over(self._task, world)
         self._say(f"{self.config.task}, {self._task.max_steps * self._task.task.dt:g} s")
-        start = self.start
-        flown = _measure(self._task, make_policy(self._task), observation, self.team)
-        self.start = start
-        return flown
+        self.start = self._begun
+        return _measure(self._task, make_policy(self._task), observation, self.team)
 
 
 _FOLLOWING = ("cable_tension", "cable_broken")  # from the places

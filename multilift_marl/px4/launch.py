@@ -69,7 +69,7 @@ USUAL: dict[str, float] = {
     "EKF2_GPS_DELAY": 100, "EKF2_GPS_P_NOISE": 0.02, "EKF2_GPS_V_NOISE": 0.1, "EKF2_HGT_REF": 1,
     "MPC_USE_HTE": 0, "MPC_ACC_DECOUPLE": 0, "MPC_THR_MIN": 0.03,
     "MPC_SPOOLUP_TIME": 0.5, "MPC_TKO_RAMP_T": 0.3, "MPC_XY_VEL_MAX": 8, "MPC_TILTMAX_AIR": 60, "MPC_YAW_MODE": 0,
-    "MPC_LAND_SPEED": 0.4, "MIS_TAKEOFF_ALT": 1.5,
+    "MPC_XY_P": 1.5, "MPC_XY_VEL_P_ACC": 3.0, "MPC_XY_VEL_I_ACC": 1.0, "MPC_Z_P": 1.5, "MPC_Z_VEL_P_ACC": 5.0,
 }  # fmt: skip
 """Parameters of every flight."""
 
@@ -80,19 +80,20 @@ class Autopilots:
     Args:
         build: folder of the build, see `find_px4`.
         parameters: of each of them.
+        first: instance of the first of them.
         log: whether they write flight logs.
 
     Attributes:
         folder: of their files, one folder each.
     """
 
-    def __init__(self, build: Path, parameters: Sequence[Mapping[str, float]], log: bool = False):
+    def __init__(self, build: Path, parameters: Sequence[Mapping[str, float]], first: int = 0, log: bool = False):
         self._temporary = tempfile.TemporaryDirectory(prefix="px4-", ignore_cleanup_errors=True)
         self.folder = Path(self._temporary.name)
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: dict[int, subprocess.Popen[bytes]] = {}
         try:
             for i, own in enumerate(parameters):
-                self._start(build, i, own, log)
+                self._start(build, first + i, own, log)
         except OSError as error:
             self.close()
             raise FlightError(f"cannot start {build / 'bin' / 'px4'} ({error.strerror})") from None
@@ -110,11 +111,11 @@ class Autopilots:
                 command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=output,
                 stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
-        self._processes.append(process)
+        self._processes[index] = process
 
     def check(self) -> None:
         """Raise a FlightError that names the first one that has ended."""
-        for i, process in enumerate(self._processes):
+        for i, process in self._processes.items():
             if process.poll() is not None:
                 raise FlightError(f"PX4 {i} has ended (status {process.returncode}): {self.last_words(i)}")
 
@@ -125,10 +126,10 @@ class Autopilots:
 
     def close(self) -> None:
         """End them all, and remove their files."""
-        for process in self._processes:
+        for process in self._processes.values():
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGTERM)
-        for process in self._processes:
+        for process in self._processes.values():
             try:
                 process.wait(5)
             except subprocess.TimeoutExpired:

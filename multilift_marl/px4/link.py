@@ -29,7 +29,8 @@ class SimulatorLink:
     """The simulation's side of one PX4.
 
     Args:
-        index: of the instance.
+        index: of PX4's instance.
+        drone: that it flies.
         timeout: [s] of real time for PX4 to connect, and to answer.
 
     Attributes:
@@ -39,8 +40,8 @@ class SimulatorLink:
         faults: answers with another time than what was sent.
     """
 
-    def __init__(self, index: int, timeout: float):
-        self.index = index
+    def __init__(self, index: int, drone: int, timeout: float):
+        self.index, self.drone = index, drone
         self.controls = np.zeros(4)
         self.armed = self.answered = False
         self.faults = 0
@@ -76,7 +77,7 @@ class SimulatorLink:
         self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, time_us: int, sensors: Sensors, site: Site) -> None:
-        """Send what the sensors of drone `index` of environment 0 have delivered at this tick.
+        """Send what the sensors of the drone in environment 0 have delivered at this tick.
 
         Args:
             time_us: of the simulation [us].
@@ -85,10 +86,10 @@ class SimulatorLink:
         """
         fresh = sensors.readings.fresh[0]
         force, rates, field, pressure = (
-            swap_flu_frd(sensors.specific_force[0, self.index]),
-            swap_flu_frd(sensors.body_rates[0, self.index]),
-            swap_flu_frd(sensors.magnetic_field[0, self.index]) * 0.01,  # [G]
-            float(sensors.pressure[0, self.index]),
+            swap_flu_frd(sensors.specific_force[0, self.drone]),
+            swap_flu_frd(sensors.body_rates[0, self.drone]),
+            swap_flu_frd(sensors.magnetic_field[0, self.drone]) * 0.01,  # [G]
+            float(sensors.pressure[0, self.drone]),
         )
         updated = IMU | (MAGNETOMETER if fresh[_MAG] else 0) | (BAROMETER if fresh[_BARO] else 0)
         data = self._mavlink.hil_sensor_encode(
@@ -100,8 +101,8 @@ class SimulatorLink:
 
     def _position(self, time_us: int, sensors: Sensors, site: Site) -> bytes:
         """Return HIL_GPS: degrees in 1e-7, millimetres, centimetres per second."""
-        latitude, longitude, altitude = site.to_geodetic(sensors.position[0, self.index])
-        north, east, down = swap_enu_ned(sensors.velocity[0, self.index])
+        latitude, longitude, altitude = site.to_geodetic(sensors.position[0, self.drone])
+        north, east, down = swap_enu_ned(sensors.velocity[0, self.drone])
         course = np.degrees(np.arctan2(east, north)) % 360
         message = self._mavlink.hil_gps_encode(
             time_us, 6, round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3), 1, 2,

@@ -6,13 +6,8 @@ import os
 from collections.abc import Collection
 from typing import Any
 
-from multilift_marl.errors import ConfigError
-
 os.environ.setdefault("MAVLINK20", "1")
-try:
-    from pymavlink.dialects.v20 import common as mavlink  # type: ignore[import-untyped]
-except ImportError as error:
-    raise ConfigError('PX4 needs pymavlink, which is not installed; pip install "multilift_marl[px4]"') from error
+from pymavlink.dialects.v20 import common as mavlink  # type: ignore[import-untyped]
 
 __all__ = ["MAVLink", "Splitter", "mavlink"]
 _MAGIC, _HEADER, _CHECKSUM, _SIGNATURE = 0xFD, 10, 2, 13

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,50 +32,67 @@ READY_WITHIN = 60.0  # [s] of the simulation, until all are armed
 _SETTLE = 10.0  # [s] of the simulation, at rest, before arming: estimators converge
 
 
+class Settings(NamedTuple):
+    """How autopilots are started and simulated."""
+
+    build: Path | None = None
+    """PX4's build folder; None where others start the autopilots."""
+    first: int = 0
+    """Instance of the first autopilot, whose number makes its ports; PX4's own start-up knows 0 to 9."""
+    timeout: float = 30.0
+    """[s] of real time, for PX4 to connect and to answer."""
+    speed: float = 0.0
+    """Largest real-time factor; 0 for as fast as it goes."""
+    seed: int = 0
+    """Of the sensors' errors."""
+    log: bool = False
+    """Whether they write flight logs."""
+    parameters: Mapping[str, float] = MappingProxyType({})
+    """Of PX4, beside and in place of ours."""
+    suite: SensorSuite = SensorSuite()
+    site: Site = Site()
+
+
 class AutopilotTeam:
     """The autopilots of a rig's drones; a context that ends them.
 
     Args:
         system: the rig.
-        build: PX4's build folder, None where others start the autopilots.
         dt: a tick, of all sensors the shortest period [s].
-        timeout: [s] of real time, for PX4 to connect and to answer.
-        log: whether they write flight logs.
-        seed: of the sensors' errors.
-        suite, site: which sensors, and where on Earth; usual ones by default.
-        speed: largest real-time factor; 0 for as fast as it goes.
+        settings: how they are started and simulated.
 
     Attributes:
-        time: of the simulation since the autopilots began [s].
         links, offboard: of each autopilot.
         autopilots: their processes; None where others started them.
+
+    Raises:
+        FlightError: a port is taken, or an autopilot does not start or connect.
     """
 
-    def __init__(
-        self, system: System, build: Path | None, dt: float, timeout: float = 30.0, log: bool = False, seed: int = 0,
-        suite: SensorSuite | None = None, site: Site | None = None, speed: float = 0.0,
-    ):  # fmt: skip
-        self.site = site or Site()
+    def __init__(self, system: System, dt: float, settings: Settings):
+        self.settings = settings
         self.links: list[SimulatorLink] = []
         self.offboard: list[OffboardLink] = []
         self.autopilots: Autopilots | None = None
-        self._suite, self._seed, self._dt = suite or SensorSuite(), seed, dt
-        self._clock = Clock(speed)
+        self._dt, self._clock = dt, Clock(settings.speed)
         self._time_us, self._ticks = 1_000_000, 0
         self._thrust_max = np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])
         self._mass, self._load_share = system.drone_mass, system.hook_force[:, 2] / GRAVITY
+        self._drag = np.array([vehicle.drag for vehicle in system.vehicles])  # [kg/s], of a level drone
         self._sensors: Sensors | None = None
         self._stack = ExitStack()
         with ExitStack() as opened:
             opened.callback(self.close)
             for i in range(system.num_drones):
-                self.links.append(SimulatorLink(i, timeout))
+                self.links.append(SimulatorLink(settings.first + i, i, settings.timeout))
                 self._stack.callback(self.links[i].close)
-                self.offboard.append(OffboardLink(i))
+                self.offboard.append(OffboardLink(settings.first + i))
                 self._stack.callback(self.offboard[i].close)
-            if build is not None:
-                parameters = [rig_parameters(system, i) for i in range(system.num_drones)]
-                self.autopilots = self._stack.enter_context(Autopilots(build, parameters, log))
+            if settings.build is not None:
+                own = [{**rig_parameters(system, i), **settings.parameters} for i in range(system.num_drones)]
+                self.autopilots = self._stack.enter_context(
+                    Autopilots(settings.build, own, settings.first, settings.log)
+                )
             for link in self.links:
                 link.accept()
             opened.pop_all()
@@ -85,9 +104,9 @@ class AutopilotTeam:
 
     def board(self, world: World) -> None:
         """Fly the drones of another world from now on; sensors keep their errors and what they remember."""
-        sensors = Sensors(self._suite, world.state, self._dt, self.site)
+        sensors = Sensors(self.settings.suite, world.state, self._dt, self.settings.site)
         if self._sensors is None:
-            sensors.reset(0, np.random.SeedSequence(self._seed))
+            sensors.reset(0, np.random.SeedSequence(self.settings.seed))
         else:
             for own, before in zip(sensors.readings, self._sensors.readings, strict=True):
                 own[:] = before
@@ -111,7 +130,7 @@ class AutopilotTeam:
         self._time_us += round(self._dt * 1e6)
         try:
             for link in self.links:
-                link.send(self._time_us, sensors, self.site)
+                link.send(self._time_us, sensors, self.settings.site)
             if self._is_due(SETPOINT_RATE):
                 self._speak(send)
             for link in self.links:
@@ -166,7 +185,7 @@ class AutopilotTeam:
         """Send a set-point to drone i.
 
         PX4's thrust is its acceleration set-point and gravity, times the drone's mass alone: the force on the cable,
-        and what accelerates its share of the payload, are added to the acceleration.
+        what accelerates its share of the payload and its own drag are added to the acceleration.
 
         Args:
             i: the drone.
@@ -175,14 +194,15 @@ class AutopilotTeam:
             yaw: from east [rad].
         """
         position, velocity, acceleration = motion
-        thrust = acceleration + (self._load_share[i] * acceleration + cable_force) / self._mass[i]
-        place = project_local(self.site.to_geodetic(position), self.offboard[i].origin)
+        drag = self._drag[i] * velocity
+        thrust = acceleration + (self._load_share[i] * acceleration + cable_force + drag) / self._mass[i]
+        place = project_local(self.settings.site.to_geodetic(position), self.offboard[i].origin)
         vectors = swap_enu_ned(np.stack([velocity, thrust]))
         self.offboard[i].send_position(self._time_us, place, vectors[0], vectors[1], float(swap_yaw(yaw)))
 
     def error(self, world: World) -> np.ndarray:
         """Return how far the drones are from where their autopilots believe to be (N,) [m]."""
-        places = self.site.to_geodetic(world.state.drone_position[0])
+        places = self.settings.site.to_geodetic(world.state.drone_position[0])
         local = [project_local(place, each.origin) for place, each in zip(places, self.offboard, strict=True)]
         return np.linalg.norm(np.array(local) - [each.position for each in self.offboard], axis=1)
 

@@ -1,0 +1,127 @@
+"""`python -m multilift_marl.px4 config=hover px4=DIR`: PX4 autopilots fly a team in the simulation."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from multilift_marl.agents.policy import find_policy
+from multilift_marl.cli.common import limit_torch_threads, make_folder, run_command, split_options, title
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.values import Between, Float, Int, Section
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.metrics import format_table, make_report, write_report
+
+_USAGE = """Fly one episode of a task by PX4 autopilots, in lockstep with the simulation: from slack cables on the
+ground to the task, back, and down again; then the same task by the controller of this package.
+
+  python -m multilift_marl.px4 config=hover policy=formation_integral px4=~/PX4-Autopilot [key=value ...]
+
+Everything stays on this machine (127.0.0.1). Any configuration key changes the environment: env.num_drones=6."""
+OURS = "geometric controller"
+
+
+class Options(Section):
+    """Keys of the command beside those of the configuration."""
+
+    config: str | None = Field(None, description="the task, name or path; None: what a policy was trained in, or hover")
+    policy: str = Field("formation_integral", description="a script, a run, module:Class, .onnx, .pt")
+    px4: str | None = Field(None, description="PX4's folder, with a build of px4_sitl_default; None: PX4_DIR")
+    seed: Int = Field(1000, ge=0, description="evaluation seed: the episode is the first of evaluate.py")
+    speed: Annotated[Float, Between(0, 100, "-")] = Field(
+        0.0, description="largest real-time factor; 0 for as fast as it goes"
+    )
+    instance: Annotated[Int, Between(0, 9)] = Field(
+        0, description="of the first PX4, which makes the ports: 4560, 14540, 14580 + instance"
+    )
+    timeout: Annotated[Float, Between(0.1, 600, "s")] = Field(30.0, description="[s] for a PX4 to connect or to answer")
+    parameters: dict[str, Float] = Field({}, description="of PX4, in place of ours: parameters.MPC_XY_P=1.2")
+    log: bool = Field(False, description="also the flight logs of PX4, .ulg")
+    out: str | None = Field(None, description="folder for metrics.json, plots and logs; None: runs/px4-...")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly; return the exit status."""
+    return run_command(_fly, _USAGE, Options, arguments)
+
+
+def _fly(values: dict[str, Any]) -> int:
+    from multilift_marl.px4.flight import Flight, check_config
+    from multilift_marl.px4.launch import find_px4
+    from multilift_marl.px4.team import AutopilotTeam, Settings
+
+    options, overrides = split_options(Options, values)
+    policy = find_policy(options.policy)
+    config = check_config(_find_config(options, policy.config, overrides))
+    folder = options.px4 or os.environ.get("PX4_DIR")
+    if not folder:
+        raise ConfigError(
+            "no PX4 is given; clone PX4-Autopilot, run `make px4_sitl_default` there, and give px4=<folder> or PX4_DIR"
+        )
+    build = find_px4(folder)
+    limit_torch_threads()
+    policy.bind(MultiliftVec(config))  # refuses what does not fit, before anything starts
+    name = f"px4-{title({'config': options.config or config.task})}-{Path(options.policy).stem}"
+    out = make_folder(Path(options.out) if options.out else Path("runs") / name / time.strftime("%Y%m%d-%H%M%S"))
+
+    begin = time.perf_counter()
+    settings = Settings(
+        build=build, first=options.instance, timeout=options.timeout, speed=options.speed, seed=options.seed,
+        log=options.log, parameters=options.parameters,
+    )  # fmt: skip
+    with AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
+        flight = Flight(config, team, options.seed, lambda text: print(text, flush=True))
+        flown = flight.fly(policy.bind)
+        factor = team.time / (time.perf_counter() - begin)
+        if options.log:
+            _keep_logs(team.autopilots.folder if team.autopilots else None, out)
+    ours = flight.fly_ours(policy.bind)
+    report = make_report(config, options.seed, flown.metrics, {OURS: ours.metrics})
+    report["px4"] = {
+        "drone_error_m": flown.drone_error, "estimate_error_m": flown.estimate_error,
+        "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
+    }  # fmt: skip
+    report["baselines"][OURS]["drone_error_m"] = ours.drone_error
+    print(f"\n{options.policy} on {config.task}, seed {options.seed}\n\n{format_table(report, 'PX4')}")
+    print(
+        f"drones from their references: {100 * flown.drone_error:.1f} cm, with our controller "
+        f"{100 * ours.drone_error:.1f} cm (RMS); PX4's estimates of their places: {100 * flown.estimate_error:.1f} cm; "
+        f"{factor:.1f} times real time"
+    )
+    write_report(out / "metrics.json", report)
+    _draw(out, {"PX4": flown.trace, OURS: ours.trace})
+    print(f"wrote {out / 'metrics.json'} and plots beside it")
+    return 0
+
+
+def _find_config(options: Options, own: Config | None, overrides: dict[str, Any]) -> Config:
+    if options.config is None and own is not None:
+        return build_config(own.model_dump(), overrides)
+    return load_config(options.config or "hover", overrides)
+
+
+def _keep_logs(folder: Path | None, out: Path) -> None:
+    for i, path in enumerate(sorted(folder.glob("*/log/*/*.ulg")) if folder else []):
+        shutil.copyfile(path, out / f"px4_{i}.ulg")
+        print(f"wrote {out / f'px4_{i}.ulg'}")
+
+
+def _draw(out: Path, traces: dict[str, Any]) -> None:
+    from multilift_marl.evaluation import plots
+
+    plots.plot_errors(out / "errors.png", traces)
+    plots.plot_tensions(out / "tensions.png", traces["PX4"], "PX4")
+    plots.plot_paths(out / "paths.png", traces["PX4"], "PX4")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
