@@ -22,7 +22,7 @@ G = 9.80665
 _SENSORS = frozenset({mavlink.MAVLINK_MSG_ID_HIL_SENSOR, mavlink.MAVLINK_MSG_ID_HIL_GPS})
 _COMMANDS = frozenset(
     {mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED, mavlink.MAVLINK_MSG_ID_COMMAND_LONG,
-     mavlink.MAVLINK_MSG_ID_HEARTBEAT}
+     mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET}
 )  # fmt: skip
 
 
@@ -213,6 +213,8 @@ class FakePX4(threading.Thread):
                 self.armed = bool(message.param1)
             acknowledged = self._mavlink.command_ack_encode(message.command, result)
             self._udp.sendto(acknowledged.pack(self._mavlink), (HOST, OWN_PORT + self.index))
+        elif kind == "SET_ATTITUDE_TARGET":
+            self.setpoints.append(message)
         elif kind == "SET_POSITION_TARGET_LOCAL_NED":
             if message.target_system != self.index + 1 or message.coordinate_frame != 1:
                 self.complaints.append(f"set-point for {message.target_system} in frame {message.coordinate_frame}")
@@ -224,8 +226,14 @@ class FakePX4(threading.Thread):
         if not self.setpoints or self._position is None:
             return np.full(4, 0.05)
         sp, p = self.setpoints[-1], self.parameters
+        if sp.get_type() == "SET_ATTITUDE_TARGET":
+            wanted = np.array([sp.body_roll_rate, sp.body_pitch_rate, sp.body_yaw_rate])
+            torque = np.array(p["inertia"]) * 22.0 * (wanted - self._rates)
+            return np.clip(self._mixer @ [4 * p["thrust"] * sp.thrust, *torque], 0.0, 1.0)
         place, velocity = np.array([sp.x, sp.y, sp.z]), np.array([sp.vx, sp.vy, sp.vz])
         acceleration = np.array([sp.afx, sp.afy, sp.afz])
+        if sp.type_mask & 1:  # an acceleration alone
+            place, velocity = self._position, self._velocity
         wanted = 6.0 * (place - self._position) + 4.0 * (velocity - self._velocity) + acceleration - [0, 0, G]
         force = p["mass"] * wanted
         down = -force / np.linalg.norm(force)

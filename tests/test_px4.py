@@ -14,6 +14,7 @@ from conftest import make_system
 import multilift_marl as ml
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.errors import ConfigError, FlightError
+from multilift_marl.realtime import RealTime
 from multilift_marl.sim import World
 from multilift_marl.sim.earth import Site, project_local
 
@@ -25,7 +26,7 @@ from multilift_marl.px4.flight import Flight, check_config
 from multilift_marl.px4.launch import find_px4, rig_parameters
 from multilift_marl.px4.link import PORT
 from multilift_marl.px4.mavlink import MAVLink, Splitter, mavlink
-from multilift_marl.px4.team import AutopilotTeam, Settings
+from multilift_marl.px4.team import AutopilotController, AutopilotTeam, Settings
 from multilift_marl.sim.sensors import Sensor, SensorSuite
 
 FIRST = 100 + 20 * int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))  # instances of this process
@@ -187,6 +188,42 @@ def test_a_team_flies_from_the_ground_through_a_task_and_back():
     assert ours.metrics["payload_position_error_m"][0] < 0.05
 
 
+@pytest.mark.parametrize("action", ["acceleration", "ctbr"])
+def test_other_interfaces_have_set_points_of_their_own(action):
+    config = config_of("takeoff", **{"control.action": action})
+    vec = ml.make_vec(config)
+    with Airfield(config.system) as field:
+        vec.use_controller(AutopilotController(config, vec.world, field.team))
+        vec.reset(seed=0)
+        field.team.board(vec.world)
+        field.team.prepare(vec.world)
+        actions = np.zeros((1, 2, vec.action_size), np.float32)
+        actions[..., 0], actions[..., 1] = 0.5, 0.2
+        for _ in range(10):
+            vec.step(actions)
+        time.sleep(0.1)
+        idle(field.team, vec.world, 10)
+        for n, fake in enumerate(field.fakes):
+            asked, vehicle = fake.setpoints[-1], config.system.vehicles[n]
+            if action == "ctbr":
+                force = vec.controller.gains.mass[n] * np.array([0, 0, 9.80665]) + vec.task.goal.cable_force[0, n]
+                hover = np.linalg.norm(force) / (4 * vehicle.rotor_thrust_max)
+                assert asked.get_type() == "SET_ATTITUDE_TARGET" and asked.type_mask == 128
+                assert asked.thrust == pytest.approx(0.5 + 0.5 * hover, abs=0.01)
+                assert asked.body_roll_rate == pytest.approx(0.2 * config.control.max_tilt_rate, rel=1e-5)
+                assert asked.body_pitch_rate == asked.body_yaw_rate == 0
+            else:
+                outward = np.append(vec.task.goal.slot_frame[0, n], 0)
+                sideways = np.array([-outward[1], outward[0], 0])
+                wanted = config.control.max_acceleration * (0.5 * outward + 0.2 * sideways)
+                share = vec.controller.gains.load_share[n]
+                wanted = wanted + (share * wanted + vec.task.goal.cable_force[0, n]) / vehicle.mass
+                velocity = vec.world.state.drone_velocity[0, n]
+                wanted_down = [asked.afy, asked.afx, -asked.afz]
+                assert asked.type_mask & 0x3F == 0x3F
+                np.testing.assert_allclose(wanted_down, wanted, atol=0.05 + 2 * np.linalg.norm(velocity))
+
+
 def test_rubbish_between_answers_is_skipped():
     system = make_system(2)
     world = World(system, 1, 1)
@@ -245,6 +282,32 @@ def test_a_port_that_is_taken_is_named():
             AutopilotTeam(make_system(2), DT, Settings(first=FIRST, timeout=0.3))
 
 
+# Real time
+
+
+def test_a_simulation_is_held_back_and_catches_up():
+    clock, begin = RealTime(2.0), time.perf_counter()
+    for step in range(101):
+        clock.wait(0.004 * step)
+        if step == 50:
+            time.sleep(0.05)  # it is late, and catches up
+    assert 0.2 <= time.perf_counter() - begin < 2.0
+    median, _, largest = clock.lateness()
+    assert 0 <= median < largest and 0.02 < largest
+    assert np.isnan(RealTime(0.0).lateness()).all()
+
+
+def test_a_simulation_that_is_far_too_late_goes_on_from_there():
+    clock = RealTime(1.0)
+    clock.wait(0.0)
+    time.sleep(0.3)
+    clock.wait(0.004)
+    assert clock.slips == 1
+    begin = time.perf_counter()
+    clock.wait(0.054)
+    assert time.perf_counter() - begin > 0.03
+
+
 # The command
 
 
@@ -253,7 +316,10 @@ def test_a_port_that_is_taken_is_named():
     [
         ([], "no PX4 is given; clone PX4-Autopilot, run `make px4_sitl_default` there"),
         (["px4=/nowhere"], "px4=/nowhere holds no PX4 for simulation"),
-        (["px4=/nowhere", "control.action=ctbr", "policy=formation"], "PX4 flies control.action=reference, not ctbr"),
+        (
+            ["px4=/nowhere", "control.action=rotor", "policy=formation"],
+            "PX4 has set-points for control.action=reference and acceleration and ctbr, not for rotor",
+        ),
         (["px4=/nowhere", "cable.model=chain"], "set cable.model=massless"),
         (["px4=/nowhere", "timeout=0"], "timeout"),
         (["px4=/nowhere", "instance=12"], "instance"),

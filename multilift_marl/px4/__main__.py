@@ -90,6 +90,8 @@ def _fly(values: dict[str, Any]) -> int:
         "drone_error_m": flown.drone_error, "estimate_error_m": flown.estimate_error,
         "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
     }  # fmt: skip
+    if options.speed:
+        report["px4"]["lateness_s"] = dict(zip(("50 %", "99 %", "99.9 %"), team.clock.lateness().tolist(), strict=True))
     report["baselines"][OURS]["drone_error_m"] = ours.drone_error
     print(f"\n{options.policy} on {config.task}, seed {options.seed}\n\n{format_table(report, 'PX4')}")
     print(
@@ -97,6 +99,9 @@ def _fly(values: dict[str, Any]) -> int:
         f"{100 * ours.drone_error:.1f} cm (RMS); PX4's estimates of their places: {100 * flown.estimate_error:.1f} cm; "
         f"{factor:.1f} times real time"
     )
+    if options.speed:
+        late = " / ".join(f"{1e3 * seconds:.2f}" for seconds in team.clock.lateness())
+        print(f"steps began late by {late} ms (50 / 99 / 99.9 %)")
     write_report(out / "metrics.json", report)
     _draw(out, {"PX4": flown.trace, OURS: ours.trace})
     print(f"wrote {out / 'metrics.json'} and plots beside it")

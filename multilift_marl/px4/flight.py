@@ -21,7 +21,7 @@ from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, FlightError
 from multilift_marl.evaluation.rollout import Trace, Tracer, measure_episodes
 from multilift_marl.math3d import ease
-from multilift_marl.px4.team import AutopilotController, AutopilotTeam
+from multilift_marl.px4.team import ACTIONS, AutopilotController, AutopilotTeam
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.failures import CAUSES
 
@@ -121,7 +121,8 @@ class Flight:
         values = {key: value for key, value in self.config.model_dump().items() if key not in _OWN}
         lasting = {"takeoff": 10.0, "land": 12.0}[task]
         overrides = {f"task_options.{key}": value for key, value in options.items()}
-        return build_config(values, {**overrides, "task": task, "env.episode_seconds": lasting})
+        overrides |= {"task": task, "env.episode_seconds": lasting, "control.action": "reference"}
+        return build_config(values, overrides)
 
     def _make(self, config: Config) -> MultiliftVec:
         vec = MultiliftVec(config, EVALUATION)
@@ -198,9 +199,10 @@ def check_config(config: Config) -> Config:
     Raises:
         ConfigError: naming what they cannot.
     """
-    if config.control.action != "reference":
+    if config.control.action not in ACTIONS:
         raise ConfigError(
-            f"PX4 flies control.action=reference, not {config.control.action}; take a policy of that interface"
+            f"PX4 has set-points for control.action={' and '.join(ACTIONS)}, not for {config.control.action}; take a "
+            "policy of one of these interfaces"
         )
     if config.cable.model != "massless":
         raise ConfigError("flights by PX4 go on from state to state, which chains cannot; set cable.model=massless")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,15 +18,15 @@ from multilift_marl.errors import FlightError
 from multilift_marl.px4.launch import Autopilots, rig_parameters
 from multilift_marl.px4.link import SimulatorLink
 from multilift_marl.px4.offboard import OFFBOARD, OffboardLink
+from multilift_marl.realtime import RealTime
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
-from multilift_marl.sim.earth import Site, project_local, swap_enu_ned, swap_yaw
+from multilift_marl.sim.earth import Site, project_local, swap_enu_ned, swap_flu_frd, swap_yaw
 from multilift_marl.sim.sensors import Sensors, SensorSuite
 from multilift_marl.sim.world import World
 
 SETPOINT_RATE = 50.0  # [Hz]
 HEARTBEAT_RATE = 2.0  # [Hz]
-_LATE = 0.1  # [s] that a simulation may catch up with
 READY_WITHIN = 60.0  # [s] of the simulation, until all are armed
 _SETTLE = 10.0  # [s] of the simulation, at rest, before arming: estimators converge
 
@@ -64,6 +63,7 @@ class AutopilotTeam:
     Attributes:
         links, offboard: of each autopilot.
         autopilots: their processes; None where others started them.
+        clock: that holds the simulation back.
 
     Raises:
         FlightError: a port is taken, or an autopilot does not start or connect.
@@ -74,7 +74,7 @@ class AutopilotTeam:
         self.links: list[SimulatorLink] = []
         self.offboard: list[OffboardLink] = []
         self.autopilots: Autopilots | None = None
-        self._dt, self._clock = dt, Clock(settings.speed)
+        self._dt, self.clock = dt, RealTime(settings.speed)
         self._time_us, self._ticks = 1_000_000, 0
         self._thrust_max = np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])
         self._mass, self._load_share = system.drone_mass, system.hook_force[:, 2] / GRAVITY
@@ -141,7 +141,7 @@ class AutopilotTeam:
             raise
         for i, link in enumerate(self.links):
             world.thrust[0, i] = link.controls * self._thrust_max[i]
-        self._clock.wait(self.time)
+        self.clock.wait(self.time)
 
     def _is_due(self, rate: float) -> bool:
         return self._ticks % max(1, round(1 / (rate * self._dt))) == 0
@@ -181,7 +181,7 @@ class AutopilotTeam:
                 said = "; ".join(late.said) or "it said nothing"
                 raise FlightError(f"PX4 {late.index} was not armed within {READY_WITHIN:g} s: {said}")
 
-    def send(self, i: int, motion: np.ndarray, cable_force: np.ndarray, yaw: float) -> None:
+    def send(self, i: int, motion: np.ndarray, cable_force: np.ndarray, yaw: float, place: bool = True) -> None:
         """Send a set-point to drone i.
 
         PX4's thrust is its acceleration set-point and gravity, times the drone's mass alone: the force on the cable,
@@ -192,13 +192,22 @@ class AutopilotTeam:
             motion: position, velocity, acceleration (3, 3), world frame.
             cable_force: nominal force of the drone on its cable (3,) [N], world frame.
             yaw: from east [rad].
+            place: whether position and velocity count, too.
         """
         position, velocity, acceleration = motion
         drag = self._drag[i] * velocity
         thrust = acceleration + (self._load_share[i] * acceleration + cable_force + drag) / self._mass[i]
-        place = project_local(self.settings.site.to_geodetic(position), self.offboard[i].origin)
-        vectors = swap_enu_ned(np.stack([velocity, thrust]))
-        self.offboard[i].send_position(self._time_us, place, vectors[0], vectors[1], float(swap_yaw(yaw)))
+        vectors, heading = swap_enu_ned(np.stack([velocity, thrust])), float(swap_yaw(yaw))
+        if place:
+            local = project_local(self.settings.site.to_geodetic(position), self.offboard[i].origin)
+            self.offboard[i].send_position(self._time_us, local, vectors[0], vectors[1], heading)
+        else:
+            self.offboard[i].send_acceleration(self._time_us, vectors[1], heading)
+
+    def send_rates(self, i: int, rates: np.ndarray, thrust: float) -> None:
+        """Send body rates [rad/s] and a total thrust [N] to drone i."""
+        share = float(np.clip(thrust / (4 * self._thrust_max[i]), 0.0, 1.0))
+        self.offboard[i].send_rates(self._time_us, swap_flu_frd(rates), share)
 
     def error(self, world: World) -> np.ndarray:
         """Return how far the drones are from where their autopilots believe to be (N,) [m]."""
@@ -217,27 +226,8 @@ class AutopilotTeam:
         self.close()
 
 
-class Clock:
-    """Holds a simulation back to a real-time factor; where it is late, it goes on from there.
-
-    Args:
-        speed: the factor; 0 for none.
-    """
-
-    def __init__(self, speed: float):
-        self.speed = speed
-        self._begin = 0.0
-
-    def wait(self, seconds: float) -> None:
-        """Wait until `seconds` of the simulation may have passed."""
-        if not self.speed:
-            return
-        now = time.perf_counter()
-        left = self._begin + seconds / self.speed - now
-        if left > 0:
-            time.sleep(left)
-        elif left < -_LATE:
-            self._begin -= left
+ACTIONS = ("reference", "acceleration", "ctbr")
+"""Action interfaces that PX4 has set-points for."""
 
 
 class AutopilotController(Controller):
@@ -251,7 +241,7 @@ class AutopilotController(Controller):
 
     def __init__(self, config: Config, world: World, team: AutopilotTeam):
         super().__init__(config, world)
-        self._team = team
+        self._team, self._action = team, config.control.action
 
     def bind(
         self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
@@ -262,8 +252,11 @@ class AutopilotController(Controller):
 
         def send(i: int) -> None:
             own = self.reference
-            motion = np.stack([own.position[0, i], own.velocity[0, i], own.acceleration[0, i]])
-            self._team.send(i, motion, cable_force[0, i], own.yaw[0, i])
+            if self._action == "ctbr":
+                self._team.send_rates(i, self._setpoint.rates[0, i], self._setpoint.thrust[0, i])
+            else:
+                motion = np.stack([own.position[0, i], own.velocity[0, i], own.acceleration[0, i]])
+                self._team.send(i, motion, cable_force[0, i], own.yaw[0, i], self._action == "reference")
 
         def autopilots() -> None:
             self._team.tick(self.world, send)
