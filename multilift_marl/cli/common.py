@@ -39,6 +39,7 @@ _EXTRAS = {
     "onnxscript": "export",
     "onnxruntime": "export",
     "pymavlink": "px4",
+    "rosbags": "ros",
 }  # of all other packages: train
 
 
@@ -79,7 +80,7 @@ def run_command(
         package = (error.name or "").split(".")[0]
         if package == "multilift_marl":
             raise
-        return _refuse(f"{error.name} is missing; {pip_install(_EXTRAS.get(package, 'train'))}")
+        return _refuse(f"{package} is missing; {pip_install(_EXTRAS.get(package, 'train'))}")
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130

@@ -21,7 +21,7 @@ from multilift_marl.control.scripted import fitting_scripts
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError
 from multilift_marl.evaluation.metrics import format_table, make_report, write_report
-from multilift_marl.evaluation.rollout import fly_episodes, trace_episode
+from multilift_marl.evaluation.rollout import Trace, fly_episodes, trace_episode
 
 _USAGE = """Evaluate a team on fixed seeds, beside the scripted ones on the same episodes.
 
@@ -55,6 +55,9 @@ class Options(Section):
     trail: Annotated[Float, Between(0, 1000, "s")] = Field(
         2.0, description="[s] of the paths that the video draws behind drones and payload"
     )
+    bag: str | None = Field(None, description="folder of a ROS 2 bag of the first episode, see docs/ros.md")
+    ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of that bag")
+    names: Literal["multilift", "report"] = Field("multilift", description="of its topics: ours or the report's")
     out: str | None = Field(
         None, description="folder for metrics.json, plots and video; None: <run>/eval/<time>, of a script runs/..."
     )
@@ -81,6 +84,10 @@ def _evaluate(values: dict[str, Any]) -> int:
         makers.setdefault(options.baseline, baseline.bind)
     for make in makers.values():  # refuses what does not fit, before there is a folder
         make(probe)
+    if options.bag is not None:
+        from multilift_marl.ros.bag import check_free
+
+        check_free(Path(options.bag))
     out = make_folder(Path(options.out) if options.out else team.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
 
     order = sorted(makers, key=lambda name: ":" not in name)  # one's own first: should they fail, nothing is lost
@@ -145,7 +152,8 @@ def _draw(config: Config, makers: dict[str, Any], team: _Team, options: Options,
     from multilift_marl.evaluation import plots
 
     names = dict.fromkeys([team.name] + ([] if options.baseline == "none" else [options.baseline]))
-    traces = {name: trace_episode(config, makers[name], 0, options.seed) for name in names}
+    traces = {name: trace_episode(config, makers[name], 0, options.seed) for name in names if name != team.name}
+    traces = {team.name: _trace(config, team, options)} | traces
     plots.plot_errors(out / "errors.png", traces)
     plots.plot_tensions(out / "tensions.png", traces[team.name], f"{team.name}, episode 0")
     plots.plot_paths(out / "paths.png", traces[team.name], f"{team.name}, episode 0")
@@ -160,6 +168,26 @@ def _draw(config: Config, makers: dict[str, Any], team: _Team, options: Options,
             _film(config, team.make, options, out / "episode_0.mp4")
         except RenderingError as error:
             print(f"no video: {error}", file=sys.stderr)
+
+
+def _trace(config: Config, team: _Team, options: Options) -> Trace:
+    """Return the trace of the first episode; record it in a bag if asked."""
+    if options.bag is None:
+        return trace_episode(config, team.make, 0, options.seed)
+    from multilift_marl.ros.bag import BagWriter
+
+    bags: list[BagWriter] = []
+    with ExitStack() as stack:
+
+        def record(vec: MultiliftVec) -> None:
+            if not bags:
+                folder = Path(str(options.bag))
+                bags.append(stack.enter_context(BagWriter(folder, vec, options.ros, options.names)))
+            bags[0].write(vec.steps[0] * vec.task.dt)
+
+        trace = trace_episode(config, team.make, 0, options.seed, record)
+    print(f"wrote {options.bag}")
+    return trace
 
 
 def _film(config: Config, maker: Any, options: Options, path: Path) -> None:

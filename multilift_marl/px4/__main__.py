@@ -8,11 +8,11 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
-from multilift_marl.agents.policy import find_policy
+from multilift_marl.agents.policy import NamedPolicy, find_policy
 from multilift_marl.cli.common import limit_torch_threads, make_folder, run_command, split_options, title
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
@@ -20,6 +20,9 @@ from multilift_marl.config.values import Between, Float, Int, Section
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.metrics import format_table, make_report, write_report
+
+if TYPE_CHECKING:
+    from multilift_marl.px4.flight import Flight, Flown
 
 _USAGE = """Fly one episode of a task by PX4 autopilots, in lockstep with the simulation: from slack cables on the
 ground to the task, back, and down again; then the same task by the controller of this package.
@@ -45,6 +48,9 @@ class Options(Section):
     )
     timeout: Annotated[Float, Between(0.1, 600, "s")] = Field(30.0, description="[s] for a PX4 to connect or to answer")
     parameters: dict[str, Float] = Field({}, description="of PX4, in place of ours: parameters.MPC_XY_P=1.2")
+    bag: str | None = Field(None, description="folder of a ROS 2 bag of the task, see docs/ros.md")
+    ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of that bag")
+    names: Literal["multilift", "report"] = Field("multilift", description="of its topics: ours or the report's")
     log: bool = Field(False, description="also the flight logs of PX4, .ulg")
     out: str | None = Field(None, description="folder for metrics.json, plots and logs; None: runs/px4-...")
 
@@ -68,6 +74,10 @@ def _fly(values: dict[str, Any]) -> int:
             "no PX4 is given; clone PX4-Autopilot, run `make px4_sitl_default` there, and give px4=<folder> or PX4_DIR"
         )
     build = find_px4(folder)
+    if options.bag is not None:
+        from multilift_marl.ros.bag import check_free
+
+        check_free(Path(options.bag))
     limit_torch_threads()
     policy.bind(MultiliftVec(config))  # refuses what does not fit, before anything starts
     name = f"px4-{title({'config': options.config or config.task})}-{Path(options.policy).stem}"
@@ -80,7 +90,7 @@ def _fly(values: dict[str, Any]) -> int:
     )  # fmt: skip
     with AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
         flight = Flight(config, team, options.seed, lambda text: print(text, flush=True))
-        flown = flight.fly(policy.bind)
+        flown = _record(flight, policy, options)
         factor = team.time / (time.perf_counter() - begin)
         if options.log:
             _keep_logs(team.autopilots.folder if team.autopilots else None, out)
@@ -106,6 +116,18 @@ def _fly(values: dict[str, Any]) -> int:
     _draw(out, {"PX4": flown.trace, OURS: ours.trace})
     print(f"wrote {out / 'metrics.json'} and plots beside it")
     return 0
+
+
+def _record(flight: Flight, policy: NamedPolicy, options: Options) -> Flown:
+    """Fly, with a bag of the task if asked."""
+    if options.bag is None:
+        return flight.fly(policy.bind)
+    from multilift_marl.ros.bag import BagWriter
+
+    with BagWriter(Path(options.bag), flight.vec, options.ros, options.names) as bag:
+        flown = flight.fly(policy.bind, lambda vec: bag.write(vec.steps[0] * vec.task.dt))
+    print(f"wrote {options.bag}")
+    return flown
 
 
 def _find_config(options: Options, own: Config | None, overrides: dict[str, Any]) -> Config:

@@ -31,6 +31,7 @@ _HOLD = 2.0  # [s] at the end of the way
 _OWN = ("task", "task_options", "reward")  # what take-off and landing have of their own
 Maker = Callable[[MultiliftVec], Policy]
 Say = Callable[[str], None]
+OnStep = Callable[[MultiliftVec], None]
 
 
 class Flown(NamedTuple):
@@ -83,8 +84,17 @@ class Flight:
         self.start: dict[str, np.ndarray] = {}
         self._begun: dict[str, np.ndarray] = {}
 
-    def fly(self, make_policy: Maker) -> Flown:
+    @property
+    def vec(self) -> MultiliftVec:
+        """The environment of the task."""
+        return self._task
+
+    def fly(self, make_policy: Maker, on_step: OnStep | None = None) -> Flown:
         """Fly, and return the task as measured.
+
+        Args:
+            make_policy: returns the policy of the task for its environment.
+            on_step: called with that environment after every step of the task.
 
         Raises:
             FlightError: an autopilot that does not do its part, or a failure before the task.
@@ -101,7 +111,7 @@ class Flight:
         self._run(takeoff, observation, "take-off")
         self._say("to the task")
         self._go(takeoff.world, _goal(takeoff), first)
-        flown = self._fly_task(takeoff.world, make_policy)
+        flown = self._fly_task(takeoff.world, make_policy, on_step)
         self._say("back, and landing")
         if flown.metrics["failure_cause"][0] == 0:
             self._go(self._task.world, _goal(self._task), _goal(self._landing))
@@ -114,7 +124,7 @@ class Flight:
         """Fly the same task from the same state with the geometric controller in place of autopilots."""
         vec = MultiliftVec(self.config, EVALUATION)
         observation, _ = vec.reset(seed=self.seed, options={"state": self.start, "randomization": self._drawn()})
-        return _measure(vec, make_policy(vec), observation, None)
+        return _measure(vec, make_policy(vec), observation)
 
     def _part(self, task: str, options: dict[str, Any]) -> Config:
         """Return the configuration of take-off or landing by the same rig."""
@@ -164,11 +174,11 @@ class Flight:
         self.team.board(vec.world)
         return observation
 
-    def _fly_task(self, world: World, make_policy: Maker) -> Flown:
+    def _fly_task(self, world: World, make_policy: Maker, on_step: OnStep | None) -> Flown:
         observation = self._take_over(self._task, world)
         self._say(f"{self.config.task}, {self._task.max_steps * self._task.task.dt:g} s")
         self.start = self._begun
-        return _measure(self._task, make_policy(self._task), observation, self.team)
+        return _measure(self._task, make_policy(self._task), observation, self.team, on_step)
 
 
 _FOLLOWING = ("cable_tension", "cable_broken")  # from the places
@@ -179,12 +189,17 @@ def _goal(vec: MultiliftVec) -> Goal:
     return Goal(goal.slots[0].copy(), goal.cable_force[0].copy(), float(goal.drone_yaw[0]), float(goal.position[0, 2]))
 
 
-def _measure(vec: MultiliftVec, policy: Policy, observation: np.ndarray, team: AutopilotTeam | None) -> Flown:
+def _measure(
+    vec: MultiliftVec, policy: Policy, observation: np.ndarray, team: AutopilotTeam | None = None,
+    on_step: OnStep | None = None,
+) -> Flown:  # fmt: skip
     tracer, drones, estimates = Tracer(), [], []
 
     def record(vec: MultiliftVec) -> None:
         tracer(vec)
         drones.append(((vec.world.state.drone_position - vec.reference.position) ** 2).sum(axis=-1).mean())
+        if on_step is not None:
+            on_step(vec)
         if team is not None:
             estimates.append((team.error(vec.world) ** 2).mean())
 
