@@ -173,18 +173,18 @@ def test_a_team_flies_from_the_ground_through_a_task_and_back():
     config, said = config_of("hover", **{"randomization.payload_force": 0.0, "env.episode_seconds": 4.0}), []
     with Airfield(config.system) as field:
         flight = Flight(config, field.team, 1000, said.append)
-        flown = flight.fly(lambda vec: make_scripted("formation_integral", vec))
+        result = flight.fly(lambda vec: make_scripted("formation_integral", vec))
         for fake in field.fakes:
             assert fake.complaints == []
             time.sleep(0.05)
         assert [link.faults for link in field.team.links] == [0, 0]
     assert said[-1] == "back, and landing" and len(said) == 5
-    assert flown.metrics["failure_cause"][0] == 0
-    assert flown.metrics["payload_position_error_m"][0] < 0.1
-    assert flown.drone_error < 0.25 and flown.estimate_error < 0.05  # its controller has no integral
-    assert flown.trace.tension.min() > 0
+    assert result.metrics["failure_cause"][0] == 0
+    assert result.metrics["payload_position_error_m"][0] < 0.1
+    assert result.drone_error < 0.25 and result.estimate_error < 0.05  # its controller has no integral
+    assert result.trace.tension.min() > 0
     ours = flight.fly_ours(lambda vec: make_scripted("formation_integral", vec))
-    np.testing.assert_allclose(ours.trace.payload_position[0], flown.trace.payload_position[0], atol=0.02)
+    np.testing.assert_allclose(ours.trace.payload_position[0], result.trace.payload_position[0], atol=0.02)
     assert ours.metrics["payload_position_error_m"][0] < 0.05
 
 

@@ -22,7 +22,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.metrics import format_table, make_report, write_report
 
 if TYPE_CHECKING:
-    from multilift_marl.px4.flight import Flight, Flown
+    from multilift_marl.px4.flight import Flight, FlightResult
 
 _USAGE = """Fly one episode of a task by PX4 autopilots, in lockstep with the simulation: from slack cables on the
 ground to the task, back, and down again; then the same task by the controller of this package.
@@ -90,14 +90,14 @@ def _fly(values: dict[str, Any]) -> int:
     )  # fmt: skip
     with AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
         flight = Flight(config, team, options.seed, lambda text: print(text, flush=True))
-        flown = _record(flight, policy, options)
+        result = _record(flight, policy, options)
         factor = team.time / (time.perf_counter() - begin)
         if options.log:
             _keep_logs(team.autopilots.folder if team.autopilots else None, out)
     ours = flight.fly_ours(policy.bind)
-    report = make_report(config, options.seed, flown.metrics, {OURS: ours.metrics})
+    report = make_report(config, options.seed, result.metrics, {OURS: ours.metrics})
     report["px4"] = {
-        "drone_error_m": flown.drone_error, "estimate_error_m": flown.estimate_error,
+        "drone_error_m": result.drone_error, "estimate_error_m": result.estimate_error,
         "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
     }  # fmt: skip
     if options.speed:
@@ -105,29 +105,29 @@ def _fly(values: dict[str, Any]) -> int:
     report["baselines"][OURS]["drone_error_m"] = ours.drone_error
     print(f"\n{options.policy} on {config.task}, seed {options.seed}\n\n{format_table(report, 'PX4')}")
     print(
-        f"drones from their references: {100 * flown.drone_error:.1f} cm, with our controller "
-        f"{100 * ours.drone_error:.1f} cm (RMS); PX4's estimates of their places: {100 * flown.estimate_error:.1f} cm; "
-        f"{factor:.1f} times real time"
+        f"drones from their references: {100 * result.drone_error:.1f} cm, with our controller "
+        f"{100 * ours.drone_error:.1f} cm (RMS); PX4's estimates of their places: "
+        f"{100 * result.estimate_error:.1f} cm; {factor:.1f} times real time"
     )
     if options.speed:
         late = " / ".join(f"{1e3 * seconds:.2f}" for seconds in team.clock.lateness())
         print(f"steps began late by {late} ms (50 / 99 / 99.9 %)")
     write_report(out / "metrics.json", report)
-    _draw(out, {"PX4": flown.trace, OURS: ours.trace})
+    _draw(out, {"PX4": result.trace, OURS: ours.trace})
     print(f"wrote {out / 'metrics.json'} and plots beside it")
     return 0
 
 
-def _record(flight: Flight, policy: NamedPolicy, options: Options) -> Flown:
+def _record(flight: Flight, policy: NamedPolicy, options: Options) -> FlightResult:
     """Fly, with a bag of the task if asked."""
     if options.bag is None:
         return flight.fly(policy.bind)
     from multilift_marl.ros.bag import BagWriter
 
     with BagWriter(Path(options.bag), flight.vec, options.ros, options.names) as bag:
-        flown = flight.fly(policy.bind, lambda vec: bag.write(vec.steps[0] * vec.task.dt))
+        result = flight.fly(policy.bind, lambda vec: bag.write(vec.steps[0] * vec.task.dt))
     print(f"wrote {options.bag}")
-    return flown
+    return result
 
 
 def _find_config(options: Options, own: Config | None, overrides: dict[str, Any]) -> Config:

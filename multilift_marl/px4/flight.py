@@ -34,7 +34,7 @@ Say = Callable[[str], None]
 OnStep = Callable[[MultiliftVec], None]
 
 
-class Flown(NamedTuple):
+class FlightResult(NamedTuple):
     """The task of a flight, as measured."""
 
     metrics: dict[str, np.ndarray]
@@ -66,7 +66,7 @@ class Flight:
         config: the task, its rig and its control.
         team: the autopilots.
         seed: evaluation seed; the episode is the first of `evaluate.py`.
-        say: is told what goes on.
+        say: called with what goes on.
 
     Attributes:
         start: state in which the task began.
@@ -89,7 +89,7 @@ class Flight:
         """The environment of the task."""
         return self._task
 
-    def fly(self, make_policy: Maker, on_step: OnStep | None = None) -> Flown:
+    def fly(self, make_policy: Maker, on_step: OnStep | None = None) -> FlightResult:
         """Fly, and return the task as measured.
 
         Args:
@@ -111,16 +111,16 @@ class Flight:
         self._run(takeoff, observation, "take-off")
         self._say("to the task")
         self._go(takeoff.world, _goal(takeoff), first)
-        flown = self._fly_task(takeoff.world, make_policy, on_step)
+        result = self._fly_task(takeoff.world, make_policy, on_step)
         self._say("back, and landing")
-        if flown.metrics["failure_cause"][0] == 0:
+        if result.metrics["failure_cause"][0] == 0:
             self._go(self._task.world, _goal(self._task), _goal(self._landing))
             self._run(self._landing, self._take_over(self._landing, self._task.world), "landing")
             for autopilot in self.team.offboard:
                 autopilot.arm(False, force=True)
-        return flown
+        return result
 
-    def fly_ours(self, make_policy: Maker) -> Flown:
+    def fly_ours(self, make_policy: Maker) -> FlightResult:
         """Fly the same task from the same state with the geometric controller in place of autopilots."""
         vec = MultiliftVec(self.config, EVALUATION)
         observation, _ = vec.reset(seed=self.seed, options={"state": self.start, "randomization": self._drawn()})
@@ -174,7 +174,7 @@ class Flight:
         self.team.board(vec.world)
         return observation
 
-    def _fly_task(self, world: World, make_policy: Maker, on_step: OnStep | None) -> Flown:
+    def _fly_task(self, world: World, make_policy: Maker, on_step: OnStep | None) -> FlightResult:
         observation = self._take_over(self._task, world)
         self._say(f"{self.config.task}, {self._task.max_steps * self._task.task.dt:g} s")
         self.start = self._begun
@@ -192,7 +192,7 @@ def _goal(vec: MultiliftVec) -> Goal:
 def _measure(
     vec: MultiliftVec, policy: Policy, observation: np.ndarray, team: AutopilotTeam | None = None,
     on_step: OnStep | None = None,
-) -> Flown:  # fmt: skip
+) -> FlightResult:  # fmt: skip
     tracer, drones, estimates = Tracer(), [], []
 
     def record(vec: MultiliftVec) -> None:
@@ -205,7 +205,7 @@ def _measure(
 
     metrics = measure_episodes(vec, policy, observation, record)
     estimate = float(np.sqrt(np.mean(estimates))) if estimates else float("nan")
-    return Flown(metrics, tracer.trace(), float(np.sqrt(np.mean(drones))), estimate)
+    return FlightResult(metrics, tracer.trace(), float(np.sqrt(np.mean(drones))), estimate)
 
 
 def check_config(config: Config) -> Config:

@@ -35,7 +35,7 @@ class OffboardLink:
     Attributes:
         armed, mode: as the last heartbeat said; mode is PX4's main and sub mode.
         position, velocity: as PX4 estimates them, in its local frame, NED [m, m/s]; NaN before the first.
-        origin: latitude, longitude [deg] and altitude [m] of that frame; NaN before PX4 has told.
+        origin: latitude, longitude [deg] and altitude [m] of that frame; NaN before PX4 has said.
         said: its last words, and which commands it refused.
     """
 
