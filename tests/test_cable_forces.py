@@ -200,3 +200,11 @@ def test_a_payload_settles_where_its_potential_energy_is_convex():
             found.append(is_stable(0, goal, make_rig(system), hanging, stiffness))
             assert found[-1] == (least > 0), (soft, roll, pitch, least)
     assert 0 < sum(found) < len(found)
+
+
+def test_a_level_payload_of_grams_settles_as_well_as_one_of_kilograms():
+    small = {"vehicle.preset": "crazyflie", "payload.mass": 0.02, "payload.size": [0.08, 0.08, 0.01]}
+    system = make_system(3, **small, **{"cable.length": 0.3, "randomization.payload_force": 0.0})
+    hanging = make_hanging(system)
+    goal = placed(system, 0.0, 0.0, lambda goal, rig: place_balanced(0, goal, rig, hanging))
+    assert is_stable(0, goal, make_rig(system), hanging, np.full(3, 0.5))

@@ -189,6 +189,11 @@ def test_numbers_that_no_flight_can_have_are_named_with_their_bounds_and_unit(ke
         ({"cable.length": 0.01}, "cable.length", "raise cable.length"),
         ({"cable.length": 1.0, "randomization.cable_length": 0.99}, "randomization.cable_length", "lower"),
         ({"cable.model": "chain", "cable.density": 1e-9}, "cable.density", "lower cable.segments"),
+        (
+            {"control.attitude_frequency": None, "sim.control_hz": 25, "env.policy_hz": 25},
+            "control.attitude_frequency=21.2121 rad/s",
+            "raise sim.control_hz",
+        ),
         ({"control.attitude_frequency": 200.0}, "control.attitude_frequency", "raise sim.control_hz"),
     ],
 )

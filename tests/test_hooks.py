@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from conftest import floats, level, load, make, make_system, mask, refuse_system, zeros
 
+import multilift_marl as ml
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.control.formation import Goal, goal_hook, make_rig, place_formation, set_heading
 from multilift_marl.control.gains import make_gains
-from multilift_marl.control.geometric import hook_moment
+from multilift_marl.control.geometric import fly_rates, hook_moment
+from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.math3d import axis_angle, rot_z
 from multilift_marl.sim import World
 from multilift_marl.sim.state import hook_position
@@ -123,6 +125,21 @@ def test_the_controller_feeds_the_moment_of_the_pull_forward():
         expected = np.cross(system.hooks[n], rotation.T @ (cable_force + gains.load_share[n] * acceleration))
         found = hook_moment(n, floats(rotation), floats(cable_force), floats(acceleration), gains)
         np.testing.assert_allclose(found, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("hook", [BELOW, ASIDE], ids=["below", "aside"])
+def test_rates_of_zero_ask_for_no_more_than_the_moment_of_the_pull(hook):
+    config = ml.load_config("hover", {"env.num_drones": 4, "cable.hook": hook})
+    world = World(config.system, 1, 1)
+    gains, thrust = make_gains(config.control, config.system), np.zeros((1, 4, 4))
+    setpoint = Setpoint.zeros(1, 4)
+    setpoint.thrust[:] = 12.0
+    cable_force = config.system.hook_force[None]
+    world.state.drone_body_rates[:] = 0
+    fly_rates(0, 1, world.state, setpoint, cable_force, thrust, gains)
+    for n, vehicle in enumerate(config.system.vehicles):
+        expected = np.cross(config.system.hooks[n], world.state.drone_rotation[0, n].T @ cable_force[0, n])
+        np.testing.assert_allclose(vehicle.allocation @ thrust[0, n], [12.0, *expected], atol=1e-9)
 
 
 # Observations

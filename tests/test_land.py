@@ -9,6 +9,7 @@ from test_scripted_flights import fly_once
 
 from multilift_marl.config.load import load_config
 from multilift_marl.control.scripted import make_scripted
+from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.tasks.land import AIRBORNE, CRASHED, LANDED, LOWER, NEAR, RELEASE, SETTLE
 
 CALM = {"randomization.payload_mass": 0.0}
@@ -51,7 +52,7 @@ def test_land_starts_are_as_documented():
     vec.reset(seed=0)
     state, task, system = vec.world.state, vec.task, vec.world.system
     np.testing.assert_allclose(state.payload_position, np.broadcast_to([0, 0, 1.5], (2000, 3)))
-    assert np.abs(task.own.course[:, :2]).max() <= 1 and np.ptp(task.own.course[:, :2]) > 1.99
+    assert np.abs(task.own.course[:, :2]).max() <= 1 and np.ptp(task.own.course[:, :2], axis=0).min() > 1.99
     assert np.degrees(np.abs(task.goal.yaw).max()) <= 45 and np.degrees(np.ptp(task.goal.yaw)) > 89
     assert (state.payload_velocity == 0).all() and task.errors.angle.max() < 1e-7
     expected = system.resting_tension * (vec.world.hidden_loads.payload_mass / system.payload_mass)[:, None]
@@ -138,6 +139,18 @@ def test_success_is_at_rest_slack_and_clear_throughout_the_last_second(spoil):
     judge(vec)
     assert task.succeeded()[0] == (spoil == "nothing")
     assert (task.good_time[0] > 0) == (spoil == "nothing")
+
+
+@pytest.mark.parametrize("above", [0.28, 0.32])
+def test_clearance_is_from_the_payloads_surface_wherever_its_centre_of_mass_is(above):
+    vec = after(11.0, **CALM, **{"payload.center_of_mass": [0.0, 0.0, 0.05]})
+    state, system = vec.world.state, vec.world.system
+    half = np.linalg.norm(drone_half_size(system.vehicle))
+    top = state.payload_position[0, 2] + system.payload_center[2] + system.payload_size[2] / 2
+    state.drone_position[0, 1] = [*state.payload_position[0, :2], top + half + above]
+    vec.task.good_time[0] = 1.0
+    judge(vec)
+    assert (vec.task.good_time[0] > 0) == (above > 0.3)
 
 
 @pytest.mark.slow

@@ -35,6 +35,7 @@ def test_targets_are_drawn_from_the_documented_ranges():
     pose = vec.task.own.plan.pose
     assert pose.shape == (1000, 4, 6)
     assert np.abs(pose[..., :2]).max() <= 1 and pose[..., 2].min() >= 1 and pose[..., 2].max() <= 2
+    assert np.ptp(pose[..., :2], axis=(0, 1)).min() > 1.95
     tilt = np.degrees(pose[:, 1:, 4:])
     assert 44 < np.abs(tilt).max() <= 45 and (pose[:, 0, 4:] == 0).all()
     assert 179 < np.degrees(np.abs(pose[..., 3])).max() <= 180

@@ -33,7 +33,7 @@ def test_takeoff_starts_are_as_documented():
     vec = make("takeoff", num_envs=4000)
     vec.reset(seed=0)
     goal, state, system = vec.task.goal, vec.world.state, vec.world.system
-    assert np.abs(goal.position[:, :2]).max() <= 1 and np.ptp(goal.position[:, :2]) > 1.99
+    assert np.abs(goal.position[:, :2]).max() <= 1 and np.ptp(goal.position[:, :2], axis=0).min() > 1.99
     assert np.degrees(np.abs(goal.yaw).max()) <= 45 and np.degrees(np.ptp(goal.yaw)) > 89
     np.testing.assert_allclose(state.payload_position[:, 2], system.payload_size[2] / 2)
     np.testing.assert_array_equal(state.payload_position, goal.position)
@@ -79,6 +79,7 @@ def test_the_velocities_of_the_plan_are_those_of_target_and_slots():
     own = np.gradient(slots - target[:, None], 0.004, axis=0)
     np.testing.assert_allclose(own[1:-1], slot_velocity[1:-1], atol=0.02)  # the closing of the cables is not told
     assert np.abs(slot_velocity).max() > 0.5
+    assert target[-1, 2] == pytest.approx(vec.task.options.target_height, abs=1e-6)
 
 
 def test_cables_are_slack_until_the_drones_close_them_and_taut_when_they_pull():

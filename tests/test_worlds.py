@@ -145,6 +145,13 @@ def test_a_diverged_simulation_keeps_sound_numbers_and_spares_the_others(force):
     assert all(np.isfinite(saved[key]).all() for key in saved if key.startswith("state."))
 
 
+def test_coordinates_are_those_of_the_environment_whatever_its_thread():
+    world = World(make_system(2), 5, 2)
+    world.state.payload_position[:, 0] = np.arange(5.0)
+    world.load(np.ones(5, bool))
+    assert [world.qpos(e)[0] for e in range(5)] == [0, 1, 2, 3, 4]
+
+
 def test_strong_damping_of_a_soft_cable_is_no_divergence():
     system = make_system(2, **{"payload.shape": "point", "payload.mass": 0.4, "cable.stiffness": 47.6})
     world = World(system, 1)
