@@ -40,6 +40,7 @@ _EXTRAS = {
     "onnxruntime": "export",
     "pymavlink": "px4",
     "rosbags": "ros",
+    "cyclonedds": "ros",
 }  # of all other packages: train
 
 

@@ -59,6 +59,9 @@ class FlightMessages:
         vec: the environments.
         store: types of a ROS distribution.
         names: a key of `NAMES`.
+
+    Attributes:
+        frames: of the drones.
     """
 
     def __init__(self, vec: MultiliftVec, store: Typestore, names: str = "multilift"):
@@ -66,7 +69,7 @@ class FlightMessages:
         self._report = names == "report"
         drones = range(self._names.first, self._names.first + vec.num_drones)
         self._drones = [self._names.drone.format(i) for i in drones]
-        self._frames = [f"drone_{i}" for i in drones]
+        self.frames = [f"drone_{i}" for i in drones]
         self._synced = -1
 
     def topics(self) -> list[Topic]:
@@ -78,7 +81,7 @@ class FlightMessages:
             Topic(self._names.payload, "nav_msgs/msg/Odometry", reliable=not self._report),
             *(Topic(name, kind, reliable=not self._report) for name in self._drones),
             Topic("/target", "geometry_msgs/msg/PoseStamped"),
-            *(Topic(f"/{frame}/reference", "geometry_msgs/msg/PoseStamped") for frame in self._frames),
+            *(Topic(f"/{frame}/reference", "geometry_msgs/msg/PoseStamped") for frame in self.frames),
             Topic("/cables", "sensor_msgs/msg/JointState"),
             Topic("/markers", "visualization_msgs/msg/MarkerArray"),
         ]
@@ -90,7 +93,7 @@ class FlightMessages:
         header = self._header(time_ns)
         yield "/clock", self._new("rosgraph_msgs/msg/Clock", clock=header.stamp)
         bodies = [("payload", *(array[0] for array in state[:4]))]
-        for i, frame in enumerate(self._frames):
+        for i, frame in enumerate(self.frames):
             rows = (state.drone_position, state.drone_rotation, state.drone_velocity, state.drone_body_rates)
             bodies.append((frame, *(array[0, i] for array in rows)))
         transforms = [
@@ -111,7 +114,7 @@ class FlightMessages:
             else:
                 yield name, self._pose_stamped(header, body[1], body[2])
         yield "/target", self._pose_stamped(header, goal.position[0], goal.rotation[0])
-        for i, frame in enumerate(self._frames):
+        for i, frame in enumerate(self.frames):
             yaw = reference.yaw[0, i]
             c, s = np.cos(yaw), np.sin(yaw)
             level = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])

@@ -1,0 +1,156 @@
+"""ROS 2 topics by DDS (Eclipse Cyclone DDS), without ROS 2.
+
+As in ROS 2, topics are `rt/<name>`, types `pkg::msg::dds_::Name_` (final, XCDR1), and the hash of the type is in the
+user data, where Jazzy and later look for it. Bytes are those of rosbags' serializer; Cyclone DDS carries them.
+"""
+
+from __future__ import annotations
+
+import types as python_types
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from cyclonedds.core import DDSException
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct, types
+from cyclonedds.idl.annotations import final
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic as DdsTopic
+from cyclonedds.util import duration
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+
+from multilift_marl.errors import FlightError
+from multilift_marl.ros.messages import Topic
+
+_LOOPBACK = """<CycloneDDS><Domain>
+<General><Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>50</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+_BASE = {
+    "bool": bool, "string": str, "byte": types.uint8, "char": types.uint8, "int8": types.int8, "uint8": types.uint8,
+    "int16": types.int16, "uint16": types.uint16, "int32": types.int32, "uint32": types.uint32,
+    "int64": types.int64, "uint64": types.uint64, "float32": types.float32, "float64": types.float64,
+}  # fmt: skip
+_QUEUE = 10  # messages that a reliable topic keeps
+_domains: dict[int, Domain] = {}  # a process configures each once
+
+
+class Node:
+    """Publishes and subscribes, on this machine alone unless it is told otherwise.
+
+    Args:
+        distribution: of ROS 2, whose types and hashes these are.
+        domain: number, ROS_DOMAIN_ID of its peers.
+        allow_network: whether DDS may use the machine's other networks, and multicast.
+
+    Raises:
+        FlightError: DDS does not start.
+    """
+
+    def __init__(self, distribution: Stores = Stores.ROS2_JAZZY, domain: int = 0, allow_network: bool = False):
+        self.store = get_typestore(distribution)
+        self._distribution = distribution
+        try:
+            if not allow_network and domain not in _domains:
+                _domains[domain] = Domain(domain, _LOOPBACK)
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            raise FlightError(
+                f"DDS does not start in domain {domain} ({error.msg}); take another one, or end what uses its ports"
+            ) from None
+
+    def publisher(self, topic: Topic) -> Callable[[Any], None]:
+        """Return the call that publishes a message of rosbags' on a topic."""
+        kind = _carrier(self._distribution, topic.kind)
+        quality = self._quality(topic)
+        writer = DataWriter(self._participant, DdsTopic(self._participant, f"rt{topic.name}", kind), quality)
+        carrier = kind()
+
+        def publish(message: Any) -> None:
+            carrier.data = bytes(self.store.serialize_cdr(message, topic.kind))
+            writer.write(carrier)
+
+        return publish
+
+    def subscription(self, topic: Topic) -> Callable[[], list[Any]]:
+        """Return the call that returns the messages of a topic that have come since the last call."""
+        kind = _carrier(self._distribution, topic.kind)
+        quality = self._quality(topic)
+        reader = DataReader(self._participant, DdsTopic(self._participant, f"rt{topic.name}", kind), quality)
+
+        def take() -> list[Any]:
+            return [
+                self.store.deserialize_cdr(sample.data, topic.kind)
+                for sample in reader.take(_QUEUE)
+                if isinstance(sample, kind)  # others tell that a publisher has gone
+            ]
+
+        return take
+
+    def _quality(self, topic: Topic) -> Qos:
+        """Return the quality of service of a topic, with the hash of its type."""
+        typehash = f"typehash={self.store.hash_rihs01(topic.kind)};".encode()
+        return Qos(
+            Policy.Reliability.Reliable(duration(seconds=1)) if topic.reliable else Policy.Reliability.BestEffort,
+            Policy.Durability.TransientLocal if topic.latched else Policy.Durability.Volatile,
+            Policy.History.KeepLast(_QUEUE if topic.reliable and not topic.latched else 1),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.Userdata(typehash),
+        )
+
+
+@cache
+def _carrier(distribution: Stores, kind: str) -> Any:
+    """Return a class with the DDS type of a message, whose instances carry its bytes as they are."""
+    described = _idl_type(distribution, kind)
+
+    class Carrier(described):  # type: ignore[misc, valid-type]
+        data = b""
+
+        def __init__(self) -> None:
+            pass
+
+        def serialize(self, *_: Any, **__: Any) -> bytes:
+            return self.data
+
+        @classmethod
+        def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Carrier:
+            sample = cls()
+            sample.data = bytes(data)
+            return sample
+
+    Carrier.__idl__ = described.__idl__
+    return Carrier
+
+
+@cache
+def _idl_type(distribution: Stores, kind: str) -> Any:
+    """Return the DDS type of a message."""
+    package, _, name = kind.split("/")
+    fields = get_typestore(distribution).fielddefs[kind][1]
+    members = {field: _idl_field(distribution, description) for field, description in fields}
+
+    def fill(namespace: dict[str, Any]) -> None:
+        namespace |= {"__annotations__": members, "__module__": __name__}
+
+    created: Any = python_types.new_class(f"{name}_", (IdlStruct,), {"typename": f"{package}.msg.dds_.{name}_"}, fill)
+    return final(dataclass(created)) or created
+
+
+def _idl_field(distribution: Stores, description: Any) -> Any:
+    node, argument = description
+    if node == Nodetype.BASE:
+        return _BASE[argument[0]]
+    if node == Nodetype.NAME:
+        return _idl_type(distribution, argument)
+    element = _idl_field(distribution, argument[0])
+    array: Any = types.array
+    sequence: Any = types.sequence
+    return array[element, argument[1]] if node == Nodetype.ARRAY else sequence[element]

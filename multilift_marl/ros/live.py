@@ -1,0 +1,126 @@
+"""A live simulation on ROS 2 topics: what it publishes, and the set-points that it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from multilift_marl.control.policy import Policy
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
+from multilift_marl.ros.dds import Node
+from multilift_marl.ros.messages import FlightMessages, Topic
+
+HOLD_AFTER = 0.25  # [s] without a set-point, after which the last place is held
+LAND_AFTER = 2.0  # [s] after which the drone sinks
+SINK = 0.4  # [m/s]
+
+
+class SetPoints:
+    """Set-points of others for each drone, in place of a policy: places, of which actions are made.
+
+    A drone without a fresh one holds the last one, and sinks later, down to the ground.
+
+    Args:
+        vec: one environment, of the action interface `reference`.
+        take: for each drone, the call that returns the poses that have come.
+
+    Attributes:
+        age: of each drone's last set-point (N,) [s], infinite before the first.
+        late: steps in which a drone had none that was fresh (N,).
+    """
+
+    def __init__(self, vec: MultiliftVec, take: list[Callable[[], list[Any]]]):
+        if vec.config.control.action != "reference":
+            raise ConfigError(
+                f"set-points are places, for control.action=reference, not {vec.config.control.action}; change it"
+            )
+        self._vec, self._take = vec, take
+        self._place = np.zeros((vec.num_drones, 3))
+        self._yaw = np.zeros(vec.num_drones)
+        self.age = np.full(vec.num_drones, np.inf)
+        self.late = np.zeros(vec.num_drones, int)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Hold where the drones are."""
+        self._place[:] = self._vec.world.state.drone_position[0]
+        self._yaw[:] = self._vec.task.goal.drone_yaw[0]
+        self.age[:] = np.inf
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the actions (1, N, 4) whose references are the set-points, as far as offsets go."""
+        dt = self._vec.task.dt
+        for n, take in enumerate(self._take):
+            self.age[n] += dt
+            for message in take():
+                pose = message.pose
+                place = np.array([pose.position.x, pose.position.y, pose.position.z])
+                q = pose.orientation
+                yaw = np.arctan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
+                if np.isfinite(place).all() and np.isfinite(yaw):
+                    self._place[n], self._yaw[n], self.age[n] = place, yaw, 0.0
+            if self.age[n] > HOLD_AFTER:
+                self.late[n] += 1
+            if np.isfinite(self.age[n]) and self.age[n] > LAND_AFTER:
+                self._place[n, 2] = max(self._place[n, 2] - SINK * dt, 0.0)
+        return self._actions()
+
+    def _actions(self) -> np.ndarray:
+        goal, control = self._vec.task.goal, self._vec.config.control
+        offset = self._place - goal.slots[0]
+        c, s = goal.slot_frame[0].T
+        turned = np.remainder(self._yaw - goal.drone_yaw[0] + np.pi, 2 * np.pi) - np.pi
+        numbers = [c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]]
+        action = np.stack([*(number / control.max_offset for number in numbers), turned / control.max_yaw], axis=-1)
+        return np.clip(action, -1, 1)[None].astype(np.float32)
+
+
+class LiveFlight:
+    """Environment 0 on topics, episode after episode.
+
+    Args:
+        vec: one environment.
+        node: publishes and subscribes.
+        names: of the topics, a key of `messages.NAMES`.
+        policy: of these environments; None: set-points of others, on /drone_<i>/setpoint.
+
+    Attributes:
+        time_ns: of the simulation, over all episodes [ns].
+        setpoints: where there is no policy.
+    """
+
+    def __init__(self, vec: MultiliftVec, node: Node, names: str = "multilift", policy: Policy | None = None):
+        self._vec = vec
+        self._messages = FlightMessages(vec, node.store, names)
+        self._publish = {topic.name: node.publisher(topic) for topic in self._messages.topics()}
+        self.setpoints: SetPoints | None = None
+        if policy is None:
+            topics = [
+                Topic(f"/{frame}/setpoint", "geometry_msgs/msg/PoseStamped", False) for frame in self._messages.frames
+            ]
+            self.setpoints = policy = SetPoints(vec, [node.subscription(topic) for topic in topics])
+        self._policy: Policy = policy
+        self.time_ns = 0
+
+    def begin(self, seed: int) -> None:
+        """Begin an episode, and publish its start."""
+        self._observation, _ = self._vec.reset(seed=seed)
+        self._policy.reset()
+        self._send()
+
+    def step(self) -> bool:
+        """Make a policy step and publish; return whether the episode goes on. After its end the next one begins."""
+        self._observation, _, terminated, truncated, _ = self._vec.step(self._policy.act(self._observation))
+        self.time_ns += round(self._vec.task.dt * 1e9)
+        self._send()
+        if terminated[0] or truncated[0]:
+            self._observation, _ = self._vec.reset()
+            self._policy.reset()
+            return False
+        return True
+
+    def _send(self) -> None:
+        for topic, message in self._messages.messages(self.time_ns):
+            self._publish[topic](message)
