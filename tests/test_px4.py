@@ -188,6 +188,21 @@ def test_a_team_flies_from_the_ground_through_a_task_and_back():
     assert ours.metrics["payload_position_error_m"][0] < 0.05
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["takeoff", "land"])
+def test_take_off_and_landing_are_tasks_too(task):
+    config, said = config_of(task, **{"randomization.payload_mass": 0.0}), []
+    with Airfield(config.system) as field:
+        flight = Flight(config, field.team, 1000, said.append)
+        result = flight.fly(lambda vec: make_scripted("formation_integral", vec))
+        assert [fake.complaints for fake in field.fakes] == [[], []]
+    assert result.metrics["failure_cause"][0] == 0
+    assert len(result.trace.time) == flight.vec.max_steps
+    assert (said[-1] == "back, and landing") == (task == "takeoff")
+    ours = flight.fly_ours(lambda vec: make_scripted("formation_integral", vec))
+    assert ours.metrics["success_rate"][0]
+
+
 @pytest.mark.parametrize("action", ["acceleration", "ctbr"])
 def test_other_interfaces_have_set_points_of_their_own(action):
     config = config_of("takeoff", **{"control.action": action})

@@ -69,7 +69,7 @@ class Flight:
         say: called with what goes on.
 
     Attributes:
-        start: state in which the task began.
+        start: state in which the task began; empty for `takeoff`, which begins as ever.
 
     Raises:
         ConfigError: what autopilots cannot fly.
@@ -99,26 +99,40 @@ class Flight:
         Raises:
             FlightError: an autopilot that does not do its part, or a failure before the task.
         """
-        first = _goal(self._task)
-        rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": first.height}
-        takeoff = self._make(self._part("takeoff", rise))
-        observation, _ = takeoff.reset(seed=self.seed, options={"randomization": self._drawn()})
-        self.team.board(takeoff.world)
-        self._say("waiting for the autopilots")
-        self.team.prepare(takeoff.world)
-        self._say(f"armed after {self.team.time:.0f} s; take-off")
-        takeoff.controller.start(0)
-        self._run(takeoff, observation, "take-off")
-        self._say("to the task")
-        self._go(takeoff.world, _goal(takeoff), first)
-        result = self._fly_task(takeoff.world, make_policy, on_step)
-        self._say("back, and landing")
-        if result.metrics["failure_cause"][0] == 0:
+        if self.config.task == "takeoff":
+            observation = self._arm(self._task)
+            result = self._measure_task(make_policy, observation, on_step)
+        else:
+            first = _goal(self._task)
+            rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": first.height}
+            takeoff = self._make(self._part("takeoff", rise))
+            self._run(takeoff, self._arm(takeoff), "take-off")
+            self._say("to the task")
+            self._go(takeoff.world, _goal(takeoff), first)
+            observation = self._take_over(self._task, takeoff.world)
+            self.start = self._begun
+            result = self._measure_task(make_policy, observation, on_step)
+        if self.config.task != "land" and result.metrics["failure_cause"][0] == 0:
+            self._say("back, and landing")
             self._go(self._task.world, _goal(self._task), _goal(self._landing))
             self._run(self._landing, self._take_over(self._landing, self._task.world), "landing")
-            for autopilot in self.team.offboard:
-                autopilot.arm(False, force=True)
+        for autopilot in self.team.offboard:
+            autopilot.arm(False, force=True)
         return result
+
+    def _arm(self, vec: MultiliftVec) -> np.ndarray:
+        """Begin a take-off, arm the autopilots there, and return its first observation."""
+        observation, _ = vec.reset(seed=self.seed, options={"randomization": self._drawn()})
+        self.team.board(vec.world)
+        self._say("waiting for the autopilots")
+        self.team.prepare(vec.world)
+        self._say(f"armed after {self.team.time:.0f} s; take-off")
+        vec.controller.start(0)
+        return observation
+
+    def _measure_task(self, make_policy: Maker, observation: np.ndarray, on_step: OnStep | None) -> FlightResult:
+        self._say(f"{self.config.task}, {self._task.max_steps * self._task.task.dt:g} s")
+        return _measure(self._task, make_policy(self._task), observation, self.team, on_step)
 
     def fly_ours(self, make_policy: Maker) -> FlightResult:
         """Fly the same task from the same state with the geometric controller in place of autopilots."""
@@ -173,12 +187,6 @@ class Flight:
         observation, _ = vec.reset(seed=self.seed, options={"state": self._begun, "randomization": self._drawn()})
         self.team.board(vec.world)
         return observation
-
-    def _fly_task(self, world: World, make_policy: Maker, on_step: OnStep | None) -> FlightResult:
-        observation = self._take_over(self._task, world)
-        self._say(f"{self.config.task}, {self._task.max_steps * self._task.task.dt:g} s")
-        self.start = self._begun
-        return _measure(self._task, make_policy(self._task), observation, self.team, on_step)
 
 
 _FOLLOWING = ("cable_tension", "cable_broken")  # from the places

@@ -15,6 +15,7 @@ from multilift_marl.control.actions import Call
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.formation import Goal
 from multilift_marl.errors import FlightError
+from multilift_marl.math3d import heading
 from multilift_marl.px4.launch import Autopilots, rig_parameters
 from multilift_marl.px4.link import SimulatorLink
 from multilift_marl.px4.offboard import OFFBOARD, OffboardLink
@@ -161,10 +162,11 @@ class AutopilotTeam:
             FlightError: one was not armed in time, with what it said.
         """
         here = world.state.drone_position[0].copy()
+        yaw = [heading(tuple(attitude.ravel())) for attitude in world.state.drone_rotation[0]]
         zero = np.zeros((len(here), 3))
 
         def stay(i: int) -> None:
-            self.send(i, np.stack([here[i], zero[i], zero[i]]), zero[i], 0.0)
+            self.send(i, np.stack([here[i], zero[i], zero[i]]), zero[i], yaw[i])
 
         steps = world.system.control_interval
         while not all(each.armed and each.mode == OFFBOARD for each in self.offboard):
@@ -197,12 +199,12 @@ class AutopilotTeam:
         position, velocity, acceleration = motion
         drag = self._drag[i] * velocity
         thrust = acceleration + (self._load_share[i] * acceleration + cable_force + drag) / self._mass[i]
-        vectors, heading = swap_enu_ned(np.stack([velocity, thrust])), float(swap_yaw(yaw))
+        vectors, north = swap_enu_ned(np.stack([velocity, thrust])), float(swap_yaw(yaw))
         if place:
             local = project_local(self.settings.site.to_geodetic(position), self.offboard[i].origin)
-            self.offboard[i].send_position(self._time_us, local, vectors[0], vectors[1], heading)
+            self.offboard[i].send_position(self._time_us, local, vectors[0], vectors[1], north)
         else:
-            self.offboard[i].send_acceleration(self._time_us, vectors[1], heading)
+            self.offboard[i].send_acceleration(self._time_us, vectors[1], north)
 
     def send_rates(self, i: int, rates: np.ndarray, thrust: float) -> None:
         """Send body rates [rad/s] and a total thrust [N] to drone i."""
