@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import JARGON, make, refusal, zeros
+from conftest import GRAVITY, JARGON, make, refusal, zeros
 
 import multilift_marl as ml
 from multilift_marl.config.files import pin_file
@@ -154,6 +154,18 @@ def test_what_cannot_be_flown_is_refused_in_one_sentence(tmp_path, change, words
     assert message.startswith(f"task_options.file={path}")
     assert all(word in message for word in words), message
     assert not any(word in message for word in JARGON), message
+
+
+@pytest.mark.parametrize("share", [0.8, 0.95])
+def test_a_path_may_fall_at_most_at_nine_tenths_of_gravity(tmp_path, share):
+    rows = loop(401)
+    wave = 2 * np.pi / 2.0  # [rad/s]
+    rows[:, 3] = 4.0 + share * GRAVITY / wave**2 * (1 - np.cos(wave * rows[:, 0]))
+    path, strong = save(tmp_path, rows, "path.npy"), {"vehicle.rotor_thrust_max": 20.0}
+    if share < 0.9:
+        make("track", **options(path), **strong)
+    else:
+        assert "the cables would go slack" in refusal(make, "track", **options(path), **strong)
 
 
 @pytest.mark.parametrize("text, words", [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import fields
 
@@ -17,7 +18,7 @@ from multilift_marl.math3d import axis_angle
 from multilift_marl.rig.mesh import read_mesh
 from multilift_marl.sim import World
 from multilift_marl.sim.scene import build_model
-from multilift_marl.tasks.failures import CAUSES
+from multilift_marl.tasks.failures import CAUSES, payload_height
 
 RIGS = [name for name in list_configs() if name.startswith("rigs/")]
 SIZES = {"falcon4": 4, "falcon3": 3, "crazyflie2": 2, "auto6": 6, "report4": 4}
@@ -131,6 +132,25 @@ def test_point_is_its_own_centre():
 def test_centre_of_mass_outside_the_payload():
     message = refuse_system(payload__center_of_mass=[0.0, 0.0, 0.2])
     assert re.match(r"payload\.center_of_mass \[0\.0, 0\.0, 0\.2\] lies outside the payload", message)
+
+
+@pytest.mark.parametrize("shape", [{}, DISC], ids=["box", "cylinder"])
+def test_the_lowest_point_is_that_of_the_surface(shape):
+    vec = make("hover", num_envs=1, **shape)
+    limits, system = vec.task.view.limits, vec.world.system
+    if shape:
+        angle = np.linspace(0, 2 * np.pi, 20001)
+        rim = 0.5 * np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1) * system.payload_size
+        points = np.concatenate([rim, rim * [1, 1, -1]])
+    else:
+        points = 0.5 * np.array(list(itertools.product((-1, 1), repeat=3))) * system.payload_size
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        axis = rng.normal(size=3)
+        attitude = np.reshape(axis_angle(tuple(axis / np.linalg.norm(axis)), rng.uniform(0, np.pi)), (3, 3))
+        place = rng.normal(size=3)
+        lowest = (place + (points + system.payload_center) @ attitude.T)[:, 2].min()
+        assert payload_height(tuple(place), tuple(attitude.ravel()), limits) == pytest.approx(lowest, abs=1e-6)
 
 
 def test_centre_of_mass_outside_a_cylinder_but_inside_its_box():
