@@ -35,6 +35,7 @@ from multilift_marl.errors import warn_once
 
 PACKAGE = Path(__file__).parent
 KEPT = 20  # folders of a module's former sources
+KEPT_COMPOSED = 100  # files of each composed kernel, which may be of former sources or of other tables
 _IMPORT = re.compile(
     r"^\s*(?:from (multilift_marl[\w.]*) import ([\w, ]+|\([^)]+\))|import (multilift_marl[\w.]*))", re.M
 )
@@ -135,6 +136,14 @@ def _forget_others(home: Path, name: str, current: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+def _forget_composed(newest: Path) -> None:
+    """Delete the files of a composed kernel but the newest: its folder does not change with what it is composed of."""
+    with contextlib.suppress(OSError):
+        files = newest.parent.glob(f"{newest.name.rpartition('-')[0]}-*.kernel")
+        for path in sorted(files, key=lambda file: file.stat().st_mtime)[:-KEPT_COMPOSED]:
+            path.unlink(missing_ok=True)
+
+
 class _Nowhere(_CacheLocator):
     """What Numba asks for the place of its own files, of which there are none."""
 
@@ -213,7 +222,10 @@ class KernelCache(NumbaCache):
         content = dumps((key, self._impl.reduce(data)))
         try:
             self._folder.mkdir(parents=True, exist_ok=True)  # others may have deleted it
-            write_whole(self._path(key), hashlib.sha256(content).digest() + content, flush=False)
+            path = self._path(key)
+            write_whole(path, hashlib.sha256(content).digest() + content, flush=False)
+            if hasattr(self._function, "_sources"):
+                _forget_composed(path)
         except OSError as error:
             reason = f"{error.strerror}; compiled anew next time"
             warn_once("kernels", f"compiled kernels cannot be kept in {self._folder}: {reason}")

@@ -196,6 +196,18 @@ print(record(Pair(1.0, 2.0)))
 """
 
 
+def test_only_the_newest_files_of_a_composed_kernel_stay(tmp_path):
+    for number in range(_kernel_cache.KEPT_COMPOSED + 5):
+        for name in ("reward-1", "observe-1"):
+            path = tmp_path / f"{name}-{number:032d}.kernel"
+            path.write_bytes(b"")
+            os.utime(path, (number, number))
+    _kernel_cache._forget_composed(path.with_name(f"reward-1-{number:032d}.kernel"))
+    left = sorted(file.name for file in tmp_path.glob("reward-1-*"))
+    assert left == [f"reward-1-{k:032d}.kernel" for k in range(5, _kernel_cache.KEPT_COMPOSED + 5)]
+    assert len(list(tmp_path.glob("observe-1-*"))) == _kernel_cache.KEPT_COMPOSED + 5
+
+
 def test_a_kernel_is_compiled_for_the_order_of_a_records_fields(package, tmp_path):
     """The type of a named tuple states the types of its fields, not their names."""
     with open(package / "tasks" / "starts.py", "a", encoding="utf-8") as file:
