@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 
 import numpy as np
 
 _LATE = 0.1  # [s] that a simulation may catch up with
+_REMEMBERED = 1_000_000  # steps of which the lateness is known
 QUANTILES = (50.0, 99.0, 99.9)  # [%]
 
 
@@ -24,7 +26,7 @@ class RealTime:
         self.speed = speed
         self.slips = 0
         self._begin: float | None = None
-        self._late: list[float] = []
+        self._late: deque[float] = deque(maxlen=_REMEMBERED)
 
     def wait(self, seconds: float) -> None:
         """Wait until `seconds` of the simulation may have passed."""

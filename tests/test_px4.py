@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -135,7 +138,13 @@ def test_rotors_are_where_ours_are_and_turn_as_ours_do(preset):
         wrench[:, k] = [1, *np.cross([x, y, 0], [0, 0, -1])[:2], ratio]
     np.testing.assert_allclose(wrench, vehicle.allocation * np.array([[1], [1], [-1], [-1]]), atol=1e-12)
     assert values["MPC_THR_HOVER"] == pytest.approx(vehicle.mass * 9.80665 / (4 * vehicle.rotor_thrust_max), rel=1e-3)
-    assert values["MC_ROLLRATE_P"] > 0 and values["MC_PITCHRATE_D"] > 0
+    # A set-point of 1 about an axis, by PX4's mixer: one factor for roll and pitch, the larger of the two.
+    mixer = np.linalg.pinv(wrench)[:, 1:3]
+    pairs = (np.abs(mixer) > 1e-9).sum(axis=0) / 2  # of rotors that turn it
+    mixer /= np.sqrt((mixer**2).sum(axis=0) / pairs).max()
+    for axis, name in enumerate(("ROLL", "PITCH")):
+        turn = (wrench @ mixer[:, axis])[1 + axis] * vehicle.rotor_thrust_max / vehicle.inertia[axis]
+        assert values[f"MC_{name}RATE_P"] * turn == pytest.approx(18.5)
 
 
 def test_px4s_local_frame_is_azimuthal_and_equidistant():
@@ -251,6 +260,7 @@ def test_rubbish_between_answers_is_skipped():
 @pytest.mark.parametrize(
     "changes, words",
     [
+        ({"silent_after": 0}, "did not answer within 0.5 s"),
         ({"silent_after": 30}, "did not answer within 0.5 s at 1."),
         ({"vanish_after": 30}, "has ended the connection (closed"),
         ({"stamp": -1000}, "did not answer within 0.5 s"),
@@ -264,7 +274,7 @@ def test_an_autopilot_that_fails_is_named(changes, words):
         field.team.board(world)
         with pytest.raises(FlightError) as error:
             idle(field.team, world, 200)
-        assert f"PX4 {FIRST}" in str(error.value) and words in str(error.value)
+        assert any(f"PX4 {FIRST + i} " in str(error.value) for i in range(2)) and words in str(error.value)
         if changes.get("stamp") == 1000:
             assert field.team.links[0].faults > 0
     assert are_free()
@@ -337,6 +347,10 @@ def test_a_simulation_that_is_far_too_late_goes_on_from_there():
         ),
         (["px4=/nowhere", "cable.model=chain"], "set cable.model=massless"),
         (["px4=/nowhere", "timeout=0"], "timeout"),
+        (["px4=/nowhere", "parameters={mpc: 1}"], "parameters"),
+        (["px4=/nowhere", "parameters={MPC_XY_P: much}"], "parameters"),
+        (["px4=/nowhere", "parameters={MPC_XY_P: 1.2}"], "px4=/nowhere holds no PX4"),
+        (["px4=/nowhere", "config=loss"], "PX4 cannot fly config=loss"),
         (["px4=/nowhere", "instance=12"], "instance"),
         (["px4=/nowhere", "policy=formations"], "unknown policy 'formations'"),
     ],
@@ -358,6 +372,57 @@ def test_a_build_is_found_in_the_repository_and_by_itself(tmp_path):
     assert find_px4(tmp_path) == find_px4(build) == build
     with pytest.raises(ConfigError, match="make px4_sitl_default"):
         find_px4(tmp_path / "build")
+
+
+STUB = """#!/bin/sh
+echo 'ERROR [px4] something is wrong'
+{last}
+"""
+
+
+def stub(folder, last: str):
+    build = folder / "build" / "px4_sitl_default"
+    for name in ("bin/px4", "etc/init.d-posix/rcS"):
+        (build / name).parent.mkdir(parents=True, exist_ok=True)
+        (build / name).write_text(STUB.format(last=last))
+    (build / "bin" / "px4").chmod(0o755)
+    return build
+
+
+def test_one_that_ends_at_once_is_named_at_once_with_its_last_words(tmp_path):
+    begin = time.monotonic()
+    with pytest.raises(FlightError, match=rf"PX4 {FIRST} has ended \(status 3\): ERROR \[px4\] something is wrong"):
+        AutopilotTeam(make_system(2), DT, Settings(build=stub(tmp_path, "exit 3"), first=FIRST, timeout=60.0))
+    assert time.monotonic() - begin < 30
+    assert are_free()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_command_that_is_ended_leaves_nothing_behind(number, tmp_path):
+    stub(tmp_path, f"echo $$ >> {tmp_path}/pids; exec sleep 1000")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "multilift_marl.px4", f"px4={tmp_path}", "env.num_drones=2", "payload.mass=0.7",
+         "timeout=300", f"out={tmp_path / 'out'}", "instance=8"],
+        env={**os.environ, "TMPDIR": str(tmp_path)}, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    pids = tmp_path / "pids"
+    end = time.monotonic() + 120
+    while not (pids.exists() and len(pids.read_text().split()) == 2) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert list(tmp_path.glob("px4-*"))
+    process.send_signal(number)
+    assert process.wait(30) == 130
+    assert process.stderr.read().strip().endswith("stopped")
+    for pid in pids.read_text().split():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid), 0)
+    assert not list(tmp_path.glob("px4-*"))
+
+
+def test_more_drones_than_px4_has_instances_are_refused(tmp_path, capsys):
+    stub(tmp_path, "exit 0")
+    assert command.main([f"px4={tmp_path}", "instance=7", "env.num_drones=4", f"out={tmp_path / 'out'}"]) == 2
+    assert "instance=7 and 4 drones need PX4 instances up to 10" in capsys.readouterr().err
 
 
 # PX4 itself

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -47,7 +49,9 @@ class Options(Section):
         0, description="of the first PX4, which makes the ports: 4560, 14540, 14580 + instance"
     )
     timeout: Annotated[Float, Between(0.1, 600, "s")] = Field(30.0, description="[s] for a PX4 to connect or to answer")
-    parameters: dict[str, Float] = Field({}, description="of PX4, in place of ours: parameters.MPC_XY_P=1.2")
+    parameters: dict[Annotated[str, Field(pattern="^[A-Z][A-Z0-9_]{1,15}$")], Float] = Field(
+        {}, description="of PX4, in place of ours: parameters={MPC_XY_P: 1.2}"
+    )
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the task, see docs/ros.md")
     ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of that bag")
     names: Literal["multilift", "report"] = Field("multilift", description="of its topics: ours or the report's")
@@ -74,6 +78,11 @@ def _fly(values: dict[str, Any]) -> int:
             "no PX4 is given; clone PX4-Autopilot, run `make px4_sitl_default` there, and give px4=<folder> or PX4_DIR"
         )
     build = find_px4(folder)
+    if (count := options.instance + config.env.num_drones) > 10:
+        raise ConfigError(
+            f"instance={options.instance} and {config.env.num_drones} drones need PX4 instances up to {count - 1}, but "
+            "PX4's start-up knows 0 to 9; lower one of them"
+        )
     if options.bag is not None:
         from multilift_marl.ros.bag import check_free
 
@@ -88,12 +97,14 @@ def _fly(values: dict[str, Any]) -> int:
         build=build, first=options.instance, timeout=options.timeout, speed=options.speed, seed=options.seed,
         log=options.log, parameters=options.parameters,
     )  # fmt: skip
-    with AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
+    with interrupted_by_signals(), AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
         flight = Flight(config, team, options.seed, lambda text: print(text, flush=True))
-        result = _record(flight, policy, options)
+        try:
+            result = _record(flight, policy, options)
+        finally:
+            if options.log:
+                _keep_logs(team.autopilots.folder if team.autopilots else None, out)
         factor = team.time / (time.perf_counter() - begin)
-        if options.log:
-            _keep_logs(team.autopilots.folder if team.autopilots else None, out)
     ours = flight.fly_ours(policy.bind)
     report = make_report(config, options.seed, result.metrics, {OURS: ours.metrics})
     report["px4"] = {
@@ -124,10 +135,33 @@ def _record(flight: Flight, policy: NamedPolicy, options: Options) -> FlightResu
         return flight.fly(policy.bind)
     from multilift_marl.ros.bag import BagWriter
 
-    with BagWriter(Path(options.bag), flight.vec, options.ros, options.names) as bag:
-        result = flight.fly(policy.bind, lambda vec: bag.write(vec.steps[0] * vec.task.dt))
+    bags: list[BagWriter] = []
+    with ExitStack() as stack:
+
+        def record(vec: MultiliftVec) -> None:
+            if not bags:  # no bag of a flight that does not reach its task
+                folder = Path(str(options.bag))
+                bags.append(stack.enter_context(BagWriter(folder, vec, options.ros, options.names)))
+            bags[0].write(vec.steps[0] * vec.task.dt)
+
+        result = flight.fly(policy.bind, record)
     print(f"wrote {options.bag}")
     return result
+
+
+@contextmanager
+def interrupted_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP do as Ctrl-C does, so that nothing is left running."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _find_config(options: Options, own: Config | None, overrides: dict[str, Any]) -> Config:

@@ -112,12 +112,15 @@ class Flight:
             observation = self._take_over(self._task, takeoff.world)
             self.start = self._begun
             result = self._measure_task(make_policy, observation, on_step)
+        world = self._task.world
         if self.config.task != "land" and result.metrics["failure_cause"][0] == 0:
             self._say("back, and landing")
             self._go(self._task.world, _goal(self._task), _goal(self._landing))
             self._run(self._landing, self._take_over(self._landing, self._task.world), "landing")
+            world = self._landing.world
         for autopilot in self.team.offboard:
             autopilot.arm(False, force=True)
+        self.team.settle(world)  # so that they do, and close their logs
         return result
 
     def _arm(self, vec: MultiliftVec) -> np.ndarray:
@@ -184,7 +187,11 @@ class Flight:
     def _take_over(self, vec: MultiliftVec, world: World) -> np.ndarray:
         """Begin an episode in the state of another world, and return its first observation."""
         self._begun = {name: array.copy() for name, array in world.state._asdict().items() if name not in _FOLLOWING}
-        observation, _ = vec.reset(seed=self.seed, options={"state": self._begun, "randomization": self._drawn()})
+        options = {"state": self._begun, "randomization": self._drawn()}
+        try:
+            observation, _ = vec.reset(seed=self.seed, options=options)
+        except ValueError as error:  # a failure from the start, or cables that would be torn
+            raise FlightError(f"{vec.config.task} cannot begin where the team is: {error}") from None
         self.team.board(vec.world)
         return observation
 
@@ -209,7 +216,7 @@ def _measure(
         if on_step is not None:
             on_step(vec)
         if team is not None:
-            estimates.append((team.error(vec.world) ** 2).mean())
+            estimates.append((team.error() ** 2).mean())
 
     metrics = measure_episodes(vec, policy, observation, record)
     estimate = float(np.sqrt(np.mean(estimates))) if estimates else float("nan")
@@ -227,6 +234,8 @@ def check_config(config: Config) -> Config:
             f"PX4 has set-points for control.action={' and '.join(ACTIONS)}, not for {config.control.action}; take a "
             "policy of one of these interfaces"
         )
+    if config.task == "loss":
+        raise ConfigError("PX4 cannot fly config=loss: a team that has lost a drone cannot be brought back")
     if config.cable.model != "massless":
         raise ConfigError("flights by PX4 go on from state to state, which chains cannot; set cable.model=massless")
     return build_config(config.model_dump(), {"env.num_envs": 1, "env.num_threads": 1})

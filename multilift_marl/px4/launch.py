@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,11 +17,9 @@ from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 
 BUILD = "build/px4_sitl_default"
-_RATE_CROSSOVER = (
-    18.5  # [rad/s] of the rate loop: PX4's gain of 0.15 times the iris' angular acceleration of 123 rad/s²
-)
+_GRACE = 5.0  # [s] for PX4s to end by themselves
+_RATE_CROSSOVER = 18.5  # [rad/s] of the rate loop: PX4's gain of 0.15 by its iris' 123 rad/s² at a set-point of 1
 _RATE_INTEGRAL, _RATE_DERIVATIVE = 24.6, 0.37  # of the iris alike
-_ALLOCATED = 0.5**0.5  # [-] of a motor's range that PX4's allocation gives a torque set-point of 1
 
 
 def find_px4(folder: str | Path) -> Path:
@@ -52,9 +51,11 @@ def rig_parameters(system: System, index: int) -> dict[str, float]:
         values[f"CA_ROTOR{k}_KM"] = -float(vehicle.rotor_spin[k]) * vehicle.torque_ratio
     # Without what it carries, which comes as acceleration, see `AutopilotController`.
     values["MPC_THR_HOVER"] = vehicle.mass * GRAVITY / (4 * vehicle.rotor_thrust_max)
+    # PX4's mixer is the inverse of thrusts to wrenches, with one factor for roll and pitch.
+    mixer = np.linalg.inv(vehicle.allocation)[:, 1:3]
+    factor = np.sqrt((mixer**2).sum(axis=0) / (0.5 * (np.abs(mixer) > 1e-3).sum(axis=0))).max()
     for axis, name in enumerate(("ROLL", "PITCH")):
-        arms = np.abs(np.array(vehicle.rotor_positions)[:, 1 - axis])
-        gain = float(_ALLOCATED * arms.sum() * vehicle.rotor_thrust_max / vehicle.inertia[axis])
+        gain = float(vehicle.rotor_thrust_max / factor / vehicle.inertia[axis])
         values[f"MC_{name}RATE_P"] = _RATE_CROSSOVER / gain
         values[f"MC_{name}RATE_I"] = _RATE_INTEGRAL / gain
         values[f"MC_{name}RATE_D"] = _RATE_DERIVATIVE / gain
@@ -66,7 +67,7 @@ USUAL: dict[str, float] = {
     "COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 1.0,  # no set-points for a second: land
     "COM_DISARM_PRFLT": -1, "COM_DISARM_LAND": -1,  # teams take their time on the ground
     "SDLOG_MODE": -1, "SYS_HAS_NUM_ASPD": 0, "CBRK_SUPPLY_CHK": 894281,
-    "EKF2_GPS_DELAY": 100, "EKF2_GPS_P_NOISE": 0.02, "EKF2_GPS_V_NOISE": 0.1, "EKF2_HGT_REF": 1,
+    "EKF2_GPS_DELAY": 100, "SENS_GPS0_DELAY": 100, "EKF2_GPS_P_NOISE": 0.02, "EKF2_GPS_V_NOISE": 0.1, "EKF2_HGT_REF": 1,
     "MPC_USE_HTE": 0, "MPC_ACC_DECOUPLE": 0, "MPC_THR_MIN": 0.03,
     "MPC_SPOOLUP_TIME": 0.5, "MPC_TKO_RAMP_T": 0.3, "MPC_XY_VEL_MAX": 8, "MPC_TILTMAX_AIR": 60, "MPC_YAW_MODE": 0,
     "MPC_XY_P": 1.5, "MPC_XY_VEL_P_ACC": 3.0, "MPC_XY_VEL_I_ACC": 1.0, "MPC_Z_P": 1.5, "MPC_Z_VEL_P_ACC": 5.0,
@@ -94,9 +95,11 @@ class Autopilots:
         try:
             for i, own in enumerate(parameters):
                 self._start(build, first + i, own, log)
-        except OSError as error:
+        except BaseException as error:
             self.close()
-            raise FlightError(f"cannot start {build / 'bin' / 'px4'} ({error.strerror})") from None
+            if isinstance(error, OSError):
+                raise FlightError(f"cannot start {build / 'bin' / 'px4'} ({error.strerror})") from None
+            raise
 
     def _start(self, build: Path, index: int, parameters: Mapping[str, float], log: bool) -> None:
         folder = self.folder / str(index)
@@ -113,8 +116,11 @@ class Autopilots:
             )  # fmt: skip
         self._processes[index] = process
 
-    def check(self) -> None:
-        """Raise a FlightError that names the first one that has ended."""
+    def check(self, seconds: float = 0.0) -> None:
+        """Raise a FlightError that names the first one that has ended, or does so within some seconds."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and all(process.poll() is None for process in self._processes.values()):
+            time.sleep(0.02)
         for i, process in self._processes.items():
             if process.poll() is not None:
                 raise FlightError(f"PX4 {i} has ended (status {process.returncode}): {self.last_words(i)}")
@@ -126,16 +132,19 @@ class Autopilots:
 
     def close(self) -> None:
         """End them all, and remove their files."""
-        for process in self._processes.values():
-            if process.poll() is None:
+        running = [process for process in self._processes.values() if process.poll() is None]
+        try:
+            for process in running:
                 os.killpg(process.pid, signal.SIGTERM)
-        for process in self._processes.values():
-            try:
-                process.wait(5)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-        self._temporary.cleanup()
+            end = time.monotonic() + _GRACE
+            while time.monotonic() < end and any(process.poll() is None for process in running):
+                time.sleep(0.02)
+        finally:  # also where Ctrl-C is pressed once more
+            for process in running:
+                if process.poll() is None:
+                    os.killpg(process.pid, signal.SIGKILL)
+                    process.wait()
+            self._temporary.cleanup()
 
     def __enter__(self) -> Autopilots:
         return self

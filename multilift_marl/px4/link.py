@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ class SimulatorLink:
         self.controls = np.zeros(4)
         self.armed = self.answered = False
         self.faults = 0
-        self._timeout = timeout
+        self._timeout, self._connected = timeout, 0.0
         self._mavlink = MAVLink(srcSystem=1, srcComponent=1)
         self._splitter = Splitter(_WANTED)
         self._connection: socket.socket | None = None
@@ -60,20 +61,27 @@ class SimulatorLink:
             ) from None
         self._server.listen(1)
 
-    def accept(self) -> None:
+    def accept(self, check: Callable[[], None]) -> None:
         """Wait for PX4 to connect.
+
+        Args:
+            check: called while waiting; raises where PX4 has ended.
 
         Raises:
             FlightError: it did not within the time-out.
         """
-        self._server.settimeout(self._timeout)
-        try:
-            self._connection, _ = self._server.accept()
-        except TimeoutError:
-            raise FlightError(
-                f"PX4 {self.index} did not connect to port {PORT + self.index} within {self._timeout:g} s; look into "
-                "its log"
-            ) from None
+        self._server.settimeout(0.2)
+        end = time.monotonic() + self._timeout
+        while self._connection is None:
+            check()
+            try:
+                self._connection, _ = self._server.accept()
+            except TimeoutError:
+                if time.monotonic() > end:
+                    raise FlightError(
+                        f"PX4 {self.index} did not connect to port {PORT + self.index} within {self._timeout:g} s"
+                    ) from None
+        self._connected = time.monotonic()
         self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, time_us: int, sensors: Sensors, site: Site) -> None:
@@ -126,7 +134,7 @@ class SimulatorLink:
                 if message.time_usec == time_us:
                     return
                 self.faults += message.time_usec > time_us
-        if self.answered:
+        if self.answered or time.monotonic() > self._connected + self._timeout:
             raise FlightError(f"PX4 {self.index} did not answer within {self._timeout:g} s at {time_us * 1e-6:.3f} s")
 
     def _read(self, timeout: float) -> list[Any]:
@@ -151,7 +159,7 @@ class SimulatorLink:
             raise self._ended(error.strerror or "no room") from None
 
     def _ended(self, why: str) -> FlightError:
-        return FlightError(f"PX4 {self.index} has ended the connection ({why}); look into its log")
+        return FlightError(f"PX4 {self.index} has ended the connection ({why})")
 
     def close(self) -> None:
         """Close connection and port."""

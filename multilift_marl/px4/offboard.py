@@ -35,6 +35,7 @@ class OffboardLink:
     Attributes:
         armed, mode: as the last heartbeat said; mode is PX4's main and sub mode.
         position, velocity: as PX4 estimates them, in its local frame, NED [m, m/s]; NaN before the first.
+        time_us: of that estimate, by PX4's clock [us].
         origin: latitude, longitude [deg] and altitude [m] of that frame; NaN before PX4 has said.
         said: its last words, and which commands it refused.
     """
@@ -44,6 +45,7 @@ class OffboardLink:
         self.armed = False
         self.mode = (0, 0)
         self.position, self.velocity, self.origin = (np.full(3, np.nan) for _ in range(3))
+        self.time_us = 0
         self.said: list[str] = []
         self._system = index + 1
         self._address = (HOST, PX4_PORT + index)
@@ -76,6 +78,7 @@ class OffboardLink:
             self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             self.mode = (message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF)
         elif kind == "LOCAL_POSITION_NED":
+            self.time_us = 1000 * message.time_boot_ms
             self.position[:] = message.x, message.y, message.z
             self.velocity[:] = message.vx, message.vy, message.vz
         elif kind == "GPS_GLOBAL_ORIGIN":

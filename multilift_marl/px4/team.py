@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,6 +29,7 @@ from multilift_marl.sim.world import World
 
 SETPOINT_RATE = 50.0  # [Hz]
 HEARTBEAT_RATE = 2.0  # [Hz]
+_PAST = 250  # ticks whose true places are kept, for estimates that arrive late
 READY_WITHIN = 60.0  # [s] of the simulation, until all are armed
 _SETTLE = 10.0  # [s] of the simulation, at rest, before arming: estimators converge
 
@@ -81,6 +83,7 @@ class AutopilotTeam:
         self._mass, self._load_share = system.drone_mass, system.hook_force[:, 2] / GRAVITY
         self._drag = np.array([vehicle.drag for vehicle in system.vehicles])  # [kg/s], of a level drone
         self._sensors: Sensors | None = None
+        self._places: deque[tuple[int, np.ndarray]] = deque(maxlen=_PAST)
         self._stack = ExitStack()
         with ExitStack() as opened:
             opened.callback(self.close)
@@ -95,7 +98,7 @@ class AutopilotTeam:
                     Autopilots(settings.build, own, settings.first, settings.log)
                 )
             for link in self.links:
-                link.accept()
+                link.accept(self._check)
             opened.pop_all()
 
     @property
@@ -125,6 +128,7 @@ class AutopilotTeam:
         """
         sensors = self._sensors
         assert sensors is not None
+        self._places.append((self._time_us + round(self._dt * 1e6), world.state.drone_position[0].copy()))
         if self._ticks:
             sensors.read()
         self._ticks += 1
@@ -137,8 +141,7 @@ class AutopilotTeam:
             for link in self.links:
                 link.receive(self._time_us)
         except FlightError:
-            if self.autopilots is not None:
-                self.autopilots.check()
+            self._check(1.0)
             raise
         for i, link in enumerate(self.links):
             world.thrust[0, i] = link.controls * self._thrust_max[i]
@@ -197,7 +200,9 @@ class AutopilotTeam:
             place: whether position and velocity count, too.
         """
         position, velocity, acceleration = motion
-        drag = self._drag[i] * velocity
+        c, s = np.cos(yaw), np.sin(yaw)
+        level = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        drag = level @ (self._drag[i] * (level.T @ velocity))
         thrust = acceleration + (self._load_share[i] * acceleration + cable_force + drag) / self._mass[i]
         vectors, north = swap_enu_ned(np.stack([velocity, thrust])), float(swap_yaw(yaw))
         if place:
@@ -211,11 +216,25 @@ class AutopilotTeam:
         share = float(np.clip(thrust / (4 * self._thrust_max[i]), 0.0, 1.0))
         self.offboard[i].send_rates(self._time_us, swap_flu_frd(rates), share)
 
-    def error(self, world: World) -> np.ndarray:
-        """Return how far the drones are from where their autopilots believe to be (N,) [m]."""
-        places = self.settings.site.to_geodetic(world.state.drone_position[0])
-        local = [project_local(place, each.origin) for place, each in zip(places, self.offboard, strict=True)]
-        return np.linalg.norm(np.array(local) - [each.position for each in self.offboard], axis=1)
+    def error(self) -> np.ndarray:
+        """Return how far the drones were from where their autopilots believed to be (N,) [m], at their last report."""
+        errors = []
+        for i, each in enumerate(self.offboard):
+            _, places = min(self._places, key=lambda past: abs(past[0] - each.time_us))
+            local = project_local(self.settings.site.to_geodetic(places[i]), each.origin)
+            errors.append(np.linalg.norm(local - each.position))
+        return np.array(errors)
+
+    def settle(self, world: World, seconds: float = 1.0) -> None:
+        """Let the autopilots run without set-points, as after landing."""
+        for _ in range(round(seconds / self._dt)):
+            self.tick(world, lambda i: None)
+            world.step(world.thrust, world.system.control_interval)
+
+    def _check(self, seconds: float = 0.0) -> None:
+        """Raise a FlightError that names an autopilot that has ended, or does so within some seconds."""
+        if self.autopilots is not None:
+            self.autopilots.check(seconds)
 
     def close(self) -> None:
         """End the autopilots and close all ports."""
