@@ -397,8 +397,9 @@ def test_one_that_ends_at_once_is_named_at_once_with_its_last_words(tmp_path):
     assert are_free()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_command_that_is_ended_leaves_nothing_behind(number, tmp_path):
+@pytest.mark.parametrize("twice", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
+def test_a_command_that_is_ended_leaves_nothing_behind(number, twice, tmp_path):
     stub(tmp_path, f"echo $$ >> {tmp_path}/pids; exec sleep 1000")
     process = subprocess.Popen(
         [sys.executable, "-m", "multilift_marl.px4", f"px4={tmp_path}", "env.num_drones=2", "payload.mass=0.7",
@@ -411,12 +412,17 @@ def test_a_command_that_is_ended_leaves_nothing_behind(number, tmp_path):
         time.sleep(0.05)
     assert list(tmp_path.glob("px4-*"))
     process.send_signal(number)
-    assert process.wait(30) == 130
-    assert process.stderr.read().strip().endswith("stopped")
-    for pid in pids.read_text().split():
-        with pytest.raises(ProcessLookupError):
-            os.kill(int(pid), 0)
-    assert not list(tmp_path.glob("px4-*"))
+    if twice:
+        process.send_signal(number)
+    status = process.wait(30)
+    running = [int(pid) for pid in pids.read_text().split()]
+    end = time.monotonic() + 10
+    while any(os.path.exists(f"/proc/{pid}") for pid in running) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in running)
+    if number != signal.SIGKILL and not twice:
+        assert status == 130 and process.stderr.read().strip().endswith("stopped")
+        assert not list(tmp_path.glob("px4-*"))
 
 
 def test_more_drones_than_px4_has_instances_are_refused(tmp_path, capsys):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -17,6 +19,8 @@ from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 
 BUILD = "build/px4_sitl_default"
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_PR_SET_PDEATHSIG = 1  # of Linux's prctl
 _GRACE = 5.0  # [s] for PX4s to end by themselves
 _RATE_CROSSOVER = 18.5  # [rad/s] of the rate loop: PX4's gain of 0.15 by its iris' 123 rad/s² at a set-point of 1
 _RATE_INTEGRAL, _RATE_DERIVATIVE = 24.6, 0.37  # of the iris alike
@@ -75,6 +79,12 @@ USUAL: dict[str, float] = {
 """Parameters of every flight."""
 
 
+def _end_with_parent() -> None:
+    """Let Linux end this process when the one that started it has ended, however that was."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
 class Autopilots:
     """Running PX4s; a context that ends them.
 
@@ -112,7 +122,7 @@ class Autopilots:
         with (folder / "px4.log").open("wb") as output:
             process = subprocess.Popen(
                 command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=output,
-                stderr=subprocess.STDOUT, start_new_session=True,
+                stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_end_with_parent,
             )  # fmt: skip
         self._processes[index] = process
 
@@ -132,6 +142,10 @@ class Autopilots:
 
     def close(self) -> None:
         """End them all, and remove their files."""
+        if not self._processes:
+            self._temporary.cleanup()
+            return
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPING)  # Ctrl-C once more waits until all have ended
         running = [process for process in self._processes.values() if process.poll() is None]
         try:
             for process in running:
@@ -139,12 +153,14 @@ class Autopilots:
             end = time.monotonic() + _GRACE
             while time.monotonic() < end and any(process.poll() is None for process in running):
                 time.sleep(0.02)
-        finally:  # also where Ctrl-C is pressed once more
             for process in running:
                 if process.poll() is None:
                     os.killpg(process.pid, signal.SIGKILL)
                     process.wait()
+            self._processes.clear()
             self._temporary.cleanup()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def __enter__(self) -> Autopilots:
         return self
