@@ -19,7 +19,8 @@ bench = load_script("bench/disturbance")
 
 def windy(kind: str, wind: float = 3.0, **overrides) -> bench.Flight:
     """Return one falcon with a payload of 1 g, in wind: all that pushes it is its own drag."""
-    light = {"env.num_drones": 1, "payload.shape": "point", "payload.mass": 1e-3, "payload.drag_area": 0.0}
+    light = {"env.num_drones": 1, "payload.shape": "point", "payload.mass": 1e-3, "payload.drag_area": 0.0,
+             "randomization.payload_force": 0.0}  # fmt: skip
     config = ml.load_config("hover", light | {"control.disturbance": kind} | overrides)
     flight = bench.Flight(config, np.ones(1))
     flight.world.hidden_loads.wind[:] = [wind, 0, 0]
