@@ -20,7 +20,7 @@ from multilift_marl.rig.vehicles import AIR_DENSITY, GRAVITY, Vehicle, check_rot
 MIN_THRUST_TO_WEIGHT = 1.18
 MAX_BENDING = 500.0  # [-] rate of bending in physics steps: substeps are as short as its inverse
 MAX_WIND = 60.0  # [m/s] mean wind and gusts together; bodies diverge at 100 m/s
-MAX_THRUST = 30.0  # [-] of a drone over its weight, twice that of racing drones
+MAX_THRUST = 50.0  # [-] of a drone over its weight
 MAX_LOAD = 100.0  # [-] hidden force over weight of the payload
 MAX_SPIN_UP = 50.0  # [rad/s] by which one physics step may change a body rate; rates diverge at 500 rad/s
 MAX_NUTATION = 200.0  # [rad/s] of a drone, also about twice its yaw rate when two rotors stop at once
