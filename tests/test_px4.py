@@ -32,7 +32,8 @@ from multilift_marl.px4.mavlink import MAVLink, Splitter, mavlink
 from multilift_marl.px4.team import AutopilotController, AutopilotTeam, Settings
 from multilift_marl.sim.sensors import Sensor, SensorSuite
 
-FIRST = 100 + 20 * int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))  # instances of this process
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+FIRST = 100 + 20 * WORKER  # instances of this process, each with ports of its own
 DT = 0.004
 FAST = Sensor(250.0)
 EXACT = SensorSuite(FAST, FAST, Sensor(50.0), Sensor(50.0), Sensor(50.0), Sensor(50.0))
@@ -403,7 +404,7 @@ def test_a_command_that_is_ended_leaves_nothing_behind(number, twice, tmp_path):
     stub(tmp_path, f"echo $$ >> {tmp_path}/pids; exec sleep 1000")
     process = subprocess.Popen(
         [sys.executable, "-m", "multilift_marl.px4", f"px4={tmp_path}", "env.num_drones=2", "payload.mass=0.7",
-         "timeout=300", f"out={tmp_path / 'out'}", "instance=8"],
+         "timeout=300", f"out={tmp_path / 'out'}", f"instance={2 + 2 * (WORKER % 4)}"],
         env={**os.environ, "TMPDIR": str(tmp_path)}, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     pids = tmp_path / "pids"
