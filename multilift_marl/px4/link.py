@@ -46,7 +46,7 @@ class SimulatorLink:
         self.controls = np.zeros(4)
         self.armed = self.answered = False
         self.faults = 0
-        self._timeout, self._connected = timeout, 0.0
+        self._timeout, self._asked = timeout, 0.0
         self._mavlink = MAVLink(srcSystem=1, srcComponent=1)
         self._splitter = Splitter(_WANTED)
         self._connection: socket.socket | None = None
@@ -81,7 +81,6 @@ class SimulatorLink:
                     raise FlightError(
                         f"PX4 {self.index} did not connect to port {PORT + self.index} within {self._timeout:g} s"
                     ) from None
-        self._connected = time.monotonic()
         self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, time_us: int, sensors: Sensors, site: Site) -> None:
@@ -92,6 +91,7 @@ class SimulatorLink:
             sensors: of the team.
             site: where the world is.
         """
+        self._asked = self._asked or time.monotonic()  # kernels may have been compiled since it connected
         fresh = sensors.readings.fresh[0]
         force, rates, field, pressure = (
             swap_flu_frd(sensors.specific_force[0, self.drone]),
@@ -134,7 +134,7 @@ class SimulatorLink:
                 if message.time_usec == time_us:
                     return
                 self.faults += message.time_usec > time_us
-        if self.answered or time.monotonic() > self._connected + self._timeout:
+        if self.answered or time.monotonic() > self._asked + self._timeout:
             raise FlightError(f"PX4 {self.index} did not answer within {self._timeout:g} s at {time_us * 1e-6:.3f} s")
 
     def _read(self, timeout: float) -> list[Any]:
