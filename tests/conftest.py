@@ -8,6 +8,7 @@ marked `slow`; tests so marked are left out unless asked for by `-m slow`.
 from __future__ import annotations
 
 import importlib.util
+import signal
 import sys
 from dataclasses import replace
 from math import sqrt
@@ -30,6 +31,11 @@ from multilift_marl.rig.system import System
 from multilift_marl.sim import World
 from multilift_marl.tasks import find_task
 from multilift_marl.validation.cables import hover_thrust  # noqa: F401 (for the tests)
+
+# A run in the background, or below nohup, begins with these ignored, as do its children; tests send them.
+for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _handler)
 
 TASKS = ml.list_tasks()
 NUM_DRONES = (1, 2, 6)

@@ -6,6 +6,7 @@ fall silent, vanish, send rubbish, and stamp its answers wrongly.
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import time
@@ -18,12 +19,23 @@ from multilift_marl.px4.offboard import OWN_PORT, PX4_PORT
 from multilift_marl.sim.earth import project_local
 
 HOST = "127.0.0.1"
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+FIRST = 100 + 20 * WORKER  # instances of this process, each with ports of its own
 G = 9.80665
 _SENSORS = frozenset({mavlink.MAVLINK_MSG_ID_HIL_SENSOR, mavlink.MAVLINK_MSG_ID_HIL_GPS})
 _COMMANDS = frozenset(
     {mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED, mavlink.MAVLINK_MSG_ID_COMMAND_LONG,
      mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET}
 )  # fmt: skip
+
+
+def are_free(first: int = FIRST, count: int = 2) -> bool:
+    """Return whether the ports can be listened to again."""
+    for i in range(count):
+        with socket.socket() as server:
+            server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            server.bind(("127.0.0.1", PORT + first + i))
+    return True
 
 
 def cross(vector: np.ndarray) -> np.ndarray:

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import os
-import signal
 import socket
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -16,24 +11,20 @@ from conftest import make_system
 
 import multilift_marl as ml
 from multilift_marl.control.scripted import make_scripted
-from multilift_marl.errors import ConfigError, FlightError
+from multilift_marl.errors import FlightError
 from multilift_marl.realtime import RealTime
 from multilift_marl.sim import World
 from multilift_marl.sim.earth import Site, project_local
 
 pytest.importorskip("pymavlink")  # of the px4 extra
-from fake_px4 import FakePX4
+from fake_px4 import FIRST, FakePX4, are_free
 
-from multilift_marl.px4 import __main__ as command
 from multilift_marl.px4.flight import Flight, check_config
-from multilift_marl.px4.launch import find_px4, rig_parameters
+from multilift_marl.px4.launch import rig_parameters
 from multilift_marl.px4.link import PORT
-from multilift_marl.px4.mavlink import MAVLink, Splitter, mavlink
 from multilift_marl.px4.team import AutopilotController, AutopilotTeam, Settings
 from multilift_marl.sim.sensors import Sensor, SensorSuite
 
-WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-FIRST = 100 + 20 * WORKER  # instances of this process, each with ports of its own
 DT = 0.004
 FAST = Sensor(250.0)
 EXACT = SensorSuite(FAST, FAST, Sensor(50.0), Sensor(50.0), Sensor(50.0), Sensor(50.0))
@@ -76,53 +67,6 @@ def idle(team: AutopilotTeam, world: World, ticks: int) -> None:
 
 def config_of(task: str = "hover", **overrides):
     return check_config(ml.load_config(task, {"env.num_drones": 2, "payload.mass": 0.7, **overrides}))
-
-
-def are_free(first: int = FIRST, count: int = 2) -> bool:
-    """Return whether the ports can be listened to again."""
-    for i in range(count):
-        with socket.socket() as server:
-            server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            server.bind(("127.0.0.1", PORT + first + i))
-    return True
-
-
-# Bytes
-
-
-def test_a_stream_is_cut_into_messages_wherever_it_is_split():
-    sender = MAVLink(1, 1)
-    sent = [sender.hil_actuator_controls_encode(k, [0.1 * k] * 16, 128, 1) for k in range(5)]
-    other = sender.heartbeat_encode(2, 12, 0, 0, 4)
-    stream = b"rubbish" + b"".join(message.pack(sender) + other.pack(sender) for message in sent) + b"\xfd\x03"
-    wanted = {mavlink.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS}
-    for size in (1, 2, 7, 50, 1000):
-        splitter = Splitter(wanted)
-        heard = [m for k in range(0, len(stream), size) for m in splitter.split(stream[k : k + size])]
-        assert [message.time_usec for message in heard] == list(range(5))
-        assert splitter.skipped == 7
-
-
-def test_what_is_damaged_is_skipped_and_no_more():
-    sender, rng = MAVLink(1, 1), np.random.default_rng(0)
-    messages = [sender.hil_actuator_controls_encode(k, [0.5] * 16, 128, 1).pack(sender) for k in range(50)]
-    damaged = set(rng.choice(50, 20, replace=False).tolist())
-    for k in damaged:
-        data = bytearray(messages[k])
-        data[rng.integers(12, len(data))] ^= 1 << int(rng.integers(8))
-        messages[k] = bytes(data)
-    splitter = Splitter({mavlink.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS})
-    heard = {message.time_usec for message in splitter.split(b"".join(messages) + bytes(400))}
-    assert heard == set(range(50)) - damaged
-
-
-def test_random_bytes_neither_hang_nor_raise():
-    rng = np.random.default_rng(0)
-    splitter = Splitter({mavlink.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS})
-    for _ in range(200):
-        data = rng.integers(0, 256, rng.integers(0, 600)).astype(np.uint8)
-        data[rng.random(len(data)) < 0.1] = 0xFD
-        assert splitter.split(data.tobytes()) == []
 
 
 # The rig as PX4 sees it
@@ -332,134 +276,3 @@ def test_a_simulation_that_is_far_too_late_goes_on_from_there():
     begin = time.perf_counter()
     clock.wait(0.054)
     assert time.perf_counter() - begin > 0.03
-
-
-# The command
-
-
-@pytest.mark.parametrize(
-    "arguments, words",
-    [
-        ([], "no PX4 is given; clone PX4-Autopilot, run `make px4_sitl_default` there"),
-        (["px4=/nowhere"], "px4=/nowhere holds no PX4 for simulation"),
-        (
-            ["px4=/nowhere", "control.action=rotor", "policy=formation"],
-            "PX4 has set-points for control.action=reference and acceleration and ctbr, not for rotor",
-        ),
-        (["px4=/nowhere", "cable.model=chain"], "set cable.model=massless"),
-        (["px4=/nowhere", "timeout=0"], "timeout"),
-        (["px4=/nowhere", "parameters={mpc: 1}"], "parameters"),
-        (["px4=/nowhere", "parameters={MPC_XY_P: much}"], "parameters"),
-        (["px4=/nowhere", "parameters={MPC_XY_P: 1.2}"], "px4=/nowhere holds no PX4"),
-        (["px4=/nowhere", "config=loss"], "PX4 cannot fly config=loss"),
-        (["px4=/nowhere", "instance=12"], "instance"),
-        (["px4=/nowhere", "policy=formations"], "unknown policy 'formations'"),
-    ],
-)
-def test_what_cannot_be_flown_is_said_in_one_sentence(arguments, words, capsys, monkeypatch, tmp_path):
-    monkeypatch.delenv("PX4_DIR", raising=False)
-    monkeypatch.chdir(tmp_path)
-    assert command.main(arguments) == 2
-    error = capsys.readouterr().err
-    assert words in error and error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_build_is_found_in_the_repository_and_by_itself(tmp_path):
-    build = tmp_path / "build" / "px4_sitl_default"
-    for name in ("bin/px4", "etc/init.d-posix/rcS"):
-        (build / name).parent.mkdir(parents=True, exist_ok=True)
-        (build / name).write_text("")
-    assert find_px4(tmp_path) == find_px4(build) == build
-    with pytest.raises(ConfigError, match="make px4_sitl_default"):
-        find_px4(tmp_path / "build")
-
-
-STUB = """#!/bin/sh
-echo 'ERROR [px4] something is wrong'
-{last}
-"""
-
-
-def stub(folder, last: str):
-    build = folder / "build" / "px4_sitl_default"
-    for name in ("bin/px4", "etc/init.d-posix/rcS"):
-        (build / name).parent.mkdir(parents=True, exist_ok=True)
-        (build / name).write_text(STUB.format(last=last))
-    (build / "bin" / "px4").chmod(0o755)
-    return build
-
-
-def test_one_that_ends_at_once_is_named_at_once_with_its_last_words(tmp_path):
-    begin = time.monotonic()
-    with pytest.raises(FlightError, match=rf"PX4 {FIRST} has ended \(status 3\): ERROR \[px4\] something is wrong"):
-        AutopilotTeam(make_system(2), DT, Settings(build=stub(tmp_path, "exit 3"), first=FIRST, timeout=60.0))
-    assert time.monotonic() - begin < 30
-    assert are_free()
-
-
-@pytest.mark.parametrize("twice", [False, True])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
-def test_a_command_that_is_ended_leaves_nothing_behind(number, twice, tmp_path):
-    stub(tmp_path, f"echo $$ >> {tmp_path}/pids; exec sleep 1000")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "multilift_marl.px4", f"px4={tmp_path}", "env.num_drones=2", "payload.mass=0.7",
-         "timeout=300", f"out={tmp_path / 'out'}", f"instance={2 + 2 * (WORKER % 4)}"],
-        env={**os.environ, "TMPDIR": str(tmp_path)}, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    pids = tmp_path / "pids"
-    end = time.monotonic() + 120
-    while not (pids.exists() and len(pids.read_text().split()) == 2) and time.monotonic() < end:
-        time.sleep(0.05)
-    assert list(tmp_path.glob("px4-*"))
-    process.send_signal(number)
-    if twice:
-        process.send_signal(number)
-    status = process.wait(30)
-    running = [int(pid) for pid in pids.read_text().split()]
-    end = time.monotonic() + 10
-    while any(os.path.exists(f"/proc/{pid}") for pid in running) and time.monotonic() < end:
-        time.sleep(0.05)
-    assert not any(os.path.exists(f"/proc/{pid}") for pid in running)
-    if number != signal.SIGKILL and not twice:
-        assert status == 130 and process.stderr.read().strip().endswith("stopped")
-        assert not list(tmp_path.glob("px4-*"))
-
-
-def test_more_drones_than_px4_has_instances_are_refused(tmp_path, capsys):
-    stub(tmp_path, "exit 0")
-    assert command.main([f"px4={tmp_path}", "instance=7", "env.num_drones=4", f"out={tmp_path / 'out'}"]) == 2
-    assert "instance=7 and 4 drones need PX4 instances up to 10" in capsys.readouterr().err
-
-
-# PX4 itself
-
-PX4 = pytest.mark.skipif("PX4_DIR" not in os.environ, reason="PX4_DIR does not point to a build of PX4")
-
-
-@PX4
-@pytest.mark.slow
-def test_px4_flies_two_drones(tmp_path, capsys):
-    assert command.main(["config=hover", "env.num_drones=2", "payload.mass=0.7", f"out={tmp_path}"]) == 0
-    assert "times real time" in capsys.readouterr().out
-    report = json.loads((tmp_path / "metrics.json").read_text())
-    assert report["px4"]["lockstep_faults"] == 0 and report["px4"]["drone_error_m"] < 0.1
-    assert (tmp_path / "errors.png").is_file()
-
-
-@PX4
-@pytest.mark.slow
-def test_one_that_is_killed_in_flight_is_named_and_the_others_end():
-    config = config_of()
-    settings = Settings(build=find_px4(os.environ["PX4_DIR"]), timeout=5.0)
-    with AutopilotTeam(config.system, DT, settings) as team:
-        processes = dict(team.autopilots._processes)
-
-        def kill(text: str) -> None:
-            if text == "to the task":
-                processes[1].kill()
-
-        with pytest.raises(FlightError, match="PX4 1 has ended"):
-            Flight(config, team, 1000, kill).fly(lambda vec: make_scripted("formation", vec))
-    assert all(process.poll() is not None for process in processes.values())
-    assert are_free(0)

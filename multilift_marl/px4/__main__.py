@@ -151,12 +151,13 @@ def _record(flight: Flight, policy: NamedPolicy, options: Options) -> FlightResu
 
 @contextmanager
 def interrupted_by_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP do as Ctrl-C does, so that nothing is left running."""
+    """Let SIGTERM and SIGHUP do as Ctrl-C does, so that nothing is left running; what is ignored (nohup) stays so."""
 
     def interrupt(number: int, frame: Any) -> None:
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, interrupt) for number in numbers}
     try:
         yield
     finally:
