@@ -16,10 +16,10 @@ from multilift_marl.errors import ConfigError
 pytest.importorskip("rosbags")  # of the ros extra
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
-from rosbags.typesys import get_typestore
 
 from multilift_marl.ros.bag import DISTRIBUTIONS, BagWriter
 from multilift_marl.ros.messages import FlightMessages
+from multilift_marl.ros.types import typestore
 
 
 def rotation(q) -> np.ndarray:
@@ -103,7 +103,7 @@ def test_a_bag_holds_the_flight(distribution, tmp_path):
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 def test_what_is_read_is_byte_for_byte_what_was_published(distribution, tmp_path):
     vec, states = fly(tmp_path / "bag", steps=1, distribution=distribution)
-    store = get_typestore(DISTRIBUTIONS[distribution][0])
+    store = typestore(DISTRIBUTIONS[distribution][0])
     messages = FlightMessages(vec, store)
     kinds = {topic.name: topic.kind for topic in messages.topics()}
     heard = read(tmp_path / "bag")

@@ -15,13 +15,14 @@ from multilift_marl.errors import ConfigError
 
 pytest.importorskip("rosbags")  # of the ros extra
 pytest.importorskip("cyclonedds")
-from rosbags.typesys import get_typestore
 
 from multilift_marl.ros import __main__ as command
 from multilift_marl.ros.bag import DISTRIBUTIONS
 from multilift_marl.ros.dds import Node
-from multilift_marl.ros.live import HOLD_AFTER, LAND_AFTER, LiveFlight, SetPoints
+from multilift_marl.ros.failsafe import HOLD_AFTER, LAND_AFTER
+from multilift_marl.ros.live import LiveFlight, SetPoints
 from multilift_marl.ros.messages import FlightMessages, Topic
+from multilift_marl.ros.types import typestore
 
 DOMAIN = 100 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 ODOMETRY = Topic("/payload/odom", "nav_msgs/msg/Odometry")
@@ -100,7 +101,7 @@ def test_dds_carries_the_bytes_of_the_bags(distribution):
     topics = messages.topics()
     takes = {topic.name: receiver.subscription(topic) for topic in topics}
     publish = {topic.name: sender.publisher(topic) for topic in topics}
-    kinds, store, heard = {topic.name: topic.kind for topic in topics}, get_typestore(types), {}
+    kinds, store, heard = {topic.name: topic.kind for topic in topics}, typestore(types), {}
     sent = dict(messages.messages(1_020_000_000))
 
     def exchange() -> bool:
@@ -144,7 +145,7 @@ def test_others_fly_the_team_by_set_points():
 def test_lost_set_points_are_held_and_then_the_team_sinks():
     vec = ml.make_vec("hover", num_envs=1, num_threads=1, num_drones=2, **{"payload.mass": 0.7})
     vec.reset(seed=3)
-    store = get_typestore(DISTRIBUTIONS["jazzy"][0])
+    store = typestore(DISTRIBUTIONS["jazzy"][0])
     start_places = vec.world.state.drone_position[0].copy()
     queue = [[], []]
 

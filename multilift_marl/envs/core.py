@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +29,9 @@ _SAVED = ("_stacked", "seeds", "episodes", "steps", "_ended")  # arrays of its o
 class MultiliftVec:
     """E environments of one task. The core does not reset by itself. Copies, also by pickle, go on bit for bit.
 
+    Class attributes:
+        world_type: of its world.
+
     Args:
         config: what to build.
         purpose: first part of every episode's seed: training, evaluation during training, or evaluation.
@@ -51,6 +54,8 @@ class MultiliftVec:
         ConfigError: an unknown task, an impossible system, or settings that do not go together.
     """
 
+    world_type: ClassVar[type[World]] = World
+
     def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
         if first_env < 0:
             raise ConfigError(f"first_env must not be negative, but is {first_env}")
@@ -61,7 +66,7 @@ class MultiliftVec:
         self.max_steps = round(config.env.episode_seconds * config.env.policy_hz)
         if self.max_steps < 1:
             raise ConfigError(f"env.episode_seconds={config.env.episode_seconds} is shorter than one step; raise it")
-        self.world = World(config.system, e, config.env.num_threads)
+        self.world = self.world_type(config.system, e, config.env.num_threads)
         self.controller = Controller(config, self.world)
         self.reference = self.controller.reference
         self.action_names = self.controller.action_names

@@ -80,10 +80,12 @@ class Pipeline:
 
     Attributes:
         stages: each of them once, in order.
+        before, tick, after: calls of those that run before the control ticks, at each of them, and after them.
     """
 
     def __init__(self, teams: Teams, shard: Shard, ticks: int):
         before, tick, after = build_stages(teams, shard, ticks)
+        self.before, self.tick, self.after = (tuple(stage.call for stage in part) for part in (before, tick, after))
         self.stages = [*before, *tick, *after]
         first, last = len(before), len(before) + len(tick)
         self._order = [*range(first), *[*range(first, last)] * ticks, *range(last, len(self.stages))]

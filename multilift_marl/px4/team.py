@@ -13,6 +13,7 @@ import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.control.actions import Call
+from multilift_marl.control.autopilot import LoadFeedforward
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.formation import Goal
 from multilift_marl.errors import FlightError
@@ -22,7 +23,6 @@ from multilift_marl.px4.link import SimulatorLink
 from multilift_marl.px4.offboard import OFFBOARD, OffboardLink
 from multilift_marl.realtime import RealTime
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.earth import Site, project_local, swap_enu_ned, swap_flu_frd, swap_yaw
 from multilift_marl.sim.sensors import Sensors, SensorSuite
 from multilift_marl.sim.world import World
@@ -80,8 +80,7 @@ class AutopilotTeam:
         self._dt, self.clock = dt, RealTime(settings.speed)
         self._time_us, self._ticks = 1_000_000, 0
         self._thrust_max = np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])
-        self._mass, self._load_share = system.drone_mass, system.hook_force[:, 2] / GRAVITY
-        self._drag = np.array([vehicle.drag for vehicle in system.vehicles])  # [kg/s], of a level drone
+        self._feedforward = LoadFeedforward(system)
         self._sensors: Sensors | None = None
         self._places: deque[tuple[int, np.ndarray]] = deque(maxlen=_PAST)
         self._stack = ExitStack()
@@ -187,10 +186,7 @@ class AutopilotTeam:
                 raise FlightError(f"PX4 {late.index} was not armed within {READY_WITHIN:g} s: {said}")
 
     def send(self, i: int, motion: np.ndarray, cable_force: np.ndarray, yaw: float, place: bool = True) -> None:
-        """Send a set-point to drone i.
-
-        PX4's thrust is its acceleration set-point and gravity, times the drone's mass alone: the force on the cable,
-        what accelerates its share of the payload and its own drag are added to the acceleration.
+        """Send a set-point to drone i, what it carries added to its acceleration.
 
         Args:
             i: the drone.
@@ -200,10 +196,7 @@ class AutopilotTeam:
             place: whether position and velocity count, too.
         """
         position, velocity, acceleration = motion
-        c, s = np.cos(yaw), np.sin(yaw)
-        level = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        drag = level @ (self._drag[i] * (level.T @ velocity))
-        thrust = acceleration + (self._load_share[i] * acceleration + cable_force + drag) / self._mass[i]
+        thrust = self._feedforward.acceleration(i, velocity, acceleration, cable_force, yaw)
         vectors, north = swap_enu_ned(np.stack([velocity, thrust])), float(swap_yaw(yaw))
         if place:
             local = project_local(self.settings.site.to_geodetic(position), self.offboard[i].origin)

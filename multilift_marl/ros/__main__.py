@@ -1,25 +1,33 @@
-"""`python -m multilift_marl.ros policy=hover`: a live simulation on ROS 2 topics."""
+"""`python -m multilift_marl.ros policy=hover`: a live simulation on ROS 2 topics, or a policy that flies one."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field
 
-from multilift_marl.agents.policy import find_policy
+from multilift_marl.agents.policy import NamedPolicy, find_policy
 from multilift_marl.cli.common import limit_torch_threads, run_command, split_options
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.values import Between, Float, Int, Section
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
-from multilift_marl.realtime import RealTime
+from multilift_marl.errors import ConfigError
+from multilift_marl.realtime import QUANTILES, RealTime
+
+if TYPE_CHECKING:
+    from multilift_marl.ros.dds import Node
 
 _USAGE = """Simulate a team live on ROS 2 topics, by DDS, without ROS 2: docs/ros.md lists the topics.
 
   python -m multilift_marl.ros config=hover policy=formation [key=value ...]
   python -m multilift_marl.ros config=hover policy=none      # others fly it, by /drone_<i>/setpoint
+  python -m multilift_marl.ros role=policy policy=hover.onnx # from odometry to set-points, of what flies elsewhere
 
 Only this machine hears it (interface lo, no multicast), unless allow_network=true. Any configuration key changes the
 environment: env.num_drones=6."""
@@ -29,10 +37,15 @@ class Options(Section):
     """Keys of the command beside those of the configuration."""
 
     config: str | None = Field(None, description="the task, name or path; None: the policy's own, or hover")
+    role: Literal["simulation", "policy"] = Field(
+        "simulation", description="what this is: a team in simulation, or the policy of a team elsewhere"
+    )
     policy: str = Field("formation", description="a script, a run, module:Class, .onnx, .pt; none: others' set-points")
     seed: Int = Field(1000, ge=0, description="evaluation seed: the episodes are those of evaluate.py")
     speed: Annotated[Float, Between(0, 100, "-")] = Field(1.0, description="real-time factor; 0: as fast as it goes")
-    seconds: Annotated[Float, Between(0, 1e9, "s")] = Field(0.0, description="[s] of the simulation; 0: until Ctrl-C")
+    seconds: Annotated[Float, Between(0, 1e9, "s")] = Field(
+        0.0, description="[s] of the simulation, of a policy by the clock; 0: until Ctrl-C"
+    )
     ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of the peers")
     names: Literal["multilift", "report"] = Field("multilift", description="of the topics: ours or the report's")
     domain: Annotated[Int, Between(0, 232)] = Field(0, description="ROS_DOMAIN_ID of the peers")
@@ -40,14 +53,13 @@ class Options(Section):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Simulate until interrupted; return the exit status."""
-    return run_command(_simulate, _USAGE, Options, arguments)
+    """Simulate or fly until interrupted; return the exit status."""
+    return run_command(_run, _USAGE, Options, arguments)
 
 
-def _simulate(values: dict[str, Any]) -> int:
+def _run(values: dict[str, Any]) -> int:
     from multilift_marl.ros.bag import DISTRIBUTIONS
     from multilift_marl.ros.dds import Node
-    from multilift_marl.ros.live import LiveFlight
 
     options, overrides = split_options(Options, values)
     policy = None if options.policy == "none" else find_policy(options.policy, others=["none"])
@@ -57,28 +69,55 @@ def _simulate(values: dict[str, Any]) -> int:
     else:
         config = load_config(options.config or "hover", overrides)
     limit_torch_threads()
-    vec = MultiliftVec(config, EVALUATION)
-    bound = None if policy is None else policy.bind(vec)
     node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
-    flight = LiveFlight(vec, node, options.names, bound)
     where = "all networks" if options.allow_network else "this machine alone"
-    print(f"publishing in domain {options.domain}, for {where} (Ctrl-C ends it)", flush=True)
+    ending = f"in domain {options.domain}, for {where} (Ctrl-C ends it)"
+    if options.role == "policy":
+        _fly(options, config, policy, node, ending)
+    else:
+        _simulate(options, config, policy, node, ending)
+    return 0
+
+
+def _simulate(options: Options, config: Config, policy: NamedPolicy | None, node: Node, ending: str) -> None:
+    """Simulate a team, flown by a policy, or by others where there is none."""
+    from multilift_marl.ros.live import LiveFlight
+
+    vec = MultiliftVec(config, EVALUATION)
+    flight = LiveFlight(vec, node, options.names, None if policy is None else policy.bind(vec))
     clock, begin = RealTime(options.speed), time.perf_counter()
     flight.begin(options.seed)
-    try:
+    print(f"publishing {ending}", flush=True)
+    with suppress(KeyboardInterrupt):
         while not options.seconds or flight.time_ns < options.seconds * 1e9:
             flight.step()
             clock.wait(flight.time_ns * 1e-9)
-    except KeyboardInterrupt:
-        pass
     simulated, real = flight.time_ns * 1e-9, time.perf_counter() - begin
     print(f"simulated {simulated:.1f} s in {real:.1f} s")
     if options.speed:
-        late = " / ".join(f"{1e3 * seconds:.2f}" for seconds in clock.lateness())
-        print(f"steps began late by {late} ms (50 / 99 / 99.9 %), {clock.slips} too late to catch up")
+        print(f"steps began late by {_describe(clock.lateness())}, {clock.slips} too late to catch up")
     if flight.setpoints is not None:
         print(f"steps without a fresh set-point, by drone: {flight.setpoints.late.tolist()}")
-    return 0
+
+
+def _fly(options: Options, config: Config, policy: NamedPolicy | None, node: Node, ending: str) -> None:
+    """Fly a team that others measure."""
+    from multilift_marl.ros.policy_node import PolicyNode
+
+    if policy is None:
+        raise ConfigError("role=policy needs a policy: give policy=<a run, an .onnx file or a script>")
+    flown = PolicyNode(config, policy.bind, node, options.names, options.seed, lambda text: print(text, flush=True))
+    print(f"flying {options.policy} {ending}", flush=True)
+    with suppress(KeyboardInterrupt):
+        flown.spin(options.seconds or float("inf"))
+    print(f"flew {flown.steps} steps")
+    if flown.latency:
+        print(f"set-points followed odometry by {_describe(np.percentile(flown.latency, QUANTILES))}")
+
+
+def _describe(late: np.ndarray) -> str:
+    """Return quantiles of a time [s] in words."""
+    return " / ".join(f"{1e3 * seconds:.2f}" for seconds in late) + " ms (50 / 99 / 99.9 %)"
 
 
 if __name__ == "__main__":

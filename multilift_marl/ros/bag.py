@@ -7,11 +7,12 @@ from types import TracebackType
 
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores
 
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, reason
 from multilift_marl.ros.messages import FlightMessages, Topic
+from multilift_marl.ros.types import typestore
 
 DISTRIBUTIONS = {
     "humble": (Stores.ROS2_HUMBLE, StoragePlugin.SQLITE3, 8),
@@ -37,7 +38,7 @@ class BagWriter:
 
     def __init__(self, folder: Path, vec: MultiliftVec, distribution: str = "jazzy", names: str = "multilift"):
         types, storage, version = DISTRIBUTIONS[distribution]
-        self._store = get_typestore(types)
+        self._store = typestore(types)
         self._messages = FlightMessages(vec, self._store, names)
         self.time_ns = 0
         check_free(folder)

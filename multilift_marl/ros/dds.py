@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from cyclonedds.core import DDSException
+from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct, types
 from cyclonedds.idl.annotations import final
@@ -22,10 +22,11 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores
 
 from multilift_marl.errors import FlightError
 from multilift_marl.ros.messages import Topic
+from multilift_marl.ros.types import typestore
 
 _LOOPBACK = """<CycloneDDS><Domain>
 <General><Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces>
@@ -55,12 +56,13 @@ class Node:
     """
 
     def __init__(self, distribution: Stores = Stores.ROS2_JAZZY, domain: int = 0, allow_network: bool = False):
-        self.store = get_typestore(distribution)
+        self.store = typestore(distribution)
         self._distribution = distribution
         try:
             if not allow_network and domain not in _domains:
                 _domains[domain] = Domain(domain, _LOOPBACK)
             self._participant = DomainParticipant(domain)
+            self._arrivals = WaitSet(self._participant)
         except DDSException as error:
             raise FlightError(
                 f"DDS does not start in domain {domain} ({error.msg}); take another one, or end what uses its ports"
@@ -84,6 +86,7 @@ class Node:
         kind = _carrier(self._distribution, topic.kind)
         quality = self._quality(topic)
         reader = DataReader(self._participant, DdsTopic(self._participant, f"rt{topic.name}", kind), quality)
+        self._arrivals.attach(ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead))
 
         def take() -> list[Any]:
             return [
@@ -93,6 +96,10 @@ class Node:
             ]
 
         return take
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until a subscription has something new, for some seconds at most; return whether one has."""
+        return self._arrivals.wait(duration(seconds=seconds)) > 0
 
     def _quality(self, topic: Topic) -> Qos:
         """Return the quality of service of a topic, with the hash of its type."""
@@ -134,7 +141,7 @@ def _carrier(distribution: Stores, kind: str) -> Any:
 def _idl_type(distribution: Stores, kind: str) -> Any:
     """Return the DDS type of a message."""
     package, _, name = kind.split("/")
-    fields = get_typestore(distribution).fielddefs[kind][1]
+    fields = typestore(distribution).fielddefs[kind][1]
     members = {field: _idl_field(distribution, description) for field, description in fields}
 
     def fill(namespace: dict[str, Any]) -> None:

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.control.policy import Policy
+from multilift_marl.control.scripted import make_scripted
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
+from multilift_marl.ros.autopilots import TopicAutopilots
 from multilift_marl.ros.dds import Node
-from multilift_marl.ros.messages import FlightMessages, Topic
-
-HOLD_AFTER = 0.25  # [s] without a set-point, after which the last place is held
-LAND_AFTER = 2.0  # [s] after which the drone sinks
-SINK = 0.4  # [m/s]
+from multilift_marl.ros.failsafe import HOLD_AFTER, is_landing, sink
+from multilift_marl.ros.messages import NAMES, FlightMessages, setpoint_topics
+from multilift_marl.ros.types import read_pose
 
 
 class SetPoints:
@@ -55,20 +55,16 @@ class SetPoints:
         for n, take in enumerate(self._take):
             self.age[n] += dt
             for message in take():
-                pose = message.pose
-                place = np.array([pose.position.x, pose.position.y, pose.position.z])
-                q = pose.orientation
-                yaw = np.arctan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
-                if np.isfinite(place).all() and np.isfinite(yaw):
-                    self._place[n], self._yaw[n], self.age[n] = place, yaw, 0.0
-            if self.age[n] > HOLD_AFTER:
-                self.late[n] += 1
-            if np.isfinite(self.age[n]) and self.age[n] > LAND_AFTER:
-                self._place[n, 2] = max(self._place[n, 2] - SINK * dt, 0.0)
+                place, rotation = read_pose(message.pose)
+                if np.isfinite(place).all() and np.isfinite(rotation).all():
+                    self._place[n], self.age[n] = place, 0.0
+                    self._yaw[n] = np.arctan2(rotation[1, 0], rotation[0, 0])
+        self.late += self.age > HOLD_AFTER
+        sink(self._place, is_landing(self.age), dt)
         return self._actions()
 
     def _actions(self) -> np.ndarray:
-        goal, control = self._vec.task.goal, self._vec.config.control
+        goal, control = self._vec.task.planned, self._vec.config.control
         offset = self._place - goal.slots[0]
         c, s = goal.slot_frame[0].T
         turned = np.remainder(self._yaw - goal.drone_yaw[0] + np.pi, 2 * np.pi) - np.pi
@@ -84,22 +80,24 @@ class LiveFlight:
         vec: one environment.
         node: publishes and subscribes.
         names: of the topics, a key of `messages.NAMES`.
-        policy: of these environments; None: set-points of others, on /drone_<i>/setpoint.
+        policy: of these environments; None: set-points of others, on /drone_<i>/setpoint or as PX4s hear them.
 
     Attributes:
         time_ns: of the simulation, over all episodes [ns].
-        setpoints: where there is no policy.
+        setpoints: of others, where there is no policy.
     """
 
     def __init__(self, vec: MultiliftVec, node: Node, names: str = "multilift", policy: Policy | None = None):
         self._vec = vec
         self._messages = FlightMessages(vec, node.store, names)
         self._publish = {topic.name: node.publisher(topic) for topic in self._messages.topics()}
-        self.setpoints: SetPoints | None = None
-        if policy is None:
-            topics = [
-                Topic(f"/{frame}/setpoint", "geometry_msgs/msg/PoseStamped", False) for frame in self._messages.frames
-            ]
+        self.setpoints: SetPoints | TopicAutopilots | None = None
+        if policy is None and NAMES[names].is_report:
+            self.setpoints = TopicAutopilots(vec.config, vec.world, node)
+            vec.use_controller(self.setpoints)
+            policy = make_scripted("formation", vec)  # whose actions do not count
+        elif policy is None:
+            topics = [setpoint_topics(NAMES[names], i)[0] for i in range(vec.num_drones)]
             self.setpoints = policy = SetPoints(vec, [node.subscription(topic) for topic in topics])
         self._policy: Policy = policy
         self.time_ns = 0
@@ -122,5 +120,7 @@ class LiveFlight:
         return True
 
     def _send(self) -> None:
+        if self.setpoints is not None:
+            self._messages.landing = is_landing(self.setpoints.age)
         for topic, message in self._messages.messages(self.time_ns):
             self._publish[topic](message)

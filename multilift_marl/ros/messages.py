@@ -13,9 +13,20 @@ from rosbags.typesys.store import Typestore
 
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.math3d import mat_to_quat
+from multilift_marl.ros.types import (
+    CONTROL_MODE,
+    LOCAL_POSITION,
+    TRAJECTORY,
+    VEHICLE_ODOMETRY,
+    Motion,
+    local_position,
+    px4_namespace,
+    vehicle_odometry,
+)
 from multilift_marl.sim.scene import DRONE_COLOURS, PAYLOAD_COLOUR
 
 WORLD = "world"
+ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 SYNC_EVERY = 0.05  # [s] of the report's clock
 _CUBE, _SPHERE, _LINES = 1, 2, 5  # kinds of markers
 _CABLES = 1000  # number of their marker
@@ -41,15 +52,50 @@ class Names(NamedTuple):
     drone: str
     first: int
     """Number of the first drone."""
-    odometry: bool
-    """Whether drones have odometry, else poses."""
+    is_report: bool
+    """Whether drones are as in the report's workspace: true poses beside the topics of a PX4."""
 
 
 NAMES = {
-    "multilift": Names("/payload/odom", "/drone_{}/odom", 0, True),
-    "report": Names("/payload_odom", "/simulation/position_drone_{}", 1, False),
+    "multilift": Names("/payload/odom", "/drone_{}/odom", 0, False),
+    "report": Names("/payload_odom", "/simulation/position_drone_{}", 1, True),
 }
 """Ours, and those of the report's workspace (see docs/ros.md)."""
+FLYING, LANDING = 5, 7  # states of a drone in the report's state machine, there called trajectory and land
+
+
+def setpoint_topics(names: Names, drone: int) -> list[Topic]:
+    """Return the topics by which others fly a drone."""
+    if not names.is_report:
+        return [Topic(f"/drone_{drone}/setpoint", POSE, False)]
+    topics = {"offboard_control_mode": CONTROL_MODE, "trajectory_setpoint": TRAJECTORY}
+    return [Topic(f"{px4_namespace(drone)}/in/{name}", kind) for name, kind in topics.items()]
+
+
+def level(yaw: float) -> np.ndarray:
+    """Return the rotation (3, 3) of a level body with a heading from east [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def make_header(store: Typestore, time_ns: int) -> Any:
+    """Return a header of a time, in the world."""
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    return store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=WORLD)
+
+
+def make_pose(store: Typestore, position: np.ndarray, rotation: np.ndarray) -> Any:
+    """Return a pose."""
+    w, x, y, z = mat_to_quat(tuple(rotation.ravel()))
+    return store.types["geometry_msgs/msg/Pose"](
+        position=store.types["geometry_msgs/msg/Point"](*(float(number) for number in position)),
+        orientation=store.types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
+    )
+
+
+def pose_stamped(store: Typestore, time_ns: int, position: np.ndarray, rotation: np.ndarray) -> Any:
+    """Return a pose at a time, in the world."""
+    return store.types[POSE](header=make_header(store, time_ns), pose=make_pose(store, position, rotation))
 
 
 class FlightMessages:
@@ -62,102 +108,100 @@ class FlightMessages:
 
     Attributes:
         frames: of the drones.
+        landing: drones (N,) whose set-points have been lost for long; of the report's names.
     """
 
     def __init__(self, vec: MultiliftVec, store: Typestore, names: str = "multilift"):
-        self._vec, self._types, self._names = vec, store.types, NAMES[names]
-        self._report = names == "report"
+        self._vec, self._store, self._types, self._names = vec, store, store.types, NAMES[names]
         drones = range(self._names.first, self._names.first + vec.num_drones)
         self._drones = [self._names.drone.format(i) for i in drones]
         self.frames = [f"drone_{i}" for i in drones]
+        self._px4 = [px4_namespace(i) for i in range(vec.num_drones)]
+        self.landing = np.zeros(vec.num_drones, bool)
         self._synced = -1
 
     def topics(self) -> list[Topic]:
         """Return what is published."""
-        kind = "nav_msgs/msg/Odometry" if self._names.odometry else "geometry_msgs/msg/PoseStamped"
+        report = self._names.is_report
         topics = [
             Topic("/clock", "rosgraph_msgs/msg/Clock"),
+            Topic("/target", POSE),
+            Topic(self._names.payload, ODOMETRY, reliable=not report),
+            *(Topic(name, POSE if report else ODOMETRY, reliable=not report) for name in self._drones),
             Topic("/tf", "tf2_msgs/msg/TFMessage"),
-            Topic(self._names.payload, "nav_msgs/msg/Odometry", reliable=not self._report),
-            *(Topic(name, kind, reliable=not self._report) for name in self._drones),
-            Topic("/target", "geometry_msgs/msg/PoseStamped"),
-            *(Topic(f"/{frame}/reference", "geometry_msgs/msg/PoseStamped") for frame in self.frames),
+            *(Topic(f"/{frame}/reference", POSE) for frame in self.frames),
             Topic("/cables", "sensor_msgs/msg/JointState"),
             Topic("/markers", "visualization_msgs/msg/MarkerArray"),
         ]
-        return topics + [Topic("/sync_time", "std_msgs/msg/Int64", False, True)] * self._report
+        if report:
+            for i, px4 in enumerate(self._px4):
+                topics.append(Topic(f"{px4}/out/vehicle_odometry", VEHICLE_ODOMETRY, False))
+                topics.append(Topic(f"{px4}/out/vehicle_local_position", LOCAL_POSITION, False))
+                topics.append(Topic(f"/state/state_drone_{i}", "std_msgs/msg/Int32"))
+            topics.append(Topic("/sync_time", "std_msgs/msg/Int64", False, True))
+        return topics
 
     def messages(self, time_ns: int) -> Iterator[Sent]:
         """Return the messages of the state as it is, at a time since the start [ns]."""
         state, goal, reference = self._vec.world.state, self._vec.task.goal, self._vec.reference
-        header = self._header(time_ns)
+        store, header = self._store, make_header(self._store, time_ns)
         yield "/clock", self._new("rosgraph_msgs/msg/Clock", clock=header.stamp)
-        bodies = [("payload", *(array[0] for array in state[:4]))]
-        for i, frame in enumerate(self.frames):
-            rows = (state.drone_position, state.drone_rotation, state.drone_velocity, state.drone_body_rates)
-            bodies.append((frame, *(array[0, i] for array in rows)))
-        transforms = [
-            self._new(
-                "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=frame,
-                transform=self._new(
-                    "geometry_msgs/msg/Transform", translation=self._vector(position),
-                    rotation=self._quaternion(rotation),
-                ),
-            )
-            for frame, position, rotation, _, _ in bodies
-        ]  # fmt: skip
-        yield "/tf", self._new("tf2_msgs/msg/TFMessage", transforms=transforms)
-        yield self._names.payload, self._odometry(header, *bodies[0])
-        for name, body in zip(self._drones, bodies[1:], strict=True):
-            if self._names.odometry:
-                yield name, self._odometry(header, *body)
+        yield "/target", pose_stamped(store, time_ns, goal.position[0], goal.rotation[0])
+        payload: Motion = tuple(array[0] for array in state[:4])
+        rows = (state.drone_position, state.drone_rotation, state.drone_velocity, state.drone_body_rates)
+        drones: list[Motion] = [tuple(array[0, i] for array in rows) for i in range(len(self.frames))]
+        yield self._names.payload, self._odometry(header, "payload", payload)
+        for name, frame, motion in zip(self._drones, self.frames, drones, strict=True):
+            if self._names.is_report:
+                yield name, pose_stamped(store, time_ns, *motion[:2])
             else:
-                yield name, self._pose_stamped(header, body[1], body[2])
-        yield "/target", self._pose_stamped(header, goal.position[0], goal.rotation[0])
+                yield name, self._odometry(header, frame, motion)
+        if self._names.is_report:
+            yield from self._report(time_ns, drones)
+        frames = {"payload": payload} | dict(zip(self.frames, drones, strict=True))
+        transforms = [self._transform(header, *pair) for pair in frames.items()]
+        yield "/tf", self._new("tf2_msgs/msg/TFMessage", transforms=transforms)
         for i, frame in enumerate(self.frames):
-            yaw = reference.yaw[0, i]
-            c, s = np.cos(yaw), np.sin(yaw)
-            level = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-            yield f"/{frame}/reference", self._pose_stamped(header, reference.position[0, i], level)
+            yaw = level(reference.yaw[0, i])
+            yield f"/{frame}/reference", pose_stamped(store, time_ns, reference.position[0, i], yaw)
         yield "/cables", self._cables(header)
         yield "/markers", self._markers(header)
-        if self._report and time_ns // int(SYNC_EVERY * 1e9) > self._synced:
+
+    def _report(self, time_ns: int, drones: list[Motion]) -> Iterator[Sent]:
+        """Return what PX4s, the state machine and the clock of the report's workspace say."""
+        for i, (px4, motion) in enumerate(zip(self._px4, drones, strict=True)):
+            yield f"{px4}/out/vehicle_odometry", vehicle_odometry(self._store, time_ns, motion)
+            yield f"{px4}/out/vehicle_local_position", local_position(self._store, time_ns, motion)
+            stage = LANDING if self.landing[i] else FLYING
+            yield f"/state/state_drone_{i}", self._new("std_msgs/msg/Int32", data=stage)
+        if time_ns // int(SYNC_EVERY * 1e9) > self._synced:
             self._synced = time_ns // int(SYNC_EVERY * 1e9)
             yield "/sync_time", self._new("std_msgs/msg/Int64", data=time_ns // 1000)
 
     def _new(self, kind: str, **fields: Any) -> Any:
         return self._types[kind](**fields)
 
-    def _header(self, time_ns: int) -> Any:
-        stamp = self._new("builtin_interfaces/msg/Time", sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-        return self._new("std_msgs/msg/Header", stamp=stamp, frame_id=WORLD)
-
     def _vector(self, vector: np.ndarray, kind: str = "Vector3") -> Any:
         return self._new(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", (float(v) for v in vector), strict=True)))
 
-    def _quaternion(self, rotation: np.ndarray) -> Any:
-        w, x, y, z = mat_to_quat(tuple(rotation.ravel()))
-        return self._new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    def _transform(self, header: Any, frame: str, motion: Motion) -> Any:
+        pose = make_pose(self._store, *motion[:2])
+        return self._new(
+            "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=frame,
+            transform=self._new(
+                "geometry_msgs/msg/Transform", translation=self._vector(motion[0]), rotation=pose.orientation
+            ),
+        )  # fmt: skip
 
-    def _pose(self, position: np.ndarray, rotation: np.ndarray) -> Any:
-        place = self._vector(position, "Point")
-        return self._new("geometry_msgs/msg/Pose", position=place, orientation=self._quaternion(rotation))
-
-    def _pose_stamped(self, header: Any, position: np.ndarray, rotation: np.ndarray) -> Any:
-        return self._new("geometry_msgs/msg/PoseStamped", header=header, pose=self._pose(position, rotation))
-
-    def _odometry(
-        self, header: Any, frame: str, position: np.ndarray, rotation: np.ndarray, velocity: np.ndarray,
-        rates: np.ndarray,
-    ) -> Any:  # fmt: skip
+    def _odometry(self, header: Any, frame: str, motion: Motion) -> Any:
+        position, rotation, velocity, rates = motion
         twist = self._new(
             "geometry_msgs/msg/Twist", linear=self._vector(rotation.T @ velocity), angular=self._vector(rates)
         )
+        pose = make_pose(self._store, position, rotation)
         return self._new(
-            "nav_msgs/msg/Odometry", header=header, child_frame_id=frame,
-            pose=self._new(
-                "geometry_msgs/msg/PoseWithCovariance", pose=self._pose(position, rotation), covariance=np.zeros(36)
-            ),
+            ODOMETRY, header=header, child_frame_id=frame,
+            pose=self._new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
             twist=self._new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         )  # fmt: skip
 
@@ -194,7 +238,7 @@ class FlightMessages:
         red, green, blue = (float(part) for part in colour[:3])
         return self._new(
             "visualization_msgs/msg/Marker", header=header, ns="team", id=number, type=kind, action=0,
-            pose=self._pose(position, rotation), scale=self._vector(size),
+            pose=make_pose(self._store, position, rotation), scale=self._vector(size),
             color=self._new("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
             lifetime=self._new("builtin_interfaces/msg/Duration", sec=0, nanosec=0), frame_locked=False, points=[],
             colors=[], texture_resource="",

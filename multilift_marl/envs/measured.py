@@ -1,0 +1,107 @@
+"""A team that flies elsewhere: an environment that observes what is measured of it, and simulates nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import build_config
+from multilift_marl.control.formation import Reference
+from multilift_marl.envs.core import EVALUATION, MultiliftVec
+from multilift_marl.sim.world import Shard, World
+from multilift_marl.tasks.failures import CAUSES
+
+Measured = dict[str, np.ndarray]
+"""Fields of `SystemState` by name, of one environment."""
+_PERFECT = {
+    f"randomization.{name}": value
+    for name, value in (
+        ("observation_noise", 0.0), ("observation_bias", 0.0), ("observation_delay", 0), ("action_delay", 0)
+    )
+}  # fmt: skip
+
+
+class _StillWorld(World):
+    """A world in which nothing moves but what is put elsewhere."""
+
+    def advance(self, shard: Shard, nstep: int) -> None:
+        """Do nothing."""
+
+
+class MeasuredTeam(MultiliftVec):
+    """One environment whose state is measured; `command`, `advance` and `observe` in turn are a policy step.
+
+    Observations, references and targets are those of the task in the simulation; noise and delays that it may simulate
+    are left to what is measured.
+
+    Args:
+        config: the task and its rig.
+
+    Raises:
+        ConfigError: see `MultiliftVec`.
+    """
+
+    world_type = _StillWorld
+
+    def __init__(self, config: Config):
+        super().__init__(
+            build_config(config.model_dump(), _PERFECT | {"env.num_envs": 1, "env.num_threads": 1}), EVALUATION
+        )
+        self._ticks_left = 0
+
+    def begin(self, measured: Measured, seed: int | None = None) -> np.ndarray:
+        """Begin an episode where the team is, and return its first observation; see `failure`.
+
+        Args:
+            measured: the state.
+            seed: of the episode, whose target the task draws; None for the next one.
+        """
+        self.reset(seed=seed)
+        self._put(measured)
+        self.task.begin(0)
+        self.controller.start(0)
+        self._observe(0)
+        self._stacked[0] = np.tile(self.task.observation[0], self.config.env.history)
+        return self._stacked.copy()
+
+    def command(self, action: np.ndarray) -> Reference:
+        """Take actions (1, N, A) in [-1, 1]; return the references, whose commands are those of the actions.
+
+        Raises:
+            ValueError: see `MultiliftVec.step`.
+        """
+        self._set_action(action, self.ended)
+        for call in self._pipelines[0].before:
+            call()
+        self._ticks_left = self.control_ticks
+        return self.reference
+
+    def advance(self) -> Reference:
+        """Move references and targets on by a control step; return the references."""
+        if self._ticks_left:
+            self._ticks_left -= 1
+            for call in self._pipelines[0].tick:
+                call()
+        return self.reference
+
+    def observe(self, measured: Measured) -> np.ndarray:
+        """Take what has been measured a policy step after the last command; return the observation (1, N, D)."""
+        while self._ticks_left:
+            self.advance()
+        self._put(measured)
+        for call in self._pipelines[0].after:
+            call()
+        self.steps += 1
+        return self._stacked.copy()
+
+    def _put(self, measured: Measured) -> None:
+        """Take what has been measured for the state."""
+        self._ticks_left = 0
+        for name, value in measured.items():
+            getattr(self.world.state, name)[0] = value
+
+    @property
+    def failure(self) -> str:
+        """What has failed, in words; empty if nothing has."""
+        cause = int(self.task.cause[0])
+        return CAUSES[cause] if cause else ""

@@ -1,0 +1,115 @@
+"""Drones that others fly as if they were PX4s, by trajectory and attitude set-points; our controller in PX4's place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from multilift_marl._jit import bind
+from multilift_marl.config.config import Config
+from multilift_marl.control.actions import Call
+from multilift_marl.control.controller import Controller
+from multilift_marl.control.formation import Goal
+from multilift_marl.control.geometric import fly
+from multilift_marl.ros.dds import Node
+from multilift_marl.ros.failsafe import HOLD_AFTER, is_landing, sink
+from multilift_marl.ros.messages import Topic
+from multilift_marl.ros.types import (
+    ATTITUDE,
+    TRAJECTORY,
+    PX4Setpoint,
+    px4_namespace,
+    read_attitude,
+    read_trajectory,
+)
+from multilift_marl.sim.world import World
+
+
+class TopicAutopilots(Controller):
+    """Set-points of PX4 in place of actions, for one environment; the newest of either kind counts.
+
+    As PX4 does, it knows the drone alone: an acceleration is that of its mass, and what its cable needs is the business
+    of who flies it. A drone without a fresh set-point holds the place where it is, and sinks later.
+
+    Args:
+        config: `control` has the gains.
+        world: of one environment.
+        node: to subscribe with.
+
+    Attributes:
+        age: of each drone's last set-point (N,) [s], infinite before the first.
+        late: policy steps in which a drone had none that was fresh (N,).
+    """
+
+    def __init__(self, config: Config, world: World, node: Node):
+        super().__init__(config, world)
+        system, drones = world.system, range(world.num_drones)
+        self._full = [4 * each.rotor_thrust_max / each.mass for each in system.vehicles]
+        self._trajectories = [self._subscribe(node, i, "trajectory_setpoint", TRAJECTORY) for i in drones]
+        self._attitudes = [self._subscribe(node, i, "vehicle_attitude_setpoint_v1", ATTITUDE) for i in drones]
+        alone = {name: np.zeros_like(getattr(self.gains, name)) for name in ("load_share", "drag")}
+        self._drone_gains = self.gains._replace(**alone)
+        self._setpoints: list[PX4Setpoint] = []
+        self._dt, self._step = 1.0 / config.sim.control_hz, 1.0 / config.env.policy_hz
+        self.age, self.late = np.full(len(drones), np.inf), np.zeros(len(drones), int)
+
+    @staticmethod
+    def _subscribe(node: Node, drone: int, name: str, kind: str) -> Callable[[], list[Any]]:
+        return node.subscription(Topic(f"{px4_namespace(drone)}/in/{name}", kind, False))
+
+    def bind(
+        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
+    ) -> tuple[Call, tuple[Call, ...]]:
+        """See `Controller.bind`; actions do not count."""
+        own = self.world.state, self.reference, np.zeros_like(goal.cable_force), self.world.thrust
+        fly_alone = bind(fly, lo, hi, *own, self._drone_gains, None)
+        return self._hear, (*(() if plan is None else (plan,)), self._follow, fly_alone)
+
+    def start(self, e: int) -> None:
+        """Hold the places where the drones are, until they hear otherwise."""
+        super().start(e)
+        self.age[:] = np.inf
+        self._setpoints = [self._stay(i) for i in range(len(self.age))]
+
+    def _stay(self, drone: int) -> PX4Setpoint:
+        place, yaw = self.world.state.drone_position[0, drone].copy(), float(self.reference.yaw[0, drone])
+        return PX4Setpoint(place, np.zeros(3), self._carried(drone), yaw)
+
+    def _carried(self, drone: int) -> np.ndarray:
+        """Return the acceleration [m/s²] that holds the nominal force on the cable."""
+        system = self.world.system
+        return np.array([0.0, 0.0, system.hook_force[drone, 2] / system.drone_mass[drone]])
+
+    def _hear(self) -> None:
+        """Take the newest set-points, once for each policy step; hold or land what hears none."""
+        for i, (take_trajectory, take_attitude) in enumerate(zip(self._trajectories, self._attitudes, strict=True)):
+            self.age[i] += self._step
+            found = [read_trajectory(message) for message in take_trajectory()]
+            found += [read_attitude(message, self._full[i]) for message in take_attitude()]
+            for setpoint in found:
+                if any(np.isfinite(vector).all() for vector in setpoint[:3]):
+                    self._setpoints[i], self.age[i] = setpoint, 0.0
+            if self.age[i] > HOLD_AFTER:
+                self.late[i] += 1
+                if not np.isfinite(self._setpoints[i].position).all() or self._setpoints[i].velocity.any():
+                    self._setpoints[i] = self._stay(i)
+            sink(self._setpoints[i].position[None], is_landing(self.age[i]), self._step)
+
+    def _follow(self) -> None:
+        """Write the references of a control tick, and let the places of moving set-points move on."""
+        state, own = self.world.state, self.reference
+        for i, (position, velocity, acceleration, yaw) in enumerate(self._setpoints):
+            placed, moving = np.isfinite(position).all(), np.isfinite(velocity).all()
+            own.acceleration[0, i] = acceleration if np.isfinite(acceleration).all() else self._carried(i)
+            if moving:
+                own.velocity[0, i] = velocity
+            else:
+                own.velocity[0, i] = 0.0 if placed else state.drone_velocity[0, i]
+            own.position[0, i] = position if placed else state.drone_position[0, i]
+            if placed and moving:
+                position += self._dt * velocity
+            if np.isfinite(yaw):
+                own.yaw[0, i] = yaw
+        own.jerk[:] = own.yaw_rate[:] = 0.0
