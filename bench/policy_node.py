@@ -2,8 +2,8 @@
 
     python bench/policy_node.py policy=hover seconds=20
 
-The simulation runs in this process at the speed of real time, the node in another, as it would beside hardware. The
-round trip is from before the first odometry message of a step to the arrival of the last drone's set-point.
+The simulation runs in this process at the speed of real time, the node in another, as it would beside hardware.
+Latency is from when the last odometry message of a step has been sent to the arrival of the last drone's set-point.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from multilift_marl.realtime import QUANTILES, RealTime
 from multilift_marl.ros.dds import Node
 from multilift_marl.ros.live import LiveFlight
 from multilift_marl.ros.messages import NAMES, setpoint_topics
-from multilift_marl.ros.types import stamp_ns
+from multilift_marl.ros.types import px4_namespace, stamp_ns
 
 DOMAIN = 91
 
@@ -49,26 +49,39 @@ def main() -> int:
         while not process.stdout.readline().startswith("flying"):
             assert process.poll() is None, "the node has ended"
         time.sleep(1.0)
-        clock, trips, lost = RealTime(1.0), [], 0
+        sent, clock, trips, lost = _stamp_last_odometry(flight, names, vec.num_drones), RealTime(1.0), [], 0
         flight.begin(1000)
         while flight.time_ns < seconds * 1e9:
             clock.wait(flight.time_ns * 1e-9)
-            begin = time.perf_counter()
+            deadline, missing = time.perf_counter() + 0.8 * vec.task.dt, set(range(vec.num_drones))
             flight.step()
-            missing, deadline = set(range(vec.num_drones)), begin + 0.8 * vec.task.dt
             while missing and answers.wait(max(deadline - time.perf_counter(), 0.0)):
                 for i in tuple(missing):
                     missing -= {i} if any(_time(m) == flight.time_ns for m in takes[i]()) else set()
             lost += bool(missing)
-            trips += [time.perf_counter() - begin] * (not missing)
+            trips += [time.perf_counter() - sent[0]] * (not missing)
     finally:
         process.send_signal(2)
         output = process.communicate(timeout=10)[0]
     trips_ms = " / ".join(f"{1e3 * trip:.2f}" for trip in np.percentile(trips, QUANTILES))
     print(f"{policy}, {vec.num_drones} drones, {config.env.policy_hz} Hz, {len(trips)} steps, {lost} without an answer")
-    print(f"step, odometry, policy, set-points: {trips_ms} ms (50 / 99 / 99.9 %)")
+    print(f"from the last odometry to the last set-point: {trips_ms} ms (50 / 99 / 99.9 %)")
     print("the node: " + output.strip().splitlines()[-1])
     return 0
+
+
+def _stamp_last_odometry(flight: LiveFlight, names: str, num_drones: int) -> list[float]:
+    """Return a list whose number is the time at which the last drone's odometry was sent last."""
+    last = num_drones - 1
+    topic = f"{px4_namespace(last)}/out/vehicle_odometry" if names == "report" else NAMES[names].drone.format(last)
+    publish, sent = flight._publish[topic], [0.0]
+
+    def stamped(message: object) -> None:
+        publish(message)
+        sent[0] = time.perf_counter()
+
+    flight._publish[topic] = stamped
+    return sent
 
 
 def _time(message: object) -> int:

@@ -16,7 +16,6 @@ from multilift_marl.sim.earth import (
     swap_enu_ned,
     swap_flu_frd,
     swap_yaw,
-    temperature_at,
 )
 from multilift_marl.sim.sensors import SIZES, Sensor, Sensors, SensorSuite, white
 
@@ -92,7 +91,6 @@ def test_metres_are_arcs_of_the_ellipsoid(latitude):
 
 def test_the_atmosphere_is_that_of_the_standard():
     np.testing.assert_allclose(pressure_at([0, 500, 1000, 5000]), [101325, 95460.8, 89874.6, 54019.9], rtol=2e-5)
-    np.testing.assert_allclose(temperature_at([0, 1000]), [288.15, 281.65])
     np.testing.assert_allclose(altitude_at(pressure_at([0, 123.4, 9000])), [0, 123.4, 9000], atol=1e-8)
 
 

@@ -61,11 +61,6 @@ def altitude_at(pressure: np.ndarray | float) -> np.ndarray:
     return SEA_TEMPERATURE / LAPSE * (1 - (np.asarray(pressure, float) / SEA_PRESSURE) ** (1 / PRESSURE_EXPONENT))
 
 
-def temperature_at(altitude: np.ndarray | float) -> np.ndarray:
-    """Return the temperature [K] at altitudes above the sea [m] of the troposphere (ISO 2533)."""
-    return SEA_TEMPERATURE - LAPSE * np.asarray(altitude, float)
-
-
 @dataclass(frozen=True)
 class Site:
     """The place of the world's origin.
