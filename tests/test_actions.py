@@ -125,15 +125,34 @@ def test_acceleration_turns_at_its_yaw_rate_and_acc_rates_to_the_targets_yaw():
 
 
 @pytest.mark.parametrize("axis, full", [(0, 4.0), (1, 4.0), (2, 1.5)])
-def test_ctbr_turns_at_the_body_rates_asked_for(axis, full):
-    vec = flying("ctbr", num_drones=1)
+def test_ctbr_turns_at_the_rates_asked_for_about_the_axes_of_the_slot(axis, full):
+    vec = flying("ctbr", num_drones=3)
     action = [0.0, 0.0, 0.0, 0.0]
     action[1 + axis] = 0.1
     for _ in range(25):
         step(vec, *action)
+    outwards = outward(vec)[0]
+    axes = [outwards, np.cross([0, 0, 1], outwards), np.broadcast_to([0.0, 0.0, 1.0], (3, 3))]
+    rates = np.einsum("nij,nj->ni", vec.world.state.drone_rotation[0], vec.world.state.drone_body_rates[0])
+    np.testing.assert_allclose(rates, 0.1 * full * axes[axis], atol=0.25 * 0.1 * full)  # they lean by now
+    seen = vec.current()[0][0][:, [vec.observation_names.index(f"turned_rates_{i}") for i in range(3)]]
     expected = np.zeros(3)
     expected[axis] = 0.1 * full
-    np.testing.assert_allclose(vec.world.state.drone_body_rates[0, 0], expected, atol=0.1 * 0.1 * full)
+    np.testing.assert_allclose(seen, np.broadcast_to(expected, (3, 3)), atol=0.1 * 0.1 * full)
+
+
+@pytest.mark.parametrize("action", ["acc_rates", "ctbr"])
+def test_the_same_numbers_move_a_team_alike_whatever_the_azimuths(action):
+    """What all drones do alike moves those alike that face each other: so a network can be shared."""
+    vec = flying(action, num_drones=4)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        one = 0.1 * rng.standard_normal(vec.action_size)
+        step(vec, *one)
+    seen, _ = vec.current()
+    own = [i for i, name in enumerate(vec.observation_names) if name.startswith(("turned", "velocity", "slot_error"))]
+    np.testing.assert_allclose(seen[0][:2, own], seen[0][2:, own], atol=2e-5)
+    assert np.abs(seen[0][0, own]).max() > 0.05
 
 
 @pytest.mark.parametrize("action", ["ctbr", "rotor"])

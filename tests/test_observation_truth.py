@@ -249,7 +249,7 @@ def test_every_number_of_an_observation_is_what_the_documents_say(task):
         observation, _, terminated, truncated, _ = vec.step(action)
         assert not (terminated | truncated).any()
         moments.append(Moment(vec, observation.astype(float), action, moments[-1]))
-    components = list_components(vec.action_size, vec.task.EXTRA)
+    components = list_components(vec.config.control.action, vec.task.EXTRA)
     compared = len(moments) - (AHEAD if task == "track" else 0)
     for k in np.linspace(0, compared - 1, COMPARED).astype(int).tolist():
         expected = common(moments[k]) | OWN[task](moments[k], moments[k + 1 :])

@@ -2,13 +2,15 @@
 
 An interface turns actions into set-points once for each policy step (`set_action`), and set-points into rotor thrusts
 at the control rate (`control_step`). Vectors are given in the drone's slot frame (x outward from the payload, y to the
-left of it, z up), body rates in the body frame. An action of zero hovers as well as the interface can, under the
-nominal payload.
+left of it, z up), body rates in the slot body frame: the body's, turned about its z axis so that x points outward. So a
+number means the same to all drones of a team, whose networks are one. An action of zero hovers as well as the interface
+can, under the nominal payload.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import cos, sin
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -50,12 +52,12 @@ def vector_components(unit: str, limit: str, meaning: str) -> tuple[ActionCompon
     )
 
 
-def rate_components(
-    *axes: str, limit: str = "max_tilt_rate", meaning: str = "angular velocity"
-) -> tuple[ActionComponent, ...]:
-    """Return a body rate for each of the axes, "roll", "pitch" or "yaw"."""
-    where = {"roll": "about body x", "pitch": "about body y", "yaw": "about body z"}
-    return tuple(ActionComponent(f"{axis}_rate", "body", "rad/s", limit, f"{meaning} {where[axis]}") for axis in axes)
+def tilt_rate_components(meaning: str) -> tuple[ActionComponent, ...]:
+    """Return the body rates that tilt a drone; `meaning` says of what."""
+    return tuple(
+        ActionComponent(f"{name}_rate", "slot body", "rad/s", "max_tilt_rate", f"{meaning} {where}")
+        for name, where in (("outward", "about the axis that points outward"), ("sideways", "about that to its left"))
+    )
 
 
 YAW_RATE = ActionComponent("yaw_rate", "world", "rad/s", "max_yaw_rate", "change of the heading, about the vertical")
@@ -80,10 +82,12 @@ class Interface:
 
     Class attributes:
         numbers: of an action, each with its frame, unit and full scale.
+        by_rates: whether actions are about body rates: drones observe their own in the slot body frame, too.
         supports: values of `control.disturbance` that go with it, beside "none".
     """
 
     numbers: ClassVar[tuple[ActionComponent, ...]]
+    by_rates: ClassVar[bool] = False
     supports: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: ControlConfig, dt: float):
@@ -174,7 +178,7 @@ class AccelerationAction(Interface):
 
 
 class AccRatesAction(Interface):
-    """Acceleration outward, sideways and upward, and roll and pitch rates; the yaw is the target's.
+    """Acceleration outward, sideways and upward, and the rates of its tilt; the yaw is the target's.
 
     The rates are those of the attitude that the acceleration asks for (Zeng et al., arXiv 2508.01522). An acceleration
     alone says nothing of how it will change: these rates feed forward what the jerk would.
@@ -182,8 +186,9 @@ class AccRatesAction(Interface):
 
     numbers = (
         *vector_components("m/s²", "max_acceleration", "own acceleration"),
-        *rate_components("roll", "pitch", meaning="angular velocity of the attitude that this asks for,"),
+        *tilt_rate_components("angular velocity of the attitude that this asks for,"),
     )
+    by_rates = True
     supports = ("indi",)
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
@@ -204,9 +209,10 @@ class CtbrAction(Interface):
 
     numbers = (
         ActionComponent("thrust", "body", "N", THRUST, "thrust of the four rotors together"),
-        *rate_components("roll", "pitch"),
-        *rate_components("yaw", limit="max_yaw_rate"),
+        *tilt_rate_components("angular velocity"),
+        ActionComponent("yaw_rate", "slot body", "rad/s", "max_yaw_rate", "angular velocity about body z"),
     )
+    by_rates = True
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
         """See `Interface.set_action`."""
@@ -247,6 +253,22 @@ def _in_world(e, n, action, goal, full):
 
 
 @kernel
+def from_slot_body(vector, yaw, slot_frame):
+    """Return a vector of the slot body frame in the body frame of a drone with heading `yaw` [rad]."""
+    c, s = cos(yaw), sin(yaw)
+    along, across = slot_frame[0], slot_frame[1]  # cosine and sine of the slot's heading
+    return turn(c * along + s * across, c * across - s * along, vector)
+
+
+@kernel
+def to_slot_body(vector, yaw, slot_frame):
+    """Return a vector of the body frame of a drone with heading `yaw` [rad] in the slot body frame."""
+    c, s = cos(yaw), sin(yaw)
+    along, across = slot_frame[0], slot_frame[1]
+    return turn(c * along + s * across, s * along - c * across, vector)
+
+
+@kernel
 def _command_offset(lo, hi, action, goal, reference, max_offset, max_yaw):
     for e in range(lo, hi):
         for n in range(action.shape[1]):
@@ -267,8 +289,8 @@ def _command_acc_rates(lo, hi, action, goal, reference, rates, max_acceleration,
     for e in range(lo, hi):
         for n in range(action.shape[1]):
             put(reference.acceleration[e, n], _in_world(e, n, action, goal, max_acceleration))
-            rates[e, n, 0] = max_tilt_rate * action[e, n, 3]
-            rates[e, n, 1] = max_tilt_rate * action[e, n, 4]
+            asked = (max_tilt_rate * action[e, n, 3], max_tilt_rate * action[e, n, 4], 0.0)
+            put(rates[e, n], from_slot_body(asked, reference.yaw[e, n], goal.slot_frame[e, n]))
             reference.command_yaw[e, n] = goal.drone_yaw[e]
 
 
@@ -292,9 +314,9 @@ def _command_rates(lo, hi, action, team, max_tilt_rate, max_yaw_rate):
         for n in range(action.shape[1]):
             hover = norm(_hover_force(vec(team.cable_force, e, n), g.mass[n]))
             setpoint.thrust[e, n] = _between(action[e, n, 0], 4.0 * g.thrust_min[n], hover, 4.0 * g.thrust_max[n])
-            setpoint.rates[e, n, 0] = max_tilt_rate * action[e, n, 1]
-            setpoint.rates[e, n, 1] = max_tilt_rate * action[e, n, 2]
-            setpoint.rates[e, n, 2] = max_yaw_rate * action[e, n, 3]
+            asked = (max_tilt_rate * action[e, n, 1], max_tilt_rate * action[e, n, 2], max_yaw_rate * action[e, n, 3])
+            yaw = heading(mat(team.state.drone_rotation, e, n))
+            put(setpoint.rates[e, n], from_slot_body(asked, yaw, team.goal.slot_frame[e, n]))
 
 
 @kernel

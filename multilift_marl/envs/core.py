@@ -71,7 +71,7 @@ class MultiliftVec:
         self.reference = self.controller.reference
         self.action_names = self.controller.action_names
         self.action_size = a = len(self.action_names)
-        self.observation_names = observation_names(a, kind.EXTRA, config.env.history)
+        self.observation_names = observation_names(config.control.action, kind.EXTRA, config.env.history)
         self.observation_size = len(self.observation_names)
         shape = e, n, a, self.observation_size // config.env.history
         self._sensing = Sensing(config.randomization, shape, config.system.payload_shape != "point")

@@ -246,7 +246,7 @@ class Task:
     def check_written(self, env: int) -> None:
         """Refuse, by a ConfigError, components of observation or global state that are not written in a first step."""
         size = self.action.shape[2]
-        check_written(self.observation[env], list_components(size, self.EXTRA), "observation")
+        check_written(self.observation[env], list_components(self.config.control.action, self.EXTRA), "observation")
         check_written(self.critic[env], list_state(self.world.num_drones, size, self.EXTRA_STATE), "global state")
 
     def state_dict(self) -> dict[str, np.ndarray]:
@@ -279,7 +279,7 @@ class Task:
             "reward": self._bind(
                 compose_reward(self.REWARD, kernels.is_good, kernels.update), v, self.weights, self.margins
             ),
-            "observe": self._bind(compose_observation(self.EXTRA, size), v, self.observation),
+            "observe": self._bind(compose_observation(self.EXTRA, self.config.control.action), v, self.observation),
         }
         true = v._replace(seen=v.state, seen_errors=v.errors)
         stages["observe state"] = self._bind(compose_state(self.EXTRA_STATE, kernels.preview, size), true, self.critic)

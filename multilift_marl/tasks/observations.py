@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from multilift_marl._jit import compose, inlined, kernel
+from multilift_marl.control.actions import ACTIONS, to_slot_body
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, column, heading, mat, matrow, mul, row, scale, sub, turn, vec
 
@@ -24,6 +25,7 @@ FRAMES = {
     "target": "the world, turned about z to the heading atan2(-R01, R11) of the payload's target attitude R",
     "slot": "x horizontal, outward from the target payload position through the drone's slot, y to the left, z up",
     "body": "of the drone itself: x forward, y left, z along the thrust",
+    "slot body": "the body's, turned about its z axis so that x points outward through the drone's slot",
 }
 
 
@@ -84,6 +86,13 @@ def relative_heading(e, n, v):
 def body_rates(e, n, v):
     """Own angular velocity."""
     return vec(v.seen.drone_body_rates, e, n)
+
+
+@inlined
+def turned_rates(e, n, v):
+    """Own angular velocity in the slot body frame."""
+    yaw = heading(mat(v.seen.drone_rotation, e, n))
+    return to_slot_body(vec(v.seen.drone_body_rates, e, n), yaw, v.goal.slot_frame[e, n])
 
 
 @inlined
@@ -229,6 +238,10 @@ OBSERVATION = (
     Component("slot_direction", 2, "target", "-", "cosine and sine of the own slot's azimuth", slot_direction),
 )  # fmt: skip
 
+_TURNED = {  # what interfaces that are about body rates observe in place of others
+    "body_rates": Component("turned_rates", 3, "slot body", "rad/s", "own angular velocity", turned_rates)
+}
+
 STATE = (  # global state of a critic: what belongs to no drone, hidden quantities among it
     Component("payload_error", 3, "target", "m", "payload position minus target", payload_error),
     Component("payload_velocity", 3, "target", "m/s", "payload velocity", payload_velocity),
@@ -262,6 +275,10 @@ DRONE_STATE = (  # then of each drone, and its last action
 )
 
 
+OBSERVATION_SIZE = sum(part.size for part in OBSERVATION)
+"""Numbers of an observation before the own last action."""
+
+
 class DroneNumbers(NamedTuple):
     """Where the numbers of the drones stand in the global state: `rows` rows of `size` from `first` on."""
 
@@ -290,9 +307,11 @@ def _count(parts: Sequence[Component]) -> int:
     return sum(part.size for part in parts)
 
 
-def list_components(action_size: int, extra: tuple[Component, ...] = ()) -> tuple[Component, ...]:
+def list_components(action: str, extra: tuple[Component, ...] = ()) -> tuple[Component, ...]:
     """Return what an observation holds of one step, in order; see `observation_names`."""
-    return (*OBSERVATION, _previous_action(action_size), *extra)
+    interface = ACTIONS[action]
+    common = (_TURNED.get(part.name, part) for part in OBSERVATION) if interface.by_rates else OBSERVATION
+    return (*common, _previous_action(len(interface.numbers)), *extra)
 
 
 def _previous_action(size: int) -> Component:
@@ -300,28 +319,28 @@ def _previous_action(size: int) -> Component:
     return Component("previous_action", size, "-", "-", "own last action", own_velocity, False)
 
 
-def observation_names(action_size: int, extra: tuple[Component, ...] = (), history: int = 1) -> tuple[str, ...]:
+def observation_names(action: str, extra: tuple[Component, ...] = (), history: int = 1) -> tuple[str, ...]:
     """Return the name of every number in an observation, such as "velocity_1", or "velocity_1@-2" of two steps ago.
 
     Args:
-        action_size: numbers of an action.
+        action: the action interface.
         extra: what a task adds.
         history: how many steps it holds, the newest first.
     """
-    names = [f"{part.name}_{i}" for part in list_components(action_size, extra) for i in range(part.size)]
+    names = [f"{part.name}_{i}" for part in list_components(action, extra) for i in range(part.size)]
     return tuple(name + (f"@-{step}" if step else "") for step in range(history) for name in names)
 
 
-def compose_observation(extra: tuple[Component, ...], action_size: int) -> Any:
+def compose_observation(extra: tuple[Component, ...], action: str) -> Any:
     """Return the kernel of (lo, hi, View, observation (E, N, D)) that writes what drones observe.
 
     Args:
         extra: what the task adds.
-        action_size: numbers of an action.
+        action: the action interface.
     """
     functions: dict[str, Any] = {"turn": turn}
-    own = _write("own", "", "n", OBSERVATION, functions)
-    size = _count(OBSERVATION)
+    size, action_size = OBSERVATION_SIZE, len(ACTIONS[action].numbers)
+    own = _write("own", "", "n", list_components(action)[:-1], functions)
     own += [f"own[{size + k}] = v.action[e, n, {k}]" for k in range(action_size)]
     own += _write("own", f"{size + action_size} + ", "n", extra, functions)
     lines = ["def observe(lo, hi, v, observation):", "    for e in range(lo, hi):"]

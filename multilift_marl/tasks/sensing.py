@@ -17,7 +17,7 @@ from multilift_marl.config.schema import RandomizationConfig
 from multilift_marl.math3d import add, axis_angle, mat, matmul, matrow, norm, put, putmat, row, scale, vec
 from multilift_marl.sim.gusts import normal_pair
 from multilift_marl.sim.state import SystemState
-from multilift_marl.tasks.observations import observation_names
+from multilift_marl.tasks.observations import OBSERVATION_SIZE
 from multilift_marl.tasks.view import Errors, View, reduce_view, update_errors
 
 Call = Callable[[int, int], None]  # of environments lo to hi
@@ -106,7 +106,7 @@ class Sensing:
 
     def bind_delay(self, observation: np.ndarray) -> Call:
         """Return the call of (lo, hi) that holds observations (E, N, D) back, but for the drones' own last action."""
-        first = len(observation_names(0))
+        first = OBSERVATION_SIZE
         return prebind(delay_observations, observation, self.memory, first, first + self.action_size)
 
     def bind_send(self, action: np.ndarray) -> Call:
