@@ -46,7 +46,7 @@ def main() -> int:
     )
     try:
         assert process.stdout is not None
-        while not process.stdout.readline().startswith("flying"):
+        while not process.stdout.readline().startswith("listening"):
             assert process.poll() is None, "the node has ended"
         time.sleep(1.0)
         sent, clock, trips, lost = _stamp_last_odometry(flight, names, vec.num_drones), RealTime(1.0), [], 0

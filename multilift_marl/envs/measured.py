@@ -49,14 +49,19 @@ class MeasuredTeam(MultiliftVec):
         )
         self._ticks_left = 0
 
-    def begin(self, measured: Measured, seed: int | None = None) -> np.ndarray:
+    def begin(
+        self, measured: Measured, seed: int | None = None, target: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> np.ndarray:
         """Begin an episode where the team is, and return its first observation; see `failure`.
 
         Args:
             measured: the state.
             seed: of the episode, whose target the task draws; None for the next one.
+            target: position (3,) [m] and rotation (3, 3) of the payload in place of those drawn.
         """
         self.reset(seed=seed)
+        if target is not None:
+            self.task.place_goal(0, *target)
         self._put(measured)
         self.task.begin(0)
         self.controller.start(0)

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -41,6 +42,9 @@ class Options(Section):
         "simulation", description="what this is: a team in simulation, or the policy of a team elsewhere"
     )
     policy: str = Field("formation", description="a script, a run, module:Class, .onnx, .pt; none: others' set-points")
+    start: Literal["at_once", "topic"] = Field(
+        "at_once", description="when a policy begins: as soon as all is heard, or when true comes on /fly"
+    )
     seed: Int = Field(1000, ge=0, description="evaluation seed: the episodes are those of evaluate.py")
     speed: Annotated[Float, Between(0, 100, "-")] = Field(1.0, description="real-time factor; 0: as fast as it goes")
     seconds: Annotated[Float, Between(0, 1e9, "s")] = Field(
@@ -106,10 +110,16 @@ def _fly(options: Options, config: Config, policy: NamedPolicy | None, node: Nod
 
     if policy is None:
         raise ConfigError("role=policy needs a policy: give policy=<a run, an .onnx file or a script>")
-    flown = PolicyNode(config, policy.bind, node, options.names, options.seed, lambda text: print(text, flush=True))
-    print(f"flying {options.policy} {ending}", flush=True)
-    with suppress(KeyboardInterrupt):
+    at_once, say = options.start == "at_once", partial(print, flush=True)
+    flown = PolicyNode(config, policy.bind, node, options.names, options.seed, at_once, say)
+    print(f"listening {ending}", flush=True)
+    try:
         flown.spin(options.seconds or float("inf"))
+    except KeyboardInterrupt:
+        flown.land("Ctrl-C; once more ends this at once")
+        with suppress(KeyboardInterrupt):
+            while not flown.landed:
+                flown.spin_once(1.0)
     print(f"flew {flown.steps} steps")
     if flown.latency:
         print(f"set-points followed odometry by {_describe(np.percentile(flown.latency, QUANTILES))}")

@@ -30,8 +30,10 @@ from multilift_marl.sim.world import World
 class TopicAutopilots(Controller):
     """Set-points of PX4 in place of actions, for one environment; the newest of either kind counts.
 
-    As PX4 does, it knows the drone alone: an acceleration is that of its mass, and what its cable needs is the business
-    of who flies it. A drone without a fresh set-point holds the place where it is, and sinks later.
+    As PX4 does, it knows the drone alone: an acceleration that is asked for is that of its mass, and what its cable
+    needs is the business of who flies it. Where none is asked for, the nominal force on the cable is held, which PX4's
+    integral would find. Each axis has its own: NaN is not controlled. A drone without a fresh set-point holds the last
+    place, or the one where it is if it was asked for none, and sinks later.
 
     Args:
         config: `control` has the gains.
@@ -77,6 +79,12 @@ class TopicAutopilots(Controller):
         place, yaw = self.world.state.drone_position[0, drone].copy(), float(self.reference.yaw[0, drone])
         return PX4Setpoint(place, np.zeros(3), self._carried(drone), yaw)
 
+    def _hold(self, drone: int) -> PX4Setpoint:
+        """Return the last place to hold, where the drone is on axes that none was asked for."""
+        place, _, _, yaw = self._setpoints[drone]
+        here = self._stay(drone)
+        return here._replace(position=np.where(np.isfinite(place), place, here.position), yaw=yaw)
+
     def _carried(self, drone: int) -> np.ndarray:
         """Return the acceleration [m/s²] that holds the nominal force on the cable."""
         system = self.world.system
@@ -86,30 +94,26 @@ class TopicAutopilots(Controller):
         """Take the newest set-points, once for each policy step; hold or land what hears none."""
         for i, (take_trajectory, take_attitude) in enumerate(zip(self._trajectories, self._attitudes, strict=True)):
             self.age[i] += self._step
-            found = [read_trajectory(message) for message in take_trajectory()]
-            found += [read_attitude(message, self._full[i]) for message in take_attitude()]
-            for setpoint in found:
-                if any(np.isfinite(vector).all() for vector in setpoint[:3]):
+            found = [(message.timestamp, read_trajectory(message)) for message in take_trajectory()]
+            found += [(message.timestamp, read_attitude(message, self._full[i])) for message in take_attitude()]
+            for _, setpoint in sorted(found, key=lambda pair: pair[0]):
+                if np.isfinite(setpoint[:3]).any():
                     self._setpoints[i], self.age[i] = setpoint, 0.0
             if self.age[i] > HOLD_AFTER:
                 self.late[i] += 1
-                if not np.isfinite(self._setpoints[i].position).all() or self._setpoints[i].velocity.any():
-                    self._setpoints[i] = self._stay(i)
+                self._setpoints[i] = self._hold(i)
             sink(self._setpoints[i].position[None], is_landing(self.age[i]), self._step)
 
     def _follow(self) -> None:
         """Write the references of a control tick, and let the places of moving set-points move on."""
         state, own = self.world.state, self.reference
         for i, (position, velocity, acceleration, yaw) in enumerate(self._setpoints):
-            placed, moving = np.isfinite(position).all(), np.isfinite(velocity).all()
-            own.acceleration[0, i] = acceleration if np.isfinite(acceleration).all() else self._carried(i)
-            if moving:
-                own.velocity[0, i] = velocity
-            else:
-                own.velocity[0, i] = 0.0 if placed else state.drone_velocity[0, i]
-            own.position[0, i] = position if placed else state.drone_position[0, i]
-            if placed and moving:
-                position += self._dt * velocity
+            placed, moving = np.isfinite(position), np.isfinite(velocity)
+            own.acceleration[0, i] = np.where(np.isfinite(acceleration), acceleration, self._carried(i))
+            still = np.where(placed, 0.0, state.drone_velocity[0, i])
+            own.velocity[0, i] = np.where(moving, velocity, still)
+            own.position[0, i] = np.where(placed, position, state.drone_position[0, i])
+            position += self._dt * np.where(moving, velocity, 0.0)  # NaN stays NaN
             if np.isfinite(yaw):
                 own.yaw[0, i] = yaw
         own.jerk[:] = own.yaw_rate[:] = 0.0

@@ -97,7 +97,7 @@ class LiveFlight:
             vec.use_controller(self.setpoints)
             policy = make_scripted("formation", vec)  # whose actions do not count
         elif policy is None:
-            topics = [setpoint_topics(NAMES[names], i)[0] for i in range(vec.num_drones)]
+            topics = [setpoint_topics(NAMES[names], i)[0]._replace(reliable=False) for i in range(vec.num_drones)]
             self.setpoints = policy = SetPoints(vec, [node.subscription(topic) for topic in topics])
         self._policy: Policy = policy
         self.time_ns = 0

@@ -26,7 +26,7 @@ from multilift_marl.ros.types import (
 from multilift_marl.sim.scene import DRONE_COLOURS, PAYLOAD_COLOUR
 
 WORLD = "world"
-ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+ODOMETRY, POSE, BOOL = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "std_msgs/msg/Bool"
 SYNC_EVERY = 0.05  # [s] of the report's clock
 _CUBE, _SPHERE, _LINES = 1, 2, 5  # kinds of markers
 _CABLES = 1000  # number of their marker
@@ -67,7 +67,7 @@ FLYING, LANDING = 5, 7  # states of a drone in the report's state machine, there
 def setpoint_topics(names: Names, drone: int) -> list[Topic]:
     """Return the topics by which others fly a drone."""
     if not names.is_report:
-        return [Topic(f"/drone_{drone}/setpoint", POSE, False)]
+        return [Topic(f"/drone_{drone}/setpoint", POSE)]
     topics = {"offboard_control_mode": CONTROL_MODE, "trajectory_setpoint": TRAJECTORY}
     return [Topic(f"{px4_namespace(drone)}/in/{name}", kind) for name, kind in topics.items()]
 
@@ -126,23 +126,23 @@ class FlightMessages:
         topics = [
             Topic("/clock", "rosgraph_msgs/msg/Clock"),
             Topic("/target", POSE),
-            Topic(self._names.payload, ODOMETRY, reliable=not report),
-            *(Topic(name, POSE if report else ODOMETRY, reliable=not report) for name in self._drones),
             Topic("/tf", "tf2_msgs/msg/TFMessage"),
             *(Topic(f"/{frame}/reference", POSE) for frame in self.frames),
             Topic("/cables", "sensor_msgs/msg/JointState"),
             Topic("/markers", "visualization_msgs/msg/MarkerArray"),
+            Topic(self._names.payload, ODOMETRY, reliable=not report),
+            *(Topic(name, POSE if report else ODOMETRY, reliable=not report) for name in self._drones),
         ]
         if report:
             for i, px4 in enumerate(self._px4):
-                topics.append(Topic(f"{px4}/out/vehicle_odometry", VEHICLE_ODOMETRY, False))
-                topics.append(Topic(f"{px4}/out/vehicle_local_position", LOCAL_POSITION, False))
+                topics.append(Topic(f"{px4}/out/vehicle_odometry", VEHICLE_ODOMETRY, False, True))  # as PX4 does
+                topics.append(Topic(f"{px4}/out/vehicle_local_position", LOCAL_POSITION, False, True))
                 topics.append(Topic(f"/state/state_drone_{i}", "std_msgs/msg/Int32"))
             topics.append(Topic("/sync_time", "std_msgs/msg/Int64", False, True))
         return topics
 
     def messages(self, time_ns: int) -> Iterator[Sent]:
-        """Return the messages of the state as it is, at a time since the start [ns]."""
+        """Return the messages of the state as it is, at a time since the start [ns]; what peers act on comes last."""
         state, goal, reference = self._vec.world.state, self._vec.task.goal, self._vec.reference
         store, header = self._store, make_header(self._store, time_ns)
         yield "/clock", self._new("rosgraph_msgs/msg/Clock", clock=header.stamp)
@@ -150,14 +150,6 @@ class FlightMessages:
         payload: Motion = tuple(array[0] for array in state[:4])
         rows = (state.drone_position, state.drone_rotation, state.drone_velocity, state.drone_body_rates)
         drones: list[Motion] = [tuple(array[0, i] for array in rows) for i in range(len(self.frames))]
-        yield self._names.payload, self._odometry(header, "payload", payload)
-        for name, frame, motion in zip(self._drones, self.frames, drones, strict=True):
-            if self._names.is_report:
-                yield name, pose_stamped(store, time_ns, *motion[:2])
-            else:
-                yield name, self._odometry(header, frame, motion)
-        if self._names.is_report:
-            yield from self._report(time_ns, drones)
         frames = {"payload": payload} | dict(zip(self.frames, drones, strict=True))
         transforms = [self._transform(header, *pair) for pair in frames.items()]
         yield "/tf", self._new("tf2_msgs/msg/TFMessage", transforms=transforms)
@@ -166,6 +158,14 @@ class FlightMessages:
             yield f"/{frame}/reference", pose_stamped(store, time_ns, reference.position[0, i], yaw)
         yield "/cables", self._cables(header)
         yield "/markers", self._markers(header)
+        yield self._names.payload, self._odometry(header, "payload", payload)
+        for name, frame, motion in zip(self._drones, self.frames, drones, strict=True):
+            if self._names.is_report:
+                yield name, pose_stamped(store, time_ns, *motion[:2])
+            else:
+                yield name, self._odometry(header, frame, motion)
+        if self._names.is_report:
+            yield from self._report(time_ns, drones)
 
     def _report(self, time_ns: int, drones: list[Motion]) -> Iterator[Sent]:
         """Return what PX4s, the state machine and the clock of the report's workspace say."""
