@@ -31,6 +31,10 @@ class Flight(NamedTuple):
 
 FLIGHTS: dict[str, Flight] = {
     "hover": Flight("hover", {}, "hover", "hover"),
+    "hover_acc_rates": Flight(
+        "hover_acc_rates", {}, "hover_acc_rates", "hover by accelerations and tilt rates, from nothing"
+    ),
+    "hover_ctbr": Flight("hover_ctbr", {}, "hover_ctbr", "hover by thrust and body rates, from nothing"),
     "hover_wind": Flight("hover_wind", {}, "hover_wind", "hover in wind of 5 m/s, noise, delay"),
     "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
     "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
@@ -55,6 +59,10 @@ FLIGHTS: dict[str, Flight] = {
     "loss_6": Flight("loss_6", {}, "loss_6", "loss, 6 drones"),
     "loss_snap": Flight("loss_snap", {}, "loss", "loss with its cable"),
 }
+
+
+SCRIPTED = {"control.action": "reference"}
+"""What scripts act by, whatever the interface of the learned teams that they are compared with."""
 
 
 def error_metric(flight: Flight) -> str:

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from flights import EPISODES, FLIGHTS, HERE, ROOT, SEED, error_metric
+from flights import EPISODES, FLIGHTS, HERE, ROOT, SCRIPTED, SEED, error_metric
 from tables import write_tables
 
 from multilift_marl._files import write_whole
@@ -107,7 +107,7 @@ def evaluate(flights: list[str], workers: int) -> None:
 def list_jobs(flight: str, only: str = "") -> list[Job]:
     """Return the teams of a flight, or the one called `only`."""
     config = load_config(FLIGHTS[flight].config, FLIGHTS[flight].overrides)
-    scripts = fitting_scripts(MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1})))
+    scripts = fitting_scripts(MultiliftVec(build_config(config.model_dump(), SCRIPTED | {"env.num_envs": 1})))
     weights = sorted((HERE / FLIGHTS[flight].recipe).glob("seed*/policy.pt"))
     jobs = [*(Job(flight, name, "") for name in scripts), *(Job(flight, w.parent.name, str(w)) for w in weights)]
     return [job for job in jobs if only in ("", job.team)]
@@ -129,6 +129,8 @@ def fly(job: Job) -> str:
         # the full scale of actions is that of training
         maker = policy.bind
         overrides = overrides | scales
+    else:
+        overrides = overrides | SCRIPTED
     results = fly_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
     metrics = summarize(results)
     error = results[error_metric(flight)]

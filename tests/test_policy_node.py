@@ -200,6 +200,6 @@ def test_two_processes_fly_a_team_in_real_time(names):
     finally:
         simulation.kill()
         node.kill()
-    assert "flying: all bodies are heard" in output and "set-points followed odometry by" in output
+    assert "flying: all is heard" in output and "set-points followed odometry by" in output
     errors = [np.linalg.norm(read_pose(m.pose.pose)[0] - read_pose(targets[-1].pose)[0]) for m in heard[-50:]]
     assert np.mean(errors) < 0.05, output + simulation.stdout.read()

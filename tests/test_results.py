@@ -57,7 +57,7 @@ def test_flights_are_flown_a_thousand_times_by_shipped_teams_and_scripts():
     assert {flight.config for flight in reproduce.FLIGHTS.values()} >= set(ml.list_tasks())
     compared = 0
     for name, flight in reproduce.FLIGHTS.items():
-        fitting = fitting_scripts(ml.make_vec(flight.config, num_envs=1, num_threads=1))
+        fitting = fitting_scripts(ml.make_vec(flight.config, num_envs=1, num_threads=1, **reproduce.SCRIPTED))
         evaluated, reported = (
             {path.stem for path in (ROOT / "results" / name).glob(kind)} for kind in ("*.npz", "*.json")
         )
