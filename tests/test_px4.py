@@ -179,8 +179,11 @@ def test_other_interfaces_have_set_points_of_their_own(action):
                 hover = np.linalg.norm(force) / (4 * vehicle.rotor_thrust_max)
                 assert asked.get_type() == "SET_ATTITUDE_TARGET" and asked.type_mask == 128
                 assert asked.thrust == pytest.approx(0.5 + 0.5 * hover, abs=0.01)
-                assert asked.body_roll_rate == pytest.approx(0.2 * config.control.max_tilt_rate, rel=1e-5)
-                assert asked.body_pitch_rate == asked.body_yaw_rate == 0
+                rotation, slot = vec.world.state.drone_rotation[0, n], vec.task.goal.slot_frame[0, n]
+                turned = np.arctan2(slot[1], slot[0]) - np.arctan2(rotation[1, 0], rotation[0, 0])
+                rates = 0.2 * config.control.max_tilt_rate * np.array([np.cos(turned), -np.sin(turned), 0.0])  # FRD
+                found = [asked.body_roll_rate, asked.body_pitch_rate, asked.body_yaw_rate]
+                np.testing.assert_allclose(found, rates, atol=0.02)
             else:
                 outward = np.append(vec.task.goal.slot_frame[0, n], 0)
                 sideways = np.array([-outward[1], outward[0], 0])
