@@ -73,6 +73,15 @@ def test_places_are_flown_to_and_held():
     assert (team.autopilots.late == 0).all()
 
 
+def test_a_place_alone_is_held_with_the_force_on_the_cable():
+    team = Team()
+    for _ in range(400):
+        for n in range(2):
+            team.say(n, team.slots[n])
+        team.step()
+    np.testing.assert_allclose(team.state.drone_position[0], team.slots, atol=0.03)
+
+
 def test_velocities_are_flown_where_no_place_is_asked_for():
     team = Team()
     flown = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from multilift_marl.math3d import turn
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 
@@ -33,6 +34,5 @@ class LoadFeedforward:
             yaw: its heading from east [rad].
         """
         c, s = np.cos(yaw), np.sin(yaw)
-        level = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        drag = level @ (self._drag[drone] * (level.T @ velocity))
+        drag = np.array(turn(c, s, tuple(self._drag[drone] * turn(c, -s, tuple(velocity)))))
         return acceleration + (self._load_share[drone] * acceleration + cable_force + drag) / self._mass[drone]

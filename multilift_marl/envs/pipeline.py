@@ -13,7 +13,7 @@ from multilift_marl._jit import bind, kernel_name
 from multilift_marl.control.controller import Controller
 from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.observations import stack
+from multilift_marl.tasks.observation_kernels import stack
 from multilift_marl.tasks.sensing import Sensing
 
 

@@ -54,6 +54,7 @@ class TopicAutopilots(Controller):
         alone = {name: np.zeros_like(getattr(self.gains, name)) for name in ("load_share", "drag")}
         self._drone_gains = self.gains._replace(**alone)
         self._setpoints: list[PX4Setpoint] = []
+        self._cable_force = np.zeros((1, len(drones), 3))  # of the task, live
         self._dt, self._step = 1.0 / config.sim.control_hz, 1.0 / config.env.policy_hz
         self.age, self.late = np.full(len(drones), np.inf), np.zeros(len(drones), int)
 
@@ -65,6 +66,7 @@ class TopicAutopilots(Controller):
         self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
     ) -> tuple[Call, tuple[Call, ...]]:
         """See `Controller.bind`; actions do not count."""
+        self._cable_force = goal.cable_force
         own = self.world.state, self.reference, np.zeros_like(goal.cable_force), self.world.thrust
         fly_alone = bind(fly, lo, hi, *own, self._drone_gains, None)
         return self._hear, (*(() if plan is None else (plan,)), self._follow, fly_alone)
@@ -87,8 +89,7 @@ class TopicAutopilots(Controller):
 
     def _carried(self, drone: int) -> np.ndarray:
         """Return the acceleration [m/s²] that holds the nominal force on the cable."""
-        system = self.world.system
-        return np.array([0.0, 0.0, system.hook_force[drone, 2] / system.drone_mass[drone]])
+        return np.asarray(self._cable_force[0, drone] / self.world.system.drone_mass[drone])
 
     def _hear(self) -> None:
         """Take the newest set-points, once for each policy step; hold or land what hears none."""
