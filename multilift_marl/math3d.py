@@ -219,6 +219,13 @@ def axis_angle(axis, angle):
 
 
 @kernel
+def turn_by(rotation, m):
+    """Return the attitude M turned by a rotation vector, in the frame that M leads to."""
+    angle = norm(rotation)
+    return matmul(axis_angle(scale(1.0 / angle, rotation), angle), m) if angle > 0.0 else m
+
+
+@kernel
 def rotation_vector(m):
     """Return axis times angle of M, angle in [0, π]."""
     w, x, y, z = mat_to_quat(m)

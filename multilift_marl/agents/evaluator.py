@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.config.config import Config
 from multilift_marl.control.policy import Policy
-from multilift_marl.control.scripted import LINEAR
+from multilift_marl.control.scripted import make_residual
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.evaluation.metrics import is_better, summarize
 from multilift_marl.evaluation.rollout import fly_episodes
@@ -81,7 +82,7 @@ class Evaluator:
     def measure_gain(self, iterations: int) -> Gain:
         """Fly the best policy and the script that training of so many iterations began with."""
         learned = self._fly(self.best_policy().bind, iterations + 1)
-        script = self._fly(LINEAR[self.config.train.residual], iterations + 1)
+        script = self._fly(partial(make_residual, self.config.train.residual), iterations + 1)
         before = {name: float(script[name].mean()) for name in _METRICS}
         after = {name: float(learned[name].mean()) for name in _METRICS}
         return Gain(before, after, is_better(learned, script))

@@ -167,7 +167,7 @@ def make_contract(policy: LearnedPolicy) -> dict[str, Any]:
 def _check_names(policy: LearnedPolicy) -> None:
     config = policy.config
     actions = tuple(number.name for number in ACTIONS[config.control.action].numbers)
-    observations = observation_names(config.control.action, find_task(config.task).EXTRA, config.env.history)
+    observations = observation_names(config.control.action, find_task(config.task).extra(config), config.env.history)
     for found, known, what in (
         (policy.action_names, actions, "actions"),
         (policy.observation_names, observations, "observations"),
@@ -179,7 +179,7 @@ def _check_names(policy: LearnedPolicy) -> None:
 def _describe_observation(policy: LearnedPolicy) -> dict[str, Any]:
     config, size = policy.config, len(policy.observation_names)
     parts, at = [], 0
-    for part in list_components(config.control.action, find_task(config.task).EXTRA):
+    for part in list_components(config.control.action, find_task(config.task).extra(config)):
         described = {key: getattr(part, key) for key in ("name", "size", "frame", "unit", "meaning")}
         parts.append({"first": at, **described})
         at += part.size

@@ -252,7 +252,8 @@ def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
 def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> dict[str, Any]:
     """Return the values of `base`, one configuration or several, with a configuration's own `values` over them.
 
-    The task is its own, else that of its first base; bases with another task give their system only.
+    The task is its own, else that of its first base; bases with another task give their system only, those without
+    one all that they say.
 
     Args:
         values: of a configuration.
@@ -276,7 +277,7 @@ def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> 
             raise ConfigError(f"{above[-1]} is based on {name}, which is based on it; take one of the two bases out")
         part = _read(folder / name if is_yaml(name) else name, above)
         task = own.get("task", merged.get("task", part.get("task")))
-        merged = _merge(merged, part if part.get("task") == task else _system_part(part))
+        merged = _merge(merged, part if part.get("task", task) == task else _system_part(part))
     return _merge(merged, own)
 
 

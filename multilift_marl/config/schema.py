@@ -28,6 +28,18 @@ from multilift_marl.config.values import (
     VectorPerDrone,
 )
 
+RESIDUALS = (
+    "formation", "formation_integral", "formation_feedback", "formation_gusts", "formation_lead", "formation_narrow",
+    "formation_redistributed", "hold_velocity", "hold_acceleration", "hold_acc_rates", "hold_ctbr",
+)  # fmt: skip
+
+
+def check_residual(name: str) -> str:
+    """Return the name of a linear script; refuse another by a ValueError."""
+    if name not in RESIDUALS and ":" not in name:
+        raise ValueError(f"must be {', '.join(RESIDUALS)}, or one's own module:Class with matrix()")
+    return name
+
 
 class EnvConfig(Section):
     """Size and timing of the environment."""
@@ -42,6 +54,9 @@ class EnvConfig(Section):
     )
     policy_hz: Annotated[Float, Between(1, 1e5, "Hz")] = Field(
         50.0, gt=0, description="[Hz] rate of actions and observations"
+    )
+    sensing: Literal["ideal", "mocap", "onboard", "blind"] = Field(
+        "ideal", description="what drones know of themselves and of the payload (docs/sensing.md)"
     )
     history: Int = Field(1, ge=1, le=50, description="steps that an observation holds, the newest first")
 
@@ -284,15 +299,9 @@ class TrainConfig(Section):
     critic: Literal["flat", "set", "attention"] = Field(
         "flat", description="of mappo; set, attention: the same value in whatever order the drones stand"
     )
-    residual: Literal[
-        "formation",
-        "formation_integral",
-        "formation_feedback",
-        "formation_gusts",
-        "formation_lead",
-        "formation_narrow",
-        "formation_redistributed",
-    ] = Field("formation", description="script that an untrained policy flies and the learned one corrects")
+    residual: Annotated[str, AfterValidator(check_residual)] = Field(
+        "formation", description="linear script that an untrained policy flies and the learned one corrects"
+    )
     frames: Int = Field(5_000_000, ge=1, description="environment steps in all")
     horizon: Int = Field(128, ge=1, le=100_000, description="steps of each environment between updates")
     epochs: Int = Field(4, ge=1, description="passes over each batch")

@@ -12,6 +12,7 @@ from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.errors import ConfigError
+from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
 
@@ -20,9 +21,11 @@ class Controller:
 
     Args:
         config: `control` says how.
-        world: whose state is read and whose thrusts are written.
+        world: whose thrusts are written.
+        state: what the drones know of themselves; None: the world's, the truth.
 
     Attributes:
+        world, state: as given.
         action_names: names of the numbers of an action.
         reference: what the drones follow; live arrays.
         gains: of the controller, for the nominal drones.
@@ -32,10 +35,10 @@ class Controller:
         ConfigError: an interface and a rejection that do not go together.
     """
 
-    def __init__(self, config: Config, world: World):
+    def __init__(self, config: Config, world: World, state: SystemState | None = None):
         settings, dt = config.control, 1.0 / config.sim.control_hz
         e, n = world.num_envs, world.num_drones
-        self.world = world
+        self.world, self.state = world, world.state if state is None else state
         self.interface = ACTIONS[settings.action](settings, dt)
         self.action_names = tuple(number.name for number in self.interface.numbers)
         self.reference = Reference.zeros(e, n)
@@ -64,7 +67,7 @@ class Controller:
             goal: of the task.
             plan: moves the goals on by one control step; None if they stay.
         """
-        state, thrust, g = self.world.state, self.world.thrust, self.gains
+        state, thrust, g = self.state, self.world.thrust, self.gains
         rejection = self.disturbance
         cable_force = goal.cable_force if rejection is None else rejection.cable_force
         team = Team(state, goal, self.reference, self._setpoint, cable_force, thrust, g)
@@ -82,9 +85,9 @@ class Controller:
 
     def start(self, e: int) -> None:
         """Let references and estimates of environment e start from the state of its drones."""
-        start_reference(e, self.world.state, self.reference)
+        start_reference(e, self.state, self.reference)
         if self.disturbance is not None:
-            reset_estimate(e, self.world.state, self.disturbance)
+            reset_estimate(e, self.state, self.disturbance)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the arrays that outlive a step."""

@@ -7,7 +7,7 @@ with every cable taut; from these the places of the drones, which act by the `re
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -103,7 +103,12 @@ class PayloadGeometric:
     Args:
         vec: environments with the interface `reference`; read at every `act`.
         gains: None for the tuned ones.
+
+    Class attributes:
+        INTERFACE: by which it acts.
     """
+
+    INTERFACE: ClassVar[str] = "reference"
 
     def __init__(self, vec: MultiliftVec, gains: PayloadGains | None = None):
         system, control, task = vec.world.system, vec.config.control, vec.task

@@ -2,201 +2,26 @@
 
 from __future__ import annotations
 
-from math import cos, radians
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from multilift_marl.control.payload_geometric import PayloadGeometric
 from multilift_marl.control.policy import OwnPolicy, Policy
+from multilift_marl.control.scripted_formation import (
+    Formation,
+    FormationFeedback,
+    FormationGusts,
+    FormationIntegral,
+    FormationLead,
+    FormationNarrow,
+    FormationRedistributed,
+)
+from multilift_marl.control.scripted_hold import HoldAcceleration, HoldAccRates, HoldCtbr, HoldVelocity
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.rig.vehicles import GRAVITY
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
-
-INTEGRAL_GAIN = 0.5  # [1/s]
-PLANNED = {  # of what is observed, the planned value, where a task has one
-    "payload_error": ("planned_position",),
-    "payload_velocity": ("planned_velocity", "target_velocity"),
-    "payload_rotation_error": ("planned_rotation",),
-}
-LEAD_TIME = 0.4  # [s] that a payload's acceleration follows a moved slot: the lags of reference and drone
-LEAD_GAIN = 0.87  # [-] of h a / g; the RMSE of `track` is least at 0.81 for the curve (2, 2), at 1 for (2, 4)
-NARROWING = 0.7  # [m] inward from the slots; 0.5 to 0.7 m pass a gap of 1 m, at 0.8 m drones collide
-
-
-class Formation:
-    """Every drone holds its slot about the target payload pose: the zero action of the `reference` interface.
-
-    Args:
-        vec: environments with the interface `reference`.
-
-    Attributes:
-        GAINS: how a script based on this one moves the slots: what is observed, its axis in the slot frame, the axis of
-            the slot's offset, and metres for each unit.
-        NEEDS: observations without which the script cannot act.
-        REFUSAL: what is said where they are missing in {task}.
-
-    Raises:
-        ConfigError: the environments do not observe what the script needs.
-    """
-
-    GAINS: ClassVar[tuple[tuple[str, int, int, float], ...]] = ()
-    NEEDS: ClassVar[tuple[str, ...]] = ()
-    REFUSAL: ClassVar[str] = ""
-
-    def __init__(self, vec: MultiliftVec):
-        if not self.fits(vec):
-            raise ConfigError(self.REFUSAL.format(task=vec.config.task))
-        self._names, self._actions = vec.observation_names, vec.action_names
-        self._max_offset = vec.config.control.max_offset
-        self._matrix = self.matrix()
-
-    def matrix(self) -> np.ndarray:
-        """Return M (A, D) float32 with which the action is M times the observation, clipped to [-1, 1]."""
-        matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
-        for name, axis, moved, gain in self.GAINS:
-            matrix[moved, self._names.index(f"{name}_{axis}")] = gain / self._max_offset
-            for planned in PLANNED.get(name, ()):
-                if f"{planned}_{axis}" in self._names:
-                    matrix[moved, self._names.index(f"{planned}_{axis}")] = -gain / self._max_offset
-        return matrix
-
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (..., N, A) float32 in [-1, 1] for observations (..., N, D)."""
-        return np.clip(np.einsum("...d,ad->...a", np.asarray(observation, np.float32), self._matrix), -1, 1)
-
-    def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget nothing: the integral is part of the observation."""
-
-    @classmethod
-    def fits(cls, vec: MultiliftVec) -> bool:
-        """Return whether the environments observe what the script needs."""
-        return all(name in vec.observation_names for name in cls.NEEDS)
-
-
-class FormationIntegral(Formation):
-    """The formation with its slots moved against the clipped integral of the payload's position error.
-
-    By -k ∫ e dt [m], k = 0.5 1/s, along each axis of a drone's slot frame; a full action is `control.max_offset`.
-    """
-
-    GAINS = tuple(("payload_error_integral", axis, axis, -INTEGRAL_GAIN) for axis in range(3))
-
-
-class FormationFeedback(Formation):
-    """The formation with its slots moved by linear feedback of what a drone observes.
-
-    Level, against the payload's error from where it should be by now, the integral of that and its velocity, and
-    against the drone's own distance from its reference, which shows the wind's force before the payload moves; up
-    and down also so that the payload turns back to its target attitude.
-    """
-
-    GAINS = (
-        ("payload_error_integral", 0, 0, -0.55),
-        ("payload_error_integral", 1, 1, -0.55),
-        ("payload_error_integral", 2, 2, -0.5),
-        ("payload_error", 0, 0, -0.15),
-        ("payload_error", 1, 1, -0.15),
-        ("payload_velocity", 0, 0, -0.4),
-        ("payload_velocity", 1, 1, -0.4),
-        ("payload_velocity", 2, 2, -0.25),
-        ("tracking_error", 0, 0, -0.45),
-        ("tracking_error", 1, 1, -0.45),
-        ("rotation_error_integral", 1, 2, 0.55),
-        ("payload_rotation_error", 1, 2, 0.2),
-    )
-
-
-class FormationGusts(Formation):
-    """The formation with its slots moved by linear feedback that holds tilted payloads in turbulent wind.
-
-    Against the payload's position and level velocity more than by `FormationFeedback`, against the drone's own lag and
-    the integral of the payload's tilt less; drones also move along the tangent at their slot, against the payload's
-    turning about the vertical, and outward where it tilts towards them. The gains are rounded from a search like that
-    of `results/search_gains.py` for `configs/pose_wind.yaml`.
-    """
-
-    GAINS = (
-        ("payload_error_integral", 0, 0, -0.57),
-        ("payload_error_integral", 1, 1, -0.57),
-        ("payload_error_integral", 2, 2, -0.74),
-        ("payload_error", 0, 0, -0.5),
-        ("payload_error", 1, 1, -0.5),
-        ("payload_error", 2, 2, -0.54),
-        ("payload_velocity", 0, 0, -0.54),
-        ("payload_velocity", 1, 1, -0.54),
-        ("payload_velocity", 2, 2, -0.22),
-        ("tracking_error", 0, 0, -0.12),
-        ("tracking_error", 1, 1, -0.12),
-        ("rotation_error_integral", 1, 2, 0.16),
-        ("payload_rotation_error", 1, 2, 0.34),
-        ("payload_angular_velocity", 1, 2, 0.03),
-        ("rotation_error_integral", 2, 1, -0.73),
-        ("payload_rotation_error", 2, 1, 0.09),
-        ("payload_angular_velocity", 2, 1, 0.02),
-        ("payload_rotation_error", 1, 0, 0.27),
-        ("payload_angular_velocity", 1, 0, 0.05),
-    )
-
-
-class FormationLead(Formation):
-    """The formation displaced by what the payload's acceleration to come asks of its cables.
-
-    Their forces lie along gravity and acceleration together (the payload's flatness, Sreenath and Kumar 2013), so that
-    drones are h a / g ahead of their slots with h the height of the formation's cables; a is that of `LEAD_TIME` ahead,
-    from the observed places that the target will pass.
-    """
-
-    AHEAD = tuple(f"target_ahead_{round(1000 * share * LEAD_TIME)}ms" for share in (1, 2))
-    NEEDS = tuple(f"{name}_0" for name in AHEAD)
-    REFUSAL = (
-        "formation_lead needs to observe where the target will go, and task {task} has no such part; take formation"
-    )
-
-    def __init__(self, vec: MultiliftVec):
-        lengths, angle = vec.world.system.cable_length, vec.config.cable.angle
-        self._height = float(np.mean(lengths)) * cos(radians(angle))
-        super().__init__(vec)
-
-    def matrix(self) -> np.ndarray:
-        """See `Formation.matrix`."""
-        matrix = super().matrix()
-        gain = LEAD_GAIN * self._height / GRAVITY / LEAD_TIME**2 / self._max_offset
-        for axis in range(2):
-            for name, weight in zip(self.AHEAD, (-2, 1), strict=True):  # a second difference
-                matrix[axis, self._names.index(f"{name}_{axis}")] = weight * gain
-        return matrix
-
-
-class FormationNarrow(Formation):
-    """The formation drawn in by a constant, so that it passes a gap, with integral and velocity feedback.
-
-    The constant is `NARROWING` times the cosine of the drone's own heading, which is 1 but for the noise. Velocity
-    counts relative to the target's.
-    """
-
-    GAINS = (
-        ("heading", 0, 0, -NARROWING),
-        *FormationIntegral.GAINS,
-        ("payload_velocity", 0, 0, -0.3),
-        ("payload_velocity", 1, 1, -0.3),
-    )
-    NEEDS = ("clearance_0",)
-    REFUSAL = "formation_narrow is for gaps, and task {task} has none; take formation_feedback"
-
-
-class FormationRedistributed(FormationIntegral):
-    """The formation with its integral; after a loss, the slots give way, then go where the others hold the payload.
-
-    Where that is, the task computes by statics and lets the drones observe; see `control/redistribution.py`.
-    """
-
-    GAINS = (*FormationIntegral.GAINS, *(("planned_offset", axis, axis, 1.0) for axis in range(3)))
-    NEEDS = ("planned_offset_0",)
-    REFUSAL = "formation_redistributed is for the loss of a drone, and task {task} has none; take formation_integral"
-
 
 LINEAR: dict[str, type[Formation]] = {
     "formation": Formation,
@@ -206,6 +31,10 @@ LINEAR: dict[str, type[Formation]] = {
     "formation_lead": FormationLead,
     "formation_narrow": FormationNarrow,
     "formation_redistributed": FormationRedistributed,
+    "hold_velocity": HoldVelocity,
+    "hold_acceleration": HoldAcceleration,
+    "hold_acc_rates": HoldAccRates,
+    "hold_ctbr": HoldCtbr,
 }
 """Scripts that are maps of the observation."""
 SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {
@@ -216,17 +45,20 @@ SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {
 
 def fitting_scripts(vec: MultiliftVec) -> list[str]:
     """Return the names of the scripts that can act in the environments `vec`."""
-    if vec.config.control.action != "reference":
-        return []
-    return [name for name, script in SCRIPTED.items() if not issubclass(script, Formation) or script.fits(vec)]
+    fitting = []
+    for name, script in SCRIPTED.items():
+        known = script.fits(vec) if issubclass(script, Formation) else vec.config.env.sensing == "ideal"
+        if known and script.INTERFACE == vec.config.control.action:
+            fitting.append(name)
+    return fitting
 
 
 def make_scripted(name: str, vec: MultiliftVec) -> Policy:
     """Return the scripted policy `name`, or that of one's own class module:Class, for the environments `vec`.
 
     Raises:
-        ConfigError: there is no such script, or the environments have another action interface than scripts have, or
-            do not observe what it needs; or see `OwnPolicy`.
+        ConfigError: there is no such script, or the environments have another action interface than it acts by, or do
+            not observe what it needs; or see `OwnPolicy`.
     """
     if ":" in name:
         return OwnPolicy(name, vec)
@@ -237,21 +69,36 @@ def make_scripted(name: str, vec: MultiliftVec) -> Policy:
 
 
 def check_interface(name: str, action: str) -> None:
-    """Refuse the script `name` with an action interface that it does not know, by a ConfigError."""
-    if action != "reference":
+    """Refuse the script `name` with an action interface that it does not act by, by a ConfigError."""
+    known = SCRIPTED[name].INTERFACE
+    if action != known:
+        fits = "set" if action in ("reference", "rotor") else f"take hold_{action}, set"
         raise ConfigError(
-            f"the scripted policy '{name}' acts by control.action=reference and cannot fly control.action={action}; "
-            "set control.action=reference, or leave the script out (baseline=none, train.residual=formation)"
+            f"the scripted policy '{name}' acts by control.action={known} and cannot fly control.action={action}; "
+            f"{fits} control.action={known}, or leave the script out (baseline=none, train.residual=formation)"
         )
+
+
+def make_residual(name: str, vec: MultiliftVec) -> Policy:
+    """Return what `train.residual` names, as a policy; `formation` acts by zeros with every interface."""
+    return LINEAR[name](vec) if name == "formation" else make_scripted(name, vec)
 
 
 def residual_matrix(name: str, vec: MultiliftVec) -> np.ndarray:
     """Return M (A, D) of the script that a learned policy corrects; `formation` is zero with every interface.
 
     Raises:
-        ConfigError: see `make_scripted`.
+        ConfigError: see `make_scripted`; or one's own class has no `matrix()` that returns such a one.
     """
+    shape = vec.action_size, vec.observation_size
     if name == "formation":
-        return np.zeros((vec.action_size, vec.observation_size), np.float32)
-    check_interface(name, vec.config.control.action)
-    return LINEAR[name](vec).matrix()
+        return np.zeros(shape, np.float32)
+    policy = make_scripted(name, vec)
+    policy = policy.policy if isinstance(policy, OwnPolicy) else policy
+    matrix = policy.matrix() if hasattr(policy, "matrix") else None
+    if not isinstance(matrix, np.ndarray) or matrix.shape != shape or not np.isfinite(matrix).all():
+        raise ConfigError(
+            f"train.residual={name} needs a method matrix() that returns finite numbers {shape} (numbers of an action, "
+            "of an observation)"
+        )
+    return matrix.astype(np.float32)

@@ -10,6 +10,7 @@ import numpy as np
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
 from multilift_marl.control.controller import Controller
+from multilift_marl.control.estimator import StateEstimator
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.envs.pipeline import Pipeline, Teams, describe_stages
@@ -61,20 +62,23 @@ class MultiliftVec:
             raise ConfigError(f"first_env must not be negative, but is {first_env}")
         kind = find_task(config.task)
         self.config, self.purpose, self.first_env = config, purpose, first_env
-        self.num_envs, self.num_drones = e, n = config.env.num_envs, config.system.num_drones
+        self.num_envs, self.num_drones = config.env.num_envs, config.system.num_drones
+        e = self.num_envs
         self.control_ticks = whole_ratio(config.sim.control_hz, config.env.policy_hz, "env.policy_hz", "sim.control_hz")
         self.max_steps = round(config.env.episode_seconds * config.env.policy_hz)
         if self.max_steps < 1:
             raise ConfigError(f"env.episode_seconds={config.env.episode_seconds} is shorter than one step; raise it")
         self.world = self.world_type(config.system, e, config.env.num_threads)
-        self.controller = Controller(config, self.world)
+        level = config.env.sensing
+        estimator = None if level == "ideal" else StateEstimator(level, self.world, config.sim.control_hz)
+        self.controller = Controller(config, self.world, estimator.state if estimator else None)
         self.reference = self.controller.reference
         self.action_names = self.controller.action_names
         self.action_size = a = len(self.action_names)
-        self.observation_names = observation_names(config.control.action, kind.EXTRA, config.env.history)
+        self.observation_names = observation_names(config.control.action, kind.extra(config), config.env.history)
         self.observation_size = len(self.observation_names)
-        shape = e, n, a, self.observation_size // config.env.history
-        self._sensing = Sensing(config.randomization, shape, config.system.payload_shape != "point")
+        self._estimator = estimator
+        self._sensing = Sensing(config, self.world, estimator, (a, self.observation_size // config.env.history))
         self.task = kind(config, self.world, self.reference, self._sensing)
         self.state_size = self.task.critic.shape[1]
         self.reward_terms, self.failure_causes = tuple(kind.REWARD), CAUSES
@@ -85,7 +89,7 @@ class MultiliftVec:
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
         self._checked = False  # whether all components were seen to be written
         self._bind()
-        self._first_sense = self._sensing.bind_sense(self.task.view, 0.0) if self._sensing.has_noise else None
+        self._first_sense = self._sensing.bind_sense(self.task.view, first=True) if self._sensing.measures else None
         delays = self._sensing.delays_observation
         self._first_delay = self._sensing.bind_delay(observation) if delays else None
 
@@ -244,6 +248,7 @@ class MultiliftVec:
         self.task.action[mask] = self.task.previous[mask] = 0.0
         self.steps[mask], self._ended[mask] = 0, False
         for e in chosen:
+            self._sensing.start_sensors(e)
             self.controller.start(e)
             if not self._checked:  # NaN stands for what is not written
                 self.task.observation[e] = self.task.critic[e] = np.nan
@@ -260,7 +265,7 @@ class MultiliftVec:
 
     def _bind(self) -> None:
         """Build the stages of every shard, from the controller and the task as they are."""
-        teams = Teams(self.world, self.controller, self.task, self._sensing, self._stacked)
+        teams = Teams(self.world, self.controller, self.task, self._estimator, self._sensing, self._stacked)
         self._pipelines = {shard.lo: Pipeline(teams, shard, self.control_ticks) for shard in self.world.shards}
 
     def _observe(self, e: int) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from multilift_marl._jit import bind, kernel_name
 from multilift_marl.control.controller import Controller
+from multilift_marl.control.estimator import StateEstimator
 from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.observation_kernels import stack
@@ -32,6 +33,7 @@ class Teams(NamedTuple):
     world: World
     controller: Controller
     task: Task
+    estimator: StateEstimator | None
     sensing: Sensing
     stacked: np.ndarray
     """(E, N, H D) float32 observations of the last H steps; the task's own array where H = 1."""
@@ -39,7 +41,7 @@ class Teams(NamedTuple):
 
 def build_stages(teams: Teams, shard: Shard, ticks: int) -> tuple[list[Stage], list[Stage], list[Stage]]:
     """Return what runs for a shard before its control ticks, at each of `ticks`, and after them."""
-    world, controller, task, sensing, stacked = teams
+    world, controller, task, estimator, sensing, stacked = teams
     lo, hi = shard.lo, shard.hi
     on_shard = {name: partial(call, lo, hi) for name, call in task.stages.items()}
     arriving = sensing.applied if sensing.delays_action else task.action
@@ -52,16 +54,19 @@ def build_stages(teams: Teams, shard: Shard, ticks: int) -> tuple[list[Stage], l
         before.append(Stage("delay action", partial(sensing.bind_send(task.action), lo, hi)))
     before.append(Stage("set action", set_action))
 
-    # at each control tick: plan, references, rejection of disturbances, rotor thrusts; then physics
+    # at each control tick: plan, references, rejection of disturbances, rotor thrusts; then physics, sensors, filters
     named = {plan: "advance plan", set_action: "set action"}
     tick = [Stage(named.get(call) or kernel_name(call), call, ticks) for call in control]
     tick.append(Stage("physics", partial(world.advance, shard, world.system.control_interval), ticks))
+    if estimator is not None:
+        tick.append(Stage("read sensors", partial(estimator.read, lo, hi), ticks))
+        tick.append(Stage("estimate own state", partial(estimator.estimate, lo, hi), ticks))
 
     # once, after: measure, reward, observe
     after = [Stage("errors and failures", on_shard["check"]), Stage("reward", on_shard["reward"])]
     after.append(Stage("observe state", on_shard["observe state"]))
-    if sensing.has_noise:
-        after.append(Stage("sense", partial(sensing.bind_sense(task.view, task.dt), lo, hi)))
+    if sensing.measures:
+        after.append(Stage("sense", partial(sensing.bind_sense(task.view), lo, hi)))
     after.append(Stage("observe", on_shard["observe"]))
     if sensing.delays_observation:
         after.append(Stage("delay observation", partial(sensing.bind_delay(task.observation), lo, hi)))

@@ -46,6 +46,13 @@ def normal_pair(e, air):
 
 
 @kernel
+def normal_vector(e, air):
+    """Return three independent standard normal numbers of environment e."""
+    (a, b), (c, _) = normal_pair(e, air), normal_pair(e, air)
+    return (a, b, c)
+
+
+@kernel
 def dryden(height, wind_speed):
     """Return intensities and scale lengths of turbulence at low altitude (MIL-F-8785C, 3.7, Dryden form).
 

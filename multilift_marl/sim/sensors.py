@@ -12,13 +12,14 @@ own (SplitMix64, see `sim.gusts`), so results do not depend on how many are comp
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from math import exp, expm1, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import bind, kernel
+from multilift_marl._jit import kernel, prebind
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import (
     add,
@@ -165,6 +166,7 @@ class Sensors:
 
     Attributes:
         readings: live arrays.
+        channels: numbers of the sensors.
 
     Raises:
         ConfigError: a rate or a delay that is no whole number of ticks.
@@ -184,7 +186,7 @@ class Sensors:
             values = [np.broadcast_to(getattr(each, part), k) for each, k in zip(sensors, SIZES.values(), strict=True)]
             return np.concatenate(values).astype(float)
 
-        self._channels = Channels(
+        self.channels = Channels(
             first=np.cumsum([0, *SIZES.values()]),
             period=np.array(period),
             delay=np.array(delay),
@@ -209,16 +211,25 @@ class Sensors:
             fresh=np.zeros((e, len(SIZES)), bool),
         )
         self._state = state
-        self._read = bind(read_sensors, 0, e, state, self.readings, self._channels)
+        self._read = prebind(read_sensors, state, self.readings, self.channels)
 
     def reset(self, env: int, seed: np.random.SeedSequence) -> None:
         """Begin an episode: draw offsets and drifts, and deliver what every sensor says of the state as it is."""
         self.readings.generator[env] = seed.generate_state(1, np.uint64)[0]
-        start_sensors(env, self._state, self.readings, self._channels)
+        start_sensors(env, self._state, self.readings, self.channels)
 
     def read(self) -> None:
         """Let all sensors measure the state as it is, one tick after the last time."""
-        self._read()
+        self._read(0, len(self.readings.tick))
+
+    def bind(self) -> Callable[[int, int], None]:
+        """Return the call of (lo, hi) that does as `read` for environments lo to hi."""
+        return self._read
+
+    @property
+    def magnetic_reference(self) -> np.ndarray:
+        """(3,) the field, world frame [µT]."""
+        return self.channels.magnetic_field[0]
 
     @property
     def specific_force(self) -> np.ndarray:

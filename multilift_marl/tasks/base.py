@@ -19,8 +19,9 @@ from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.failures import FailureMask, find_cause, make_limits
+from multilift_marl.tasks.load_sensing import true_load
 from multilift_marl.tasks.observation_kernels import check_written, compose_observation, compose_state
-from multilift_marl.tasks.observations import Component, list_components, list_state, state_size
+from multilift_marl.tasks.observations import SENSED, Component, list_components, list_state, state_size
 from multilift_marl.tasks.rewards import RestBounds, Term, compose_reward, is_at_rest
 from multilift_marl.tasks.sensing import Sensing
 from multilift_marl.tasks.starts import make_hanging, true_hanging
@@ -139,13 +140,16 @@ class Task:
         self.prepare()
         self.view = View(
             state=world.state,
-            seen=sensing.state if sensing.has_noise else world.state,
+            seen=sensing.state,
+            load=sensing.load,
+            true_load=true_load(world.state),
+            true_errors=self.errors.as_rows(),
             loads=world.hidden_loads,
             goal=self.goal,
             planned=self.planned,
             has_plan=self.planned is not self.goal,
             errors=self.errors,
-            seen_errors=sensing.errors if sensing.has_noise else self.errors,
+            seen_errors=sensing.errors or self.errors.as_rows(),
             reference=reference,
             rig=self.rig,
             nominal=self.nominal_hanging,
@@ -166,6 +170,11 @@ class Task:
         )
         self._views: dict[Callable[..., Any], View] = {}
         self.stages = self._compose()
+
+    @classmethod
+    def extra(cls, config: Config) -> tuple[Component, ...]:
+        """Return what observations have beside the common components: the task's own, and what only sensors tell."""
+        return (*cls.EXTRA, *SENSED.get(config.env.sensing, ()))
 
     def prepare(self) -> None:
         """Check the options, set `settings`, and `own` where the task has arrays of its own."""
@@ -238,8 +247,8 @@ class Task:
 
     def check_written(self, env: int) -> None:
         """Refuse, by a ConfigError, components of observation or global state that are not written in a first step."""
-        size = self.action.shape[2]
-        check_written(self.observation[env], list_components(self.config.control.action, self.EXTRA), "observation")
+        size, parts = self.action.shape[2], list_components(self.config.control.action, self.extra(self.config))
+        check_written(self.observation[env], parts, "observation")
         check_written(self.critic[env], list_state(self.world.num_drones, size, self.EXTRA_STATE), "global state")
 
     def state_dict(self) -> dict[str, np.ndarray]:
@@ -265,6 +274,7 @@ class Task:
     def _compose(self) -> dict[str, Call]:
         """Return the stages of a step that are the task's, each a call of (lo, hi)."""
         v, kernels, size = self.view, self.KERNELS, self.action.shape[2]
+        observe = compose_observation(self.extra(self.config), self.config.control.action)
         check = compose_check(kernels.check)
         stages = {
             "measure": self._bind(check, v, 0.0),
@@ -272,9 +282,9 @@ class Task:
             "reward": self._bind(
                 compose_reward(self.REWARD, kernels.is_good, kernels.update), v, self.weights, self.margins
             ),
-            "observe": self._bind(compose_observation(self.EXTRA, self.config.control.action), v, self.observation),
+            "observe": self._bind(observe, v, self.observation),
         }
-        true = v._replace(seen=v.state, seen_errors=v.errors)
+        true = v._replace(seen=v.state, load=v.true_load, seen_errors=v.true_errors)
         stages["observe state"] = self._bind(compose_state(self.EXTRA_STATE, kernels.preview, size), true, self.critic)
         if kernels.plan is not None:
             stages["plan"] = self._bind(compose_plan(kernels.plan), v)
@@ -294,7 +304,7 @@ def compose_check(check: Callable[..., Any] | None) -> Callable[..., Any]:
     source = """def check(lo, hi, v, dt):
     for e in range(lo, hi):
         before(e, v)
-        update_errors(e, v.state, v.errors, v, dt)
+        update_errors(e, 0, v.true_load, v.true_errors, v, dt)
         v.cause[e] = find_cause(e, v)
 """
     functions: dict[str, Callable[..., Any]] = {"update_errors": update_errors, "find_cause": find_cause}

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from multilift_marl._jit import inlined
 from multilift_marl.control.actions import ACTIONS, to_slot_body
 from multilift_marl.math3d import add, column, heading, mat, matrow, mul, row, scale, sub, vec
+from multilift_marl.tasks.view import load_row
 
 FRAMES = {
     "world": "z up",
@@ -107,8 +108,8 @@ def reference_velocity(e, n, v):
 @inlined
 def anchor_position(e, n, v):
     """Where the own cable is attached to the payload."""
-    attitude = matrow(v.seen.payload_rotation, e)
-    return add(row(v.seen.payload_position, e), mul(attitude, row(v.rig.anchors, n)))
+    k = load_row(n, v)
+    return add(vec(v.load.position, e, k), mul(mat(v.load.rotation, e, k), row(v.rig.anchors, n)))
 
 
 @inlined
@@ -134,37 +135,38 @@ def cable(e, n, v):
 @inlined
 def payload_error(e, n, v):
     """Payload position minus target."""
-    return row(v.seen_errors.position, e)
+    return vec(v.seen_errors.position, e, load_row(n, v))
 
 
 @inlined
 def payload_velocity(e, n, v):
     """Payload velocity."""
-    return row(v.seen.payload_velocity, e)
+    return vec(v.load.velocity, e, load_row(n, v))
 
 
 @inlined
 def payload_rotation_error(e, n, v):
     """Rotation vector from target to payload attitude."""
-    return row(v.seen_errors.rotation, e)
+    return vec(v.seen_errors.rotation, e, load_row(n, v))
 
 
 @inlined
 def payload_angular_velocity(e, n, v):
     """Angular velocity of the payload."""
-    return mul(matrow(v.seen.payload_rotation, e), row(v.seen.payload_body_rates, e))
+    k = load_row(n, v)
+    return mul(mat(v.load.rotation, e, k), vec(v.load.body_rates, e, k))
 
 
 @inlined
 def payload_error_integral(e, n, v):
     """Clipped integral of payload_error."""
-    return row(v.seen_errors.position_integral, e)
+    return vec(v.seen_errors.position_integral, e, load_row(n, v))
 
 
 @inlined
 def rotation_error_integral(e, n, v):
     """Clipped integral of payload_rotation_error."""
-    return row(v.seen_errors.rotation_integral, e)
+    return vec(v.seen_errors.rotation_integral, e, load_row(n, v))
 
 
 @inlined
@@ -203,6 +205,12 @@ def cable_tension(e, n, v):
     return v.state.cable_tension[e, n] / v.resting_tension[n] - 1.0
 
 
+@inlined
+def measured_tension(e, n, v):
+    """Measured tension over that at rest, minus 1."""
+    return v.load.tension[e, n] / v.resting_tension[n] - 1.0
+
+
 OBSERVATION = (
     Component("slot_error", 3, "slot", "m", "own position minus own slot about the target pose", slot_error),
     Component("velocity", 3, "slot", "m/s", "own velocity", own_velocity),
@@ -234,6 +242,12 @@ OBSERVATION = (
     ),
     Component("slot_direction", 2, "target", "-", "cosine and sine of the own slot's azimuth", slot_direction),
 )  # fmt: skip
+
+SENSED = {  # what levels of `env.sensing` add
+    "onboard": (
+        Component("measured_tension", 1, "-", "-", "measured tension over that at rest, minus 1", measured_tension),
+    )
+}
 
 _TURNED = {  # what interfaces that are about body rates observe in place of others
     "body_rates": Component("turned_rates", 3, "slot body", "rad/s", "own angular velocity", turned_rates)

@@ -1,22 +1,27 @@
-"""Sensing: noise, bias and delay between the true state and an observation, and delay of actions.
+"""Sensing: what stands between the true state and an observation, and delay of actions.
 
-Noise and bias are those of measured states: each drone measures its own, and all observe one measurement of the
-payload's. Delays are whole policy steps. Success, reward and the critic's global state are computed from the true
-state, which the drones' own controllers use, too. docs/randomization.md says the same in a table.
+By `env.sensing` drones observe, and their controllers use, the truth (`ideal`) or estimates from simulated sensors
+(docs/sensing.md). Of the truth, `randomization` can make observations alone noisy and biased: each drone measures its
+own state, and all observe one measurement of the payload's. Delays are whole policy steps. Success, reward and the
+critic's global state are computed from the true state. docs/randomization.md says the same in a table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from multilift_marl._jit import kernel, prebind
-from multilift_marl.config.schema import RandomizationConfig
-from multilift_marl.math3d import add, axis_angle, mat, matmul, matrow, norm, put, putmat, row, scale, vec
-from multilift_marl.sim.gusts import normal_pair
+from multilift_marl.config.config import Config
+from multilift_marl.control.estimator import StateEstimator
+from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import add, mat, matrow, put, putmat, row, scale, turn_by, vec
+from multilift_marl.sim.gusts import normal_vector
 from multilift_marl.sim.state import SystemState
+from multilift_marl.sim.world import World
+from multilift_marl.tasks.load_sensing import LoadSensing, true_load
 from multilift_marl.tasks.observations import OBSERVATION_SIZE
 from multilift_marl.tasks.view import Errors, View, reduce_view, update_errors
 
@@ -47,31 +52,39 @@ class Memory(NamedTuple):
 
 
 class Sensing:
-    """Noise, bias and delays of E teams.
+    """Sensors, noise, bias and delays of E teams.
 
     Args:
-        ranges: how large they are.
-        shape: E, N, A, D.
-        attitude: whether the payload has one.
+        config: `env.sensing` and `randomization` say which and how large.
+        world: the teams.
+        estimator: of the drones' own states, None where they know the truth.
+        sizes: A, D.
 
     Attributes:
         memory: Memory.
-        state: what is measured (SystemState; tensions, rotors and cables are not).
-        errors: the payload's errors as measured, with their own integrals.
-        has_noise, delays_observation, delays_action: whether there is noise or bias, a delay of observations, one of
-            actions.
+        state: what drones know of themselves (SystemState; its payload, where that is measured, is in `load`).
+        load: what they know of the payload.
+        errors: the payload's errors as known, with their own integrals, (E, L, ...) as in `Load`; None: the true ones.
+        measures, delays_observation, delays_action: whether what drones know is not the truth, whether there is a delay
+            of observations, one of actions.
         enabled: whether there is any of these.
         applied: actions that reach the drones (E, N, A).
         action_size, observation_size: A, D.
     """
 
-    def __init__(self, ranges: RandomizationConfig, shape: tuple[int, int, int, int], attitude: bool):
-        e, n, a, d = shape
+    def __init__(self, config: Config, world: World, estimator: StateEstimator | None, sizes: tuple[int, int]):
+        ranges, level = config.randomization, config.env.sensing
+        e, n, (a, d) = world.num_envs, world.num_drones, sizes
         self.action_size, self.observation_size = a, d
         self.noise = STANDARD * ranges.observation_noise
         self.bias = STANDARD * ranges.observation_bias
         (_, slowest), (_, latest) = ranges.action_delay, ranges.observation_delay
-        self.has_noise = bool(self.noise.any() or self.bias.any())
+        has_noise = bool(self.noise.any() or self.bias.any())
+        if has_noise and estimator is not None:
+            raise ConfigError(
+                f"env.sensing={level} has noise of its own; set randomization.observation_noise and observation_bias "
+                "to none, or env.sensing=ideal"
+            )
         self.delays_observation, self.delays_action = latest > 0, slowest > 0
         acted, observed = (slowest + 1) * self.delays_action, (latest + 1) * self.delays_observation
         sent, seen, action_delay, observation_delay = (np.zeros(e, np.int64) for _ in range(4))
@@ -79,10 +92,21 @@ class Sensing:
             np.zeros(e, np.uint64), np.zeros((e, n + 1, 4, 3)), sent, seen, action_delay, observation_delay,
             np.zeros((e, acted, n, a)), np.zeros((e, observed, n, d), np.float32),
         )  # fmt: skip
-        self.state, self.errors = SystemState.zeros(e, n), Errors.zeros(e)
         self.applied = np.zeros((e, n, a))
-        self.enabled = self.has_noise or self.delays_observation or self.delays_action
-        self._attitude = attitude
+        self._true, self._estimator, self._attitude = world.state, estimator, config.system.payload_shape != "point"
+        self._load_sensing: LoadSensing | None = None
+        self.state = world.state
+        if estimator is not None:
+            dt, length = 1 / config.env.policy_hz, float(np.mean(world.system.cable_length))
+            self._load_sensing = LoadSensing(level, world.state, estimator.state, dt, length)
+            unknown: Any = dict.fromkeys(name for name in SystemState._fields if name.startswith("payload_"))
+            self.state = estimator.state._replace(**unknown)
+        elif has_noise:
+            self.state = SystemState.zeros(e, n)
+        self.load = self._load_sensing.load if self._load_sensing else true_load(self.state)
+        self.measures = has_noise or estimator is not None
+        self.errors = Errors.zeros(e, self.load.position.shape[1]) if self.measures else None
+        self.enabled = self.measures or self.delays_observation or self.delays_action
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:
         """Begin an episode of one environment: draw its biases, forget what was sent and seen."""
@@ -91,11 +115,23 @@ class Sensing:
         draw_bias(env, memory, self.bias)
         memory.sent[env] = memory.seen[env] = 0
         memory.actions[env] = 0.0
-        self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
+        if self.errors is not None:
+            self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
 
-    def bind_sense(self, view: View, dt: float) -> Call:
-        """Return the call of (lo, hi) that measures state and errors of environments, integrated over `dt` [s]."""
-        measure = prebind(sense, view.state, self.state, self.memory, self.noise, self._attitude)
+    def start_sensors(self, env: int) -> None:
+        """Let the sensors of an environment start from its team as it is; after `start`."""
+        if self._estimator is not None and self._load_sensing is not None:
+            own, load = np.random.SeedSequence(int(self.memory.generator[env])).spawn(2)
+            self._estimator.start(env, own)
+            self._load_sensing.start(env, load)
+
+    def bind_sense(self, view: View, first: bool = False) -> Call:
+        """Return the call of (lo, hi) that measures what drones know; `first` of an episode, not to be integrated."""
+        if self._load_sensing is not None:
+            measure = self._load_sensing.bind(view.planned, view.rig, view.resting_tension, first)
+        else:
+            measure = prebind(sense, view.state, self.state, self.memory, self.noise, self._attitude)
+        dt = 0.0 if first else view.dt
         update = prebind(update_seen_errors, reduce_view(view, update_seen_errors), dt)
 
         def call(lo: int, hi: int) -> None:
@@ -124,7 +160,12 @@ class Sensing:
         """Return the live arrays that outlive a step."""
         if not self.enabled:
             return {}
-        return self.memory._asdict() | {f"errors_{name}": array for name, array in self.errors._asdict().items()}
+        arrays = self.memory._asdict()
+        if self.errors is not None:
+            arrays |= {f"errors_{name}": array for name, array in self.errors._asdict().items()}
+        if self._estimator is not None and self._load_sensing is not None:
+            arrays |= self._estimator.arrays() | self._load_sensing.arrays()
+        return arrays
 
 
 @kernel
@@ -132,27 +173,13 @@ def draw_bias(e, memory, size):
     """Draw the biases of environment e, normal with standard deviations `size` (4,)."""
     for i in range(memory.bias.shape[1]):
         for kind in range(4):
-            put(memory.bias[e, i, kind], scale(size[kind], _normal(e, memory)))
-
-
-@kernel
-def _normal(e, memory):
-    """Return three independent standard normal numbers."""
-    (a, b), (c, _) = normal_pair(e, memory), normal_pair(e, memory)
-    return (a, b, c)
+            put(memory.bias[e, i, kind], scale(size[kind], normal_vector(e, memory)))
 
 
 @kernel
 def _off(e, i, kind, memory, noise):
     """Return how far a measurement is off: its bias and, drawn anew, its noise."""
-    return add(vec(memory.bias[e], i, kind), scale(noise[kind], _normal(e, memory)))
-
-
-@kernel
-def _turned(off, attitude):
-    """Return an attitude turned by a rotation vector in the world frame."""
-    angle = norm(off)
-    return matmul(axis_angle(scale(1.0 / angle, off), angle), attitude) if angle > 0.0 else attitude
+    return add(vec(memory.bias[e], i, kind), scale(noise[kind], normal_vector(e, memory)))
 
 
 @kernel
@@ -172,7 +199,7 @@ def sense(lo, hi, state, seen, memory, noise, attitude):
         for n in range(count):
             put(seen.drone_position[e, n], add(vec(state.drone_position, e, n), _off(e, n, 0, memory, noise)))
             put(seen.drone_velocity[e, n], add(vec(state.drone_velocity, e, n), _off(e, n, 1, memory, noise)))
-            turned = _turned(_off(e, n, 2, memory, noise), mat(state.drone_rotation, e, n))
+            turned = turn_by(_off(e, n, 2, memory, noise), mat(state.drone_rotation, e, n))
             putmat(seen.drone_rotation[e, n], turned)
             put(seen.drone_body_rates[e, n], add(vec(state.drone_body_rates, e, n), _off(e, n, 3, memory, noise)))
         put(seen.payload_position[e], add(row(state.payload_position, e), _off(e, count, 0, memory, noise)))
@@ -180,16 +207,17 @@ def sense(lo, hi, state, seen, memory, noise, attitude):
         putmat(seen.payload_rotation[e], matrow(state.payload_rotation, e))
         put(seen.payload_body_rates[e], row(state.payload_body_rates, e))
         if attitude:
-            turned = _turned(_off(e, count, 2, memory, noise), matrow(state.payload_rotation, e))
+            turned = turn_by(_off(e, count, 2, memory, noise), matrow(state.payload_rotation, e))
             putmat(seen.payload_rotation[e], turned)
             put(seen.payload_body_rates[e], add(row(state.payload_body_rates, e), _off(e, count, 3, memory, noise)))
 
 
 @kernel
 def update_seen_errors(lo, hi, v, dt):
-    """Update the errors of environments lo to hi as the drones measure them, integrated over `dt` [s]."""
+    """Update the errors of environments lo to hi as the drones know them, integrated over `dt` [s]."""
     for e in range(lo, hi):
-        update_errors(e, v.seen, v.seen_errors, v, dt)
+        for k in range(v.load.position.shape[1]):
+            update_errors(e, k, v.load, v.seen_errors, v, dt)
 
 
 @kernel

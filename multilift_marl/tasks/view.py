@@ -10,9 +10,10 @@ import numpy as np
 
 from multilift_marl._jit import inlined
 from multilift_marl.control.formation import Goal, Reference, Rig
-from multilift_marl.math3d import clip, matmul, matrow, norm, put, rotation_vector, row, sub, transpose
+from multilift_marl.math3d import clip, mat, matmul, matrow, norm, put, rotation_vector, row, sub, transpose, vec
 from multilift_marl.sim.state import HiddenLoads, SystemState
 from multilift_marl.tasks.failures import FailureMask, Limits
+from multilift_marl.tasks.load_sensing import Load
 from multilift_marl.tasks.starts import CableEquilibrium
 
 INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals: a full action's worth of the scripts
@@ -35,10 +36,14 @@ class Errors(NamedTuple):
     """(E, 3) ∫ rotation dt, in the same way [rad s]."""
 
     @classmethod
-    def zeros(cls, num_envs: int) -> Errors:
-        """Return zero errors."""
-        e = num_envs
-        return cls(*(np.zeros(shape) for shape in ((e, 3), (e, 3), (e,), (e,), (e, 3), (e, 3))))
+    def zeros(cls, num_envs: int, rows: int | None = None) -> Errors:
+        """Return zero errors; with `rows` those that drones know, (E, rows, ...), see `Load`."""
+        first = (num_envs,) if rows is None else (num_envs, rows)
+        return cls(*(np.zeros(first + rest) for rest in ((3,), (3,), (), (), (3,), (3,))))
+
+    def as_rows(self) -> Errors:
+        """Return the same live arrays with one row for all drones."""
+        return Errors(*(array[:, None] for array in self))
 
 
 class View(NamedTuple):
@@ -47,7 +52,12 @@ class View(NamedTuple):
     state: SystemState
     """True."""
     seen: SystemState
-    """As the drones measure it; `state` itself where nothing disturbs that."""
+    """As each drone knows its own; `state` itself where nothing disturbs that."""
+    load: Load
+    """The payload as the drones know it; see `load_row`."""
+    true_load: Load
+    true_errors: Errors
+    """`errors` with one row."""
     loads: HiddenLoads
     goal: Goal
     planned: Goal
@@ -55,7 +65,7 @@ class View(NamedTuple):
     has_plan: bool
     errors: Errors
     seen_errors: Errors
-    """From `seen`; `errors` itself where nothing disturbs that."""
+    """From `load`, a row for each of its; `true_errors` where nothing disturbs that."""
     reference: Reference
     rig: Rig
     nominal: CableEquilibrium
@@ -133,31 +143,39 @@ def _keep(record: Any, names: set[str]) -> Any:
 
 
 @inlined
-def update_errors(e, state, errors, v, dt):
-    """Update the errors of environment e and integrate them over `dt` [s].
+def load_row(n, v):
+    """Return the row of `load` and `seen_errors` that is drone n's."""
+    return min(n, v.load.position.shape[1] - 1)
+
+
+@inlined
+def update_errors(e, k, load, errors, v, dt):
+    """Update row k of the errors of environment e and integrate them over `dt` [s].
 
     Where the payload follows a plan, its distance from the planned pose is integrated: the distance from a goal still
     far away would only wind the integrals up.
 
     Args:
         e: the environment.
-        state: true or measured.
+        k: row of load and errors.
+        load: Load, true or as drones know it.
         errors: written.
         v: View.
         dt: since the last update [s].
     """
     goal, planned = v.goal, v.planned
-    put(errors.position[e], sub(row(state.payload_position, e), row(goal.position, e)))
-    turned = matmul(matrow(state.payload_rotation, e), transpose(matrow(goal.rotation, e)))
-    put(errors.rotation[e], rotation_vector(turned))
-    errors.distance[e] = norm(row(errors.position, e))
-    errors.angle[e] = norm(row(errors.rotation, e))
-    offset, rotation = row(errors.position, e), row(errors.rotation, e)
+    position, attitude = vec(load.position, e, k), mat(load.rotation, e, k)
+    put(errors.position[e, k], sub(position, row(goal.position, e)))
+    turned = matmul(attitude, transpose(matrow(goal.rotation, e)))
+    put(errors.rotation[e, k], rotation_vector(turned))
+    errors.distance[e, k] = norm(vec(errors.position, e, k))
+    errors.angle[e, k] = norm(vec(errors.rotation, e, k))
+    offset, rotation = vec(errors.position, e, k), vec(errors.rotation, e, k)
     if v.has_plan:
-        offset = sub(row(state.payload_position, e), row(planned.position, e))
-        rotation = rotation_vector(matmul(matrow(state.payload_rotation, e), transpose(matrow(planned.rotation, e))))
+        offset = sub(position, row(planned.position, e))
+        rotation = rotation_vector(matmul(attitude, transpose(matrow(planned.rotation, e))))
     for j in range(3):
-        moved = errors.position_integral[e, j] + dt * offset[j]
-        errors.position_integral[e, j] = clip(moved, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
-        moved = errors.rotation_integral[e, j] + dt * rotation[j]
-        errors.rotation_integral[e, j] = clip(moved, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+        moved = errors.position_integral[e, k, j] + dt * offset[j]
+        errors.position_integral[e, k, j] = clip(moved, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+        moved = errors.rotation_integral[e, k, j] + dt * rotation[j]
+        errors.rotation_integral[e, k, j] = clip(moved, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)

@@ -1,0 +1,316 @@
+"""What each drone knows of its own state: a filter with fixed gains over its IMU, positioning and magnetometer.
+
+The attitude follows the gyroscope, position and velocity the accelerometer turned by it. Positioning and magnetometer
+correct them as they arrive, late: an innovation is against what the filter said when the sample was taken. Gains are
+those of the steady Kalman filter of the errors about hovering (Solà, arXiv 1711.02508, chapter 5; Farrell, Aided
+Navigation, 2008): of each level axis position, velocity, tilt and gyroscope bias, of the vertical one position,
+velocity and accelerometer bias, of the heading angle and gyroscope bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl._jit import kernel, prebind
+from multilift_marl.math3d import (
+    add,
+    axis_angle,
+    mat,
+    matmul,
+    mul,
+    norm,
+    put,
+    putmat,
+    row,
+    scale,
+    sub,
+    tmul,
+    turn_by,
+    unit,
+    vec,
+)
+from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.sim.sensors import Sensor, Sensors, SensorSuite, white
+from multilift_marl.sim.state import SystemState
+from multilift_marl.sim.world import World
+
+Call = Callable[[int, int], None]  # of environments lo to hi
+
+# Process noise of the filter beside that of the IMU's white noise: what its linear model leaves out, at each sample.
+_MODEL_ACCELERATION = 0.1  # [m/s²] offsets in directions that turn with the drone
+_MODEL_RATE = 2e-3  # [rad/s]
+_BIAS_WALK = 2e-5  # [rad/s, m/s²] of the biases in a sample
+_CONVERGED = 1e-9  # relative change of the covariance from one correction to the next
+_MAX_CORRECTIONS = 20_000
+
+POSITION, MAGNETOMETER = 4, 2  # sensors, in the order of `sim.sensors.SIZES`
+
+
+class Filter(NamedTuple):
+    """What the filters of E x N drones remember."""
+
+    gyro_bias: np.ndarray
+    """(E, N, 3) body frame [rad/s]."""
+    lift_bias: np.ndarray
+    """(E, N) of the accelerometer along the vertical [m/s²]."""
+    past: np.ndarray
+    """(E, N, K, 6) position and velocity of the last K ticks, at their number modulo K."""
+
+
+class Gains(NamedTuple):
+    """Corrections for each unit of an innovation; the columns are those of position and velocity."""
+
+    level: np.ndarray
+    """(4, 2) of position, velocity, tilt, gyroscope bias."""
+    vertical: np.ndarray
+    """(3, 2) of position, velocity, accelerometer bias."""
+    heading: np.ndarray
+    """(2, 1) of heading, gyroscope bias, for an innovation of the heading."""
+
+
+def nearest_rate(rate: float, ticks_per_second: float) -> float:
+    """Return the rate [Hz] next to `rate` that is a whole part of that of ticks."""
+    return ticks_per_second / max(1, round(ticks_per_second / rate))
+
+
+def _make_suite(level: str, rate: float) -> SensorSuite:
+    """Return the sensors of a level of `env.sensing`, in ticks of `rate` [Hz]."""
+    usual = SensorSuite()
+    tick = 1 / rate
+    accelerometer = Sensor(rate, noise=white(70e-6 * GRAVITY, rate), offset=0.02, drift=0.006, drift_time=300)
+    gyroscope = Sensor(rate, noise=white(np.radians(2.8e-3), rate), offset=1e-3, drift=4e-5, drift_time=1000)
+    magnetometer, position, velocity = usual.magnetometer, usual.position, usual.velocity
+    if level == "mocap":
+        # Cameras: Vicon and OptiTrack state 0.2 to 0.5 mm; here 1 mm and 8 ms. Their heading, 0.2°, is that of a
+        # magnetometer this good; they measure no velocity.
+        cameras = nearest_rate(125.0, rate)
+        position = Sensor(cameras, delay=tick * round(0.008 / tick), noise=1e-3)
+        velocity = Sensor(cameras, delay=position.delay, noise=1.0)
+        magnetometer = Sensor(cameras, noise=0.075)
+    else:
+        fixes, delay = nearest_rate(position.rate, rate), tick * round(position.delay / tick)
+        position = Sensor(fixes, delay, position.noise, drift=position.drift, drift_time=position.drift_time)
+        velocity = Sensor(fixes, delay, velocity.noise)
+        magnetometer = Sensor(
+            nearest_rate(50.0, rate), 0.0, magnetometer.noise, magnetometer.offset, magnetometer.drift
+        )
+    barometer = Sensor(nearest_rate(50.0, rate))  # not used
+    return SensorSuite(accelerometer, gyroscope, magnetometer, barometer, position, velocity)
+
+
+class StateEstimator:
+    """The own states of the drones of E teams as their filters have them.
+
+    Args:
+        level: of `env.sensing`, not "ideal".
+        world: whose drones they are.
+        rate: of ticks, those of the controllers [Hz].
+
+    Attributes:
+        state: SystemState whose drones are the estimated ones; what is not estimated (rotors, tensions) is the true.
+    """
+
+    def __init__(self, level: str, world: World, rate: float):
+        true = world.state
+        e, n = world.num_envs, world.num_drones
+        suite = _make_suite(level, rate)
+        self._true, self._rate = true, rate
+        self._sensors = Sensors(suite, true, 1 / rate)
+        names = ("drone_position", "drone_velocity", "drone_rotation", "drone_body_rates")
+        self.state: SystemState = true._replace(**{name: getattr(true, name).copy() for name in names})
+        delay = round(suite.position.delay * rate)
+        self._filter = Filter(np.zeros((e, n, 3)), np.zeros((e, n)), np.zeros((e, n, delay + 1, 6)))
+        field = self._sensors.magnetic_reference
+        self._gains = make_gains(suite, float(np.hypot(*field[:2])))
+        arguments = (self._sensors.readings, self._sensors.channels, self.state, self._filter, self._gains)
+        self.read = self._sensors.bind()
+        self.estimate = prebind(estimate, *arguments)
+
+    def start(self, env: int, seed: np.random.SeedSequence) -> None:
+        """Begin an episode with the drones where they are: sensors and filters start anew."""
+        self._sensors.reset(env, seed)
+        start_filter(env, self._true, self._sensors.readings, self.state, self._filter)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the live arrays that outlive a step."""
+        names = ("drone_position", "drone_velocity", "drone_rotation", "drone_body_rates")
+        arrays = {f"filter_{name}": array for name, array in self._filter._asdict().items()}
+        arrays |= {f"readings_{name}": array for name, array in self._sensors.readings._asdict().items()}
+        return arrays | {f"estimated_{name}": getattr(self.state, name) for name in names}
+
+
+def make_gains(suite: SensorSuite, level_field: float) -> Gains:
+    """Return the gains of the filter for the sensors of a suite.
+
+    Args:
+        suite: sensors; position and velocity have the same rate and delay.
+        level_field: level part of the magnetic field [µT].
+    """
+    dt = 1 / suite.gyroscope.rate
+    push = np.hypot(np.max(suite.accelerometer.noise), _MODEL_ACCELERATION)
+    turn = np.hypot(np.max(suite.gyroscope.noise), _MODEL_RATE)
+    noise = np.array([np.max(suite.position.noise), np.max(suite.velocity.noise)])
+
+    # A level axis: x' = v, v' = g tilt, tilt' = -bias.
+    a = np.eye(4)
+    a[0, 1], a[1, 2], a[2, 3] = dt, GRAVITY * dt, -dt
+    q = np.diag([0.0, push * dt, turn * dt, _BIAS_WALK]) ** 2
+    both = np.eye(2, 4)
+    level = steady_gain(a, q, both, noise, round(suite.gyroscope.rate / suite.position.rate))
+
+    # The vertical: z' = w, w' = -bias.
+    a = np.eye(3)
+    a[0, 1], a[1, 2] = dt, -dt
+    q = np.diag([0.0, push * dt, _BIAS_WALK * GRAVITY]) ** 2
+    vertical = steady_gain(a, q, np.eye(2, 3), noise, round(suite.gyroscope.rate / suite.position.rate))
+
+    # The heading: angle' = -bias.
+    a = np.array([[1.0, -dt], [0.0, 1.0]])
+    q = np.diag([turn * dt, _BIAS_WALK]) ** 2
+    angle = np.array([np.max(suite.magnetometer.noise) / level_field])
+    steps = round(suite.gyroscope.rate / suite.magnetometer.rate)
+    heading = steady_gain(a, q, np.eye(1, 2), angle, steps)
+    return Gains(level, vertical, heading)
+
+
+def steady_gain(a: np.ndarray, q: np.ndarray, c: np.ndarray, noise: np.ndarray, steps: int) -> np.ndarray:
+    """Return the steady gain (X, Y) of the Kalman filter that predicts `steps` times between corrections.
+
+    Args:
+        a: (X, X) transition of a step.
+        q: (X, X) covariance that it adds.
+        c: (Y, X) what is measured.
+        noise: (Y,) standard deviations of that.
+        steps: from one correction to the next.
+    """
+    through, added = np.eye(len(a)), np.zeros_like(q)
+    for _ in range(steps):
+        through, added = a @ through, a @ added @ a.T + q
+    r = np.diag(noise**2)
+    covariance = added + np.eye(len(a)) * 1e-4
+    for _ in range(_MAX_CORRECTIONS):
+        gain = covariance @ c.T @ np.linalg.inv(c @ covariance @ c.T + r)
+        rest = np.eye(len(a)) - gain @ c
+        corrected = rest @ covariance @ rest.T + gain @ r @ gain.T  # Joseph's form stays positive
+        after = through @ corrected @ through.T + added
+        change = np.abs(after - covariance).max()
+        covariance = after
+        if change <= _CONVERGED * np.abs(after).max():
+            break
+    return np.asarray(covariance @ c.T @ np.linalg.inv(c @ covariance @ c.T + r))
+
+
+@kernel
+def start_filter(e, true, readings, state, filter):
+    """Let the filters of environment e begin: at the first fix, elsewhere at the truth, biases at zero."""
+    for n in range(filter.lift_bias.shape[1]):
+        fix = readings.values[e, n, 10:13]
+        put(state.drone_position[e, n], (fix[0], fix[1], fix[2]))
+        put(state.drone_velocity[e, n], vec(true.drone_velocity, e, n))
+        putmat(state.drone_rotation[e, n], mat(true.drone_rotation, e, n))
+        put(state.drone_body_rates[e, n], vec(true.drone_body_rates, e, n))
+        put(filter.gyro_bias[e, n], (0.0, 0.0, 0.0))
+        filter.lift_bias[e, n] = 0.0
+        for k in range(filter.past.shape[2]):
+            put(filter.past[e, n, k, 0:3], vec(state.drone_position, e, n))
+            put(filter.past[e, n, k, 3:6], vec(state.drone_velocity, e, n))
+
+
+@kernel
+def estimate(lo, hi, readings, channels, state, filter, gains):
+    """Move the filters of environments lo to hi on by the tick that the sensors have just measured.
+
+    Args:
+        lo, hi: the environments.
+        readings, channels: of the sensors.
+        state: SystemState, drones are written.
+        filter: Filter, written.
+        gains: Gains.
+    """
+    for e in range(lo, hi):
+        for n in range(filter.lift_bias.shape[1]):
+            _predict(e, n, readings, channels, state, filter)
+            if readings.fresh[e, POSITION]:
+                _correct_motion(e, n, readings, channels, state, filter, gains)
+            if readings.fresh[e, MAGNETOMETER]:
+                _correct_heading(e, n, readings, channels, state, filter, gains)
+
+
+@kernel
+def _predict(e, n, readings, channels, state, filter):
+    """Follow gyroscope and accelerometer for one tick."""
+    dt, values = channels.dt, readings.values[e, n]
+    rates = sub((values[3], values[4], values[5]), vec(filter.gyro_bias, e, n))
+    speed = norm(rates)
+    axis = unit(rates) if speed > 0.0 else (1.0, 0.0, 0.0)
+    before = mat(state.drone_rotation, e, n)
+
+    # Specific force is a mean over the tick: it is turned by the attitude in its middle.
+    middle = matmul(before, axis_angle(axis, 0.5 * dt * speed))
+    force = mul(middle, (values[0], values[1], values[2]))
+    acceleration = sub(force, (0.0, 0.0, GRAVITY + filter.lift_bias[e, n]))
+    velocity = vec(state.drone_velocity, e, n)
+    moved = add(scale(dt, velocity), scale(0.5 * dt * dt, acceleration))
+    put(state.drone_position[e, n], add(vec(state.drone_position, e, n), moved))
+    put(state.drone_velocity[e, n], add(velocity, scale(dt, acceleration)))
+    putmat(state.drone_rotation[e, n], matmul(before, axis_angle(axis, dt * speed)))
+    put(state.drone_body_rates[e, n], rates)
+
+    past = filter.past[e, n, readings.tick[e] % filter.past.shape[2]]
+    put(past[0:3], vec(state.drone_position, e, n))
+    put(past[3:6], vec(state.drone_velocity, e, n))
+
+
+@kernel
+def _correct_motion(e, n, readings, channels, state, filter, gains):
+    """Correct position, velocity, tilt and biases by a fix, against what the filter said when it was taken."""
+    then = filter.past[e, n, (readings.tick[e] - channels.delay[POSITION]) % filter.past.shape[2]]
+    values = readings.values[e, n]
+    off = (values[10] - then[0], values[11] - then[1], values[12] - then[2])
+    fast = (values[13] - then[3], values[14] - then[4], values[15] - then[5])
+    k, z = gains.level, gains.vertical
+    moved = (
+        k[0, 0] * off[0] + k[0, 1] * fast[0],
+        k[0, 0] * off[1] + k[0, 1] * fast[1],
+        z[0, 0] * off[2] + z[0, 1] * fast[2],
+    )
+    pushed = (
+        k[1, 0] * off[0] + k[1, 1] * fast[0],
+        k[1, 0] * off[1] + k[1, 1] * fast[1],
+        z[1, 0] * off[2] + z[1, 1] * fast[2],
+    )
+    put(state.drone_position[e, n], add(vec(state.drone_position, e, n), moved))
+    put(state.drone_velocity[e, n], add(vec(state.drone_velocity, e, n), pushed))
+    for j in range(filter.past.shape[2]):  # so that what is still on its way is compared with the corrected past
+        past = filter.past[e, n, j]
+        put(past[0:3], add((past[0], past[1], past[2]), moved))
+        put(past[3:6], add((past[3], past[4], past[5]), pushed))
+    filter.lift_bias[e, n] += z[2, 0] * off[2] + z[2, 1] * fast[2]
+
+    # A tilt θ gives the acceleration θ × g e3 = g (θy, -θx, 0): x tells θy, y tells -θx.
+    along = (k[2, 0] * off[0] + k[2, 1] * fast[0], k[2, 0] * off[1] + k[2, 1] * fast[1])
+    bias = (k[3, 0] * off[0] + k[3, 1] * fast[0], k[3, 0] * off[1] + k[3, 1] * fast[1])
+    _turn(e, n, (-along[1], along[0], 0.0), (-bias[1], bias[0], 0.0), state, filter)
+
+
+@kernel
+def _correct_heading(e, n, readings, channels, state, filter, gains):
+    """Correct the heading by the magnetic field: how far it is from where the attitude has it, about the vertical."""
+    values = readings.values[e, n]
+    seen = mul(mat(state.drone_rotation, e, n), (values[6], values[7], values[8]))
+    north = row(channels.magnetic_field, 0)
+    cross = seen[0] * north[1] - seen[1] * north[0]
+    angle = np.arctan2(cross, seen[0] * north[0] + seen[1] * north[1])
+    k = gains.heading
+    _turn(e, n, (0.0, 0.0, k[0, 0] * angle), (0.0, 0.0, k[1, 0] * angle), state, filter)
+
+
+@kernel
+def _turn(e, n, rotation, bias, state, filter):
+    """Turn the attitude by a rotation vector and change the gyroscope's bias, both in the world frame."""
+    attitude = mat(state.drone_rotation, e, n)
+    put(filter.gyro_bias[e, n], add(vec(filter.gyro_bias, e, n), tmul(attitude, bias)))
+    putmat(state.drone_rotation[e, n], turn_by(rotation, attitude))

@@ -1,0 +1,135 @@
+"""Scripts that hold slots by interfaces below references: velocity, acceleration, its tilt rates, thrust and rates.
+
+All are one linear law, the acceleration of each drone as a map of its observation; an interface that commands another
+quantity is given what leads to this acceleration. So each is a map of the observation, too, and a learned policy can
+start from it (`train.residual`). Gains can be searched (`results/search_gains.py`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from multilift_marl.control.scripted_formation import PLANNED, Formation
+from multilift_marl.rig.vehicles import GRAVITY
+
+if TYPE_CHECKING:
+    from multilift_marl.envs.core import MultiliftVec
+
+TILT_GAIN = 8.0  # [1/s] of a tilt from the desired one: of `ctbr`, whose rate loops are faster
+YAW_GAIN = 2.0  # [1/s] of the heading
+STIFFNESS, DAMPING = 16.0, 8.0  # [1/s²], [1/s] of a drone about its slot, as those of the controller by default
+INTEGRAL = 8.0  # [1/s³] of the payload's error: as a slot that moves by 0.5/s
+
+
+class HoldAcceleration(Formation):
+    """Every drone is drawn to its slot, and against the integral of the payload's error.
+
+    Class attributes:
+        GAINS: what is observed, its axis in the slot frame, the axis of the acceleration, m/s² for each unit.
+    """
+
+    INTERFACE: ClassVar[str] = "acceleration"
+    GAINS: ClassVar[tuple[tuple[str, int, int, float], ...]] = tuple(
+        (name, axis, axis, -gain)
+        for name, gain in (("slot_error", STIFFNESS), ("velocity", DAMPING), ("payload_error_integral", INTEGRAL))
+        for axis in range(3)
+    )
+    REFUSAL = ""
+
+    def __init__(self, vec: MultiliftVec):
+        self._vec = vec
+        super().__init__(vec)
+
+    def law(self) -> np.ndarray:
+        """Return L (3, D) with which the acceleration [m/s²] is L times the observation."""
+        law = np.zeros((3, len(self._names)), np.float32)
+        for name, axis, moved, gain in self.GAINS:
+            law[moved, self._column(name, axis)] += gain
+            for planned in (*PLANNED.get(name, ()), *(("target_velocity",) if name == "velocity" else ())):
+                if f"{planned}_{axis}" in self._names:
+                    law[moved, self._column(planned, axis)] -= gain
+        return law
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        control = self._vec.config.control
+        matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
+        matrix[:3] = self.law() / control.max_acceleration
+        matrix[3] = self._turn_back() / control.max_yaw_rate
+        return matrix
+
+    def _column(self, name: str, axis: int) -> int:
+        return self._names.index(f"{name}_{axis}")
+
+    def _turn_back(self) -> np.ndarray:
+        """Return the map (D,) of the observation to the yaw rate that turns a drone to the target's heading [rad/s]."""
+        row = np.zeros(len(self._names), np.float32)
+        row[self._column("heading", 1)] = -YAW_GAIN
+        return row
+
+
+class HoldVelocity(HoldAcceleration):
+    """The same law by velocities: those whose error, times the law's damping, is its acceleration."""
+
+    INTERFACE = "velocity"
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        control, law = self._vec.config.control, self.law()
+        matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
+        for axis in range(3):
+            column = self._column("velocity", axis)
+            damping = max(-law[axis, column], 1e-3)
+            law[axis, column] = 0.0
+            matrix[axis] = law[axis] / damping / control.max_velocity
+        matrix[3] = self._turn_back() / control.max_yaw_rate
+        return matrix
+
+
+class HoldAccRates(HoldAcceleration):
+    """The same law, with the tilt rates that follow from it while the drone moves at its velocity."""
+
+    INTERFACE = "acc_rates"
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        control, law = self._vec.config.control, self.law()
+        matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
+        matrix[:3] = law / control.max_acceleration
+
+        # The slot error changes by the velocity, and the tilt by jerk / g: outward about the sideways axis.
+        for axis, rate, sign in ((0, 4, 1.0), (1, 3, -1.0)):
+            stiffness = law[axis, self._column("slot_error", axis)]
+            matrix[rate, self._column("velocity", axis)] = sign * stiffness / GRAVITY / control.max_tilt_rate
+        return matrix
+
+
+class HoldCtbr(HoldAcceleration):
+    """The same law by thrust and body rates: tilts lead to level accelerations, thrust to the vertical one."""
+
+    INTERFACE = "ctbr"
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        control, system, law = self._vec.config.control, self._vec.world.system, self.law()
+        matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
+        gains = self._vec.controller.gains
+        mass = float(np.mean(gains.mass + gains.load_share))
+        force = system.hook_force[0] + np.array([0.0, 0.0, float(gains.mass[0]) * GRAVITY])  # at rest
+        hover = float(np.linalg.norm(force))
+
+        # More or less thrust than at rest; equal shares of the range above, which is the smaller one.
+        matrix[0] = law[2] * mass / (4 * float(np.min(gains.thrust_max)) - hover)
+
+        # A tilt from that at rest gives g times as much acceleration of drone and load.
+        lean = float(np.hypot(*force[:2])) / hover
+        for axis, rate, sign in ((0, 2, 1.0), (1, 1, -1.0)):
+            wanted = law[axis] * mass / hover
+            wanted[self._column("thrust_axis", axis)] -= 1.0
+            if axis == 0:
+                wanted[self._column("heading", 0)] += lean
+            matrix[rate] = sign * TILT_GAIN * wanted / control.max_tilt_rate
+        matrix[3] = self._turn_back() / control.max_yaw_rate
+        return matrix

@@ -1,0 +1,97 @@
+"""Scripts that hold slots by interfaces below references: one law, whatever they command."""
+
+import numpy as np
+import pytest
+from conftest import make, refusal
+
+import multilift_marl as ml
+from multilift_marl.control.scripted import LINEAR, fitting_scripts, make_scripted, residual_matrix
+from multilift_marl.control.scripted_hold import DAMPING, STIFFNESS
+
+HOLDING = {script.INTERFACE: name for name, script in LINEAR.items() if name.startswith("hold_")}
+
+
+def make_holding(action, **settings):
+    vec = make(**{"num_envs": 24, "control.action": action, **settings})
+    return vec, make_scripted(HOLDING[action], vec)
+
+
+@pytest.mark.parametrize("action", HOLDING)
+def test_they_hold_the_payload_at_its_target(action):
+    vec, script = make_holding(action)
+    seen, _ = vec.reset(seed=1)
+    for _ in range(vec.max_steps):
+        seen, _, terminated, _, info = vec.step(script.act(seen))
+        assert not terminated.any()
+    assert info["success"].all()
+    assert vec.task.errors.distance.mean() < 0.01
+
+
+@pytest.mark.parametrize("action", ["velocity", "acceleration", "acc_rates", "ctbr"])
+def test_a_drone_off_its_slot_begins_to_move_by_the_law(action):
+    vec, script = make_holding(action, **{"num_envs": 1, "env.sensing": "ideal", "randomization.payload_force": 0.0})
+    vec.reset(seed=1)
+    seen = np.zeros((1, 4, vec.observation_size), np.float32)
+    names = vec.observation_names
+    seen[..., names.index("heading_0")] = 1.0  # at rest but for 5 cm outward
+    seen[..., names.index("slot_error_0")] = 0.05
+    if action == "ctbr":  # at rest drones lean outward, against their cables
+        force = vec.world.system.hook_force[0] + np.array([0.0, 0.0, vec.world.system.vehicle.mass * 9.81])
+        lean = np.hypot(*force[:2]) / np.linalg.norm(force)
+        seen[..., names.index("thrust_axis_0")] = lean
+    action_taken = script.act(seen)[0, 0]
+    moving = {"velocity": 0, "acceleration": 0, "acc_rates": 0, "ctbr": 2}[action]
+    assert action_taken[moving] < -0.05  # inward, or its tilt that way
+    rest = np.delete(action_taken, moving)
+    assert np.abs(rest).max() < 1e-4
+    if action == "acceleration":
+        assert action_taken[0] * vec.config.control.max_acceleration == pytest.approx(-STIFFNESS * 0.05, rel=1e-5)
+    if action == "velocity":
+        expected = -STIFFNESS / DAMPING * 0.05
+        assert action_taken[0] * vec.config.control.max_velocity == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("action", HOLDING)
+def test_a_turned_drone_turns_back(action):
+    if action == "acc_rates":  # its yaw is the target's
+        return
+    vec, script = make_holding(action, num_envs=1)
+    seen = np.zeros((1, 4, vec.observation_size), np.float32)
+    seen[..., vec.observation_names.index("heading_0")] = np.cos(0.3)
+    seen[..., vec.observation_names.index("heading_1")] = np.sin(0.3)
+    assert (script.act(seen)[..., -1] < 0).all()
+
+
+def test_each_fits_its_interface_alone():
+    for action, name in HOLDING.items():
+        assert fitting_scripts(make(num_envs=1, **{"control.action": action})) == [name]
+    assert not set(fitting_scripts(make(num_envs=1))) & set(HOLDING.values())
+    assert fitting_scripts(make(num_envs=1, **{"control.action": "rotor"})) == []
+    vec = make(num_envs=1, **{"control.action": "ctbr"})
+    assert "take hold_ctbr" in refusal(make_scripted, "formation_integral", vec)
+
+
+OWN = """
+from multilift_marl.control.scripted_hold import HoldAcceleration
+
+class Mine(HoldAcceleration):
+    GAINS = (("slot_error", 0, 0, -3.0),)
+
+class Wrong:
+    def __init__(self, vec): pass
+    def act(self, observation): return observation
+    def reset(self, mask=None): pass
+"""
+
+
+def test_ones_own_script_can_be_corrected(tmp_path):
+    (tmp_path / "mine.py").write_text(OWN, encoding="utf-8")
+    name = f"{tmp_path / 'mine.py'}:Mine"
+    config = ml.load_config("hover", {"control.action": "acceleration", "train.residual": name, "env.num_envs": 1})
+    vec = ml.make_vec(config)
+    matrix = residual_matrix(config.train.residual, vec)
+    assert matrix.shape == (4, vec.observation_size) and matrix.dtype == np.float32
+    assert matrix[0, vec.observation_names.index("slot_error_0")] == pytest.approx(-1.0)  # of 3 m/s²
+    wrong = f"{tmp_path / 'mine.py'}:Wrong"
+    assert "needs a method matrix()" in refusal(residual_matrix, wrong, vec)
+    assert "must be formation" in refusal(ml.load_config, "hover", {"train.residual": "hold_everything"})
