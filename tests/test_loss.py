@@ -137,3 +137,33 @@ def test_one_drone_cannot_lose_itself():
         message = refusal(make, task, **{"task_options.target_height": (2.0, 1.5)})
         assert "task_options.target_height" in message and "must list the lower one first" in message
     assert "must list the earlier one first" in refusal(make, "loss", **{"task_options.loss_time": (4.0, 2.0)})
+
+
+def test_nobody_is_told_of_a_loss_and_all_notice_it():
+    vec = make("loss", num_envs=48)
+    assert not vec.task.options.broadcast
+    observation, _ = vec.reset(seed=0)
+    script, own = make_scripted("formation_redistributed", vec), vec.task.own
+    at = [i for i, name in enumerate(vec.observation_names) if name.startswith(("team_lost", "planned_offset"))]
+    for step in range(1, 230):
+        observation, _, terminated, _, _ = vec.step(script.act(observation))
+        before = 0.02 * step < own.when
+        assert not own.known[before].any() and (observation[before][..., at] == 0).all()  # no false alarm
+        if terminated.any():
+            vec.reset(mask=terminated)
+    aware = own.known.any(axis=1) & vec.task.mask.lost.any(axis=1)
+    assert aware.mean() > 0.9
+    assert (own.known_who[aware] == own.who[aware, None]).all()  # all of them know who it is
+    late = own.known_when[aware] - own.when[aware, None]
+    assert 0.1 < late.min() and late.max() < 0.3
+
+
+def test_where_it_is_broadcast_a_loss_is_known_at_once():
+    vec = make("loss_6", num_envs=16)
+    assert vec.task.options.broadcast
+    fly = make_scripted("formation_redistributed", vec)
+    observation, _ = vec.reset(seed=0)
+    for _ in range(210):
+        observation, *_ = vec.step(fly.act(observation))
+        assert (vec.task.own.known == vec.task.mask.lost.any(axis=1)[:, None]).all()
+    assert (vec.task.own.known_when == vec.task.own.when[:, None]).all()

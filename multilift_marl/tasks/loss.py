@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from math import cos, sin
-from typing import ClassVar, NamedTuple
+from math import cos, hypot, radians, sin
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import inlined
-from multilift_marl.config.values import Float, Section
+from multilift_marl.config.values import Between, Float, Section
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.redistribution import RAMP, WAIT, plan_offset, redistributed_slots
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import scale
+from multilift_marl.math3d import add, mat, mul, scale, vec
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.rewards import (
@@ -26,6 +26,9 @@ from multilift_marl.tasks.rewards import (
     update_peak_tension,
 )
 from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
+from multilift_marl.tasks.view import load_row
+
+LEAD = 0.1  # [s] by which a tilt is foreseen: 4 drones notice a loss 0.13 s after it, 6 after 0.17 s
 
 
 class LossOptions(StartOptions):
@@ -33,6 +36,12 @@ class LossOptions(StartOptions):
 
     loss_time: tuple[Float, Float] = Field((2.0, 4.0), description="[s] earliest and latest stop of the motors")
     snap: bool = Field(False, description="whether the lost drone's cable breaks, so that it is gone")
+    broadcast: bool = Field(
+        True, description="whether all drones are told at once who is lost; else they tell by how the payload tilts"
+    )
+    noticed_angle: Annotated[Float, Between(1, 90, "deg")] = Field(
+        25.0, description="[deg] tilt at which drones that are not told notice a loss"
+    )
     success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of its target ...")
     success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, as level as can be held ...")
     success_speed: Float = Field(0.2, gt=0, description="[m/s] ... no faster than this ...")
@@ -54,6 +63,12 @@ class LossArrays(NamedTuple):
     """(E,) number of the drone, int64."""
     peak_tension: np.ndarray
     """(E,) largest tension in the episode over that at rest [-]."""
+    known: np.ndarray
+    """(E, N) bool, drones that know of the loss."""
+    known_who: np.ndarray
+    """(E, N) whom they take for lost, int64."""
+    known_when: np.ndarray
+    """(E, N) since when they know [s]."""
 
 
 class LossSettings(NamedTuple):
@@ -62,6 +77,9 @@ class LossSettings(NamedTuple):
     bounds: RestBounds
     snap: bool
     """Whether the lost drone's cable breaks."""
+    broadcast: bool
+    noticed_angle: float
+    """[rad]"""
     offsets: np.ndarray
     """(N lost, N, 3) by how much slots are to move after a loss, see `redistributed_slots` [m]."""
 
@@ -79,6 +97,39 @@ def stop_motors(e, v):
 
 
 @inlined
+def coming_tilt(e, n, v):
+    """Return the level part of the rotation vector to which the payload turns in `LEAD` as drone n knows it [rad]."""
+    k = load_row(n, v)
+    spin = mul(mat(v.load.rotation, e, k), vec(v.load.body_rates, e, k))
+    return add(vec(v.seen_errors.rotation, e, k), scale(LEAD, spin))[:2]
+
+
+@inlined
+def lowest_corner(e, tilt, v):
+    """Return the drone whose corner of the payload sinks most by a tilt."""
+    lowest, who = 1e9, 0
+    for k in range(v.rig.azimuth.shape[0]):
+        azimuth = v.goal.yaw[e] + v.rig.azimuth[k]
+        height = tilt[0] * sin(azimuth) - tilt[1] * cos(azimuth)  # of tilt x corner
+        if height < lowest:
+            lowest, who = height, k
+    return who
+
+
+@inlined
+def notice_loss(e, v):
+    """Let drones know of a loss: when it is broadcast, or when the payload tilts as it does then."""
+    lost = v.mask.lost[e, v.own.who[e]]
+    for n in range(v.own.known.shape[1]):
+        tilt = coming_tilt(e, n, v)
+        noticed = hypot(tilt[0], tilt[1]) > v.settings.noticed_angle
+        if not v.own.known[e, n] and (lost if v.settings.broadcast else noticed):
+            v.own.known[e, n] = True
+            v.own.known_who[e, n] = v.own.who[e] if v.settings.broadcast else lowest_corner(e, tilt, v)
+            v.own.known_when[e, n] = v.own.when[e] if v.settings.broadcast else v.time[e]
+
+
+@inlined
 def lost(e, n, v):
     """1 if the own motors have stopped."""
     return 1.0 if v.mask.lost[e, n] else 0.0
@@ -91,19 +142,25 @@ def team_lost(e, n, v):
 
 
 @inlined
+def knows_loss(e, n, v):
+    """1 if one knows of a loss."""
+    return 1.0 if v.own.known[e, n] else 0.0
+
+
+@inlined
 def lost_direction(e, n, v):
     """Cosine and sine of the lost drone's azimuth from the own one; 0 before."""
-    angle, any_lost = v.rig.azimuth[v.own.who[e]] - v.rig.azimuth[n], team_lost(e, n, v)
-    return any_lost * cos(angle), any_lost * sin(angle)
+    angle, known = v.rig.azimuth[v.own.known_who[e, n]] - v.rig.azimuth[n], knows_loss(e, n, v)
+    return known * cos(angle), known * sin(angle)
 
 
 @inlined
 def planned_offset(e, n, v):
     """By how much the own slot is to move after a loss, in its frame."""
-    who, seconds = v.own.who[e], v.time[e] - v.own.when[e]
+    who, seconds = v.own.known_who[e, n], v.time[e] - v.own.known_when[e, n]
     cosine = cos(v.rig.azimuth[who] - v.rig.azimuth[n])
     offset = plan_offset(seconds, v.settings.offsets[who, n], cosine, not v.settings.snap)
-    return scale(team_lost(e, n, v), offset)
+    return scale(knows_loss(e, n, v), offset)
 
 
 @inlined
@@ -133,10 +190,10 @@ class Loss(Task):
         "stillness": Term(0.15, stillness, (0.2, 0.3), "m/s, rad/s"),
         "action_rate": Term(-0.05, action_rate),
     }
-    KERNELS: ClassVar[Kernels] = Kernels(plan=stop_motors)
+    KERNELS: ClassVar[Kernels] = Kernels(plan=stop_motors, update=notice_loss)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("lost", 1, "-", "-", "1 if the own motors have stopped", lost),
-        Component("team_lost", 1, "-", "-", "1 if those of any drone have", team_lost),
+        Component("team_lost", 1, "-", "-", "1 if those of any drone have, as one knows", knows_loss),
         Component(
             "lost_direction", 2, "slot", "-", "cosine and sine of its azimuth from the own one; 0 before",
             lost_direction,
@@ -161,17 +218,22 @@ class Loss(Task):
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
         self._ranges = make_ranges(option)
         world.breakable = world.breakable or option.snap
-        e, gains = world.num_envs, make_gains(control, world.system)
+        e, n, gains = world.num_envs, world.num_drones, make_gains(control, world.system)
         offsets = redistributed_slots(world.system, gains, not option.snap, control.max_offset)
-        self.own = LossArrays(np.zeros(e), np.zeros(e, np.int64), np.zeros(e))
-        self.settings = LossSettings(RestBounds.of(option), option.snap, offsets)
+        self.own = LossArrays(
+            np.zeros(e), np.zeros(e, np.int64), np.zeros(e), np.zeros((e, n), bool), np.zeros((e, n), np.int64),
+            np.zeros((e, n)),
+        )  # fmt: skip
+        self.settings = LossSettings(
+            RestBounds.of(option), option.snap, option.broadcast, radians(option.noticed_angle), offsets
+        )
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, start, drone and time; see `Task.start`."""
         start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.hanging)
         self.own.who[env] = rng.integers(self.world.num_drones)
         self.own.when[env] = rng.uniform(*self.options.loss_time)
-        self.mask.lost[env], self.own.peak_tension[env] = False, 0.0
+        self.mask.lost[env], self.own.peak_tension[env], self.own.known[env] = False, 0.0, False
 
     def succeeded(self) -> np.ndarray:
         """At rest throughout the last seconds, with a drone less, and never too large a tension."""
