@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from flights import EPISODES, FLIGHTS, HERE, ROOT, SCRIPTED, SEED, error_metric
+from searched import SEARCHED
 from tables import write_tables
 
 from multilift_marl._files import write_whole
@@ -109,6 +110,7 @@ def list_jobs(flight: str, only: str = "") -> list[Job]:
     config = load_config(FLIGHTS[flight].config, FLIGHTS[flight].overrides)
     scripts = fitting_scripts(MultiliftVec(build_config(config.model_dump(), SCRIPTED | {"env.num_envs": 1})))
     weights = sorted((HERE / FLIGHTS[flight].recipe).glob("seed*/policy.pt"))
+    scripts += ["searched"] if flight in SEARCHED else []
     jobs = [*(Job(flight, name, "") for name in scripts), *(Job(flight, w.parent.name, str(w)) for w in weights)]
     return [job for job in jobs if only in ("", job.team)]
 
@@ -123,6 +125,8 @@ def fly(job: Job) -> str:
     flight = FLIGHTS[job.flight]
     overrides = flight.overrides | {"env.num_threads": 1}
     maker: Callable[[MultiliftVec], Any] = partial(make_scripted, job.team)
+    if job.team == "searched":
+        maker = SEARCHED[job.flight]
     if job.weights:
         policy = load_policy(job.weights)
         scales = {f"control.{key}": getattr(policy.config.control, key) for key in ("max_offset", "max_yaw")}
@@ -130,7 +134,8 @@ def fly(job: Job) -> str:
         maker = policy.bind
         overrides = overrides | scales
     else:
-        overrides = overrides | SCRIPTED
+        action = SEARCHED[job.flight].INTERFACE if job.team == "searched" else "reference"
+        overrides = overrides | {"control.action": action}
     results = fly_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
     metrics = summarize(results)
     error = results[error_metric(flight)]

@@ -14,6 +14,8 @@ from flights import FLIGHTS, HERE, ROOT, error_metric
 from multilift_marl.control.scripted import SCRIPTED
 from multilift_marl.evaluation.metrics import bootstrap, is_gain
 
+TEAMS = (*(name for name, script in SCRIPTED.items() if script.INTERFACE == "reference"), "searched")
+"""Scripts of the tables: those that move slots, and the best one of a search for a flight (searched.py)."""
 _DETAILS = (  # of each team: metric, title, factor, digits
     ("success_rate", "success [%]", 100, 1),
     ("payload_position_error_m", "position error [cm]", 100, 2),
@@ -29,9 +31,9 @@ def table() -> str:
     """Return all flights and all teams as a Markdown table: success and error, of learned ones the mean of seeds."""
     rows = []
     for name, flight in FLIGHTS.items():
-        scripts = [_cell([HERE / name / f"{script}.json"], error_metric(flight)) for script in SCRIPTED]
+        scripts = [_cell([HERE / name / f"{script}.json"], error_metric(flight)) for script in TEAMS]
         rows.append([flight.title, *_learned(name), gain(name), *scripts, flight.published])
-    return _markdown(["learned", "training seeds", "learned - best script", *SCRIPTED, "published"], rows)
+    return _markdown(["learned", "training seeds", "learned - best script", *TEAMS, "published"], rows)
 
 
 def summary() -> str:
@@ -64,7 +66,7 @@ def _markdown(columns: list[str], rows: list[list[str]]) -> str:
 
 def best_script(flight: str) -> str:
     """Return the script with the most successes, of several the one with the least error; "" if none was evaluated."""
-    scripts = {name: np.load(path) for name in SCRIPTED if (path := HERE / flight / f"{name}.npz").is_file()}
+    scripts = {name: np.load(path) for name in TEAMS if (path := HERE / flight / f"{name}.npz").is_file()}
     return min(scripts, default="", key=lambda name: (-scripts[name]["success"].mean(), scripts[name]["error"].mean()))
 
 
@@ -107,7 +109,7 @@ def details(flights: Sequence[str]) -> str:
     """Return the metrics of every team of some flights as a Markdown table: means and 95 % intervals over episodes."""
     rows = []
     for flight in flights:
-        for team in (*SCRIPTED, *learned_teams(flight)):
+        for team in (*TEAMS, *learned_teams(flight)):
             if not (HERE / flight / f"{team}.npz").is_file():
                 continue
             metrics = json.loads((HERE / flight / f"{team}.json").read_text(encoding="utf-8"))["metrics"]
