@@ -1,9 +1,12 @@
 """What drones know of themselves: filters over simulated sensors, and controllers that fly by them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import make
 
+from multilift_marl.control import estimator
 from multilift_marl.control.estimator import StateEstimator, make_gains, steady_gain
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.sim.sensors import Sensor, SensorSuite
@@ -94,14 +97,23 @@ def test_gains_are_those_of_the_riccati_equation():
     assert (five > expected).all()
 
 
-def test_a_filter_is_stable_however_its_sensors_are():
-    for fix in (1e-4, 0.01, 1.0):
-        suite = SensorSuite(position=Sensor(10.0, 0.1, fix), velocity=Sensor(10.0, 0.1, 10 * fix))
-        gains = make_gains(suite, 20.0)
-        a = np.eye(4)
-        a[0, 1], a[1, 2], a[2, 3] = DT, 9.81 * DT, -DT
-        closed = (np.eye(4) - gains.level @ np.eye(2, 4)) @ np.linalg.matrix_power(a, 25)
-        assert np.abs(np.linalg.eigvals(closed)).max() < 1
+@pytest.mark.parametrize("noise", [1e-4, 0.05])
+def test_filters_are_stable_with_fixes_that_come_late_however_exact_they_are(noise, monkeypatch):
+    usual = estimator._make_suite("onboard", 250.0)
+    fixes = {"delay": 0.1, "noise": noise, "drift": 0.0}
+    suite = replace(usual, position=replace(usual.position, **fixes), velocity=replace(usual.velocity, **fixes))
+    monkeypatch.setattr(estimator, "_make_suite", lambda level, rate: suite)
+    _, (position, velocity, angle) = fly("onboard")
+    assert np.sqrt((position**2).mean()) < max(0.01, noise)
+    assert np.sqrt((velocity**2).mean()) < 0.05 and angle.max() < 4
+
+
+def test_a_correction_moves_on_as_the_state_does():
+    gains = make_gains(estimator._make_suite("onboard", 250.0), 20.0)
+    late, now = gains.level[25], gains.level[0]
+    assert gains.level.shape == (26, 4, 2) and gains.vertical.shape == (26, 3, 2)
+    np.testing.assert_allclose(late[0] - now[0], 0.1 * now[1], rtol=0.2)  # position by velocity times 0.1 s
+    np.testing.assert_allclose(late[1] - now[1], 0.1 * 9.81 * now[2], rtol=0.05)  # velocity by g times tilt
 
 
 def test_a_team_flies_by_what_it_knows_not_by_the_truth(monkeypatch):

@@ -7,7 +7,10 @@ import pytest
 from conftest import make, same
 
 from multilift_marl.config.load import load_config
+from multilift_marl.control.scripted import fitting_scripts, make_scripted
+from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError
+from multilift_marl.ros.policy_node import check_flyable
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks.load_sensing import alpha_beta
 
@@ -167,12 +170,55 @@ def test_noise_on_top_of_sensors_is_refused():
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("task", ["hover", "track", "gate", "pose", "recover", "loss", "land", "takeoff"])
 def test_every_task_flies_by_sensors(level, task):
-    vec = make(task=task, num_envs=4, **{"env.sensing": level})
+    told = {"task_options.broadcast": True} if task == "loss" else {}
+    vec = make(task=task, num_envs=4, **{"env.sensing": level, **told})
     seen, _ = vec.reset(seed=0)
     for _ in range(10):
         seen, reward, terminated, _, _ = vec.step(np.zeros((4, 4, 4)))
         vec.reset(mask=terminated)
     assert np.isfinite(seen).all() and np.isfinite(reward).all()
+
+
+def test_a_slack_cable_points_nowhere():
+    vec = settled("onboard")
+    before = vec.task.view.load.position.copy()
+    vec.world.state.cable_tension[0, 1] = 0.0
+    vec._sensing._load_sensing.bind(vec.task.view.planned, vec.task.view.rig, vec.task.view.resting_tension, False)(
+        0, 1
+    )
+    load = vec.task.view.load
+    np.testing.assert_allclose(load.position[0, 1], before[0, 1] + 0.02 * load.velocity[0, 1], atol=1e-12)
+    assert np.abs(load.position[0, 0] - before[0, 0] - 0.02 * load.velocity[0, 0]).max() > 1e-6
+
+
+@pytest.mark.parametrize("level", ["onboard", "blind"])
+def test_a_goal_that_leaps_is_no_motion_of_the_payload(level):
+    vec = settled(level)
+    speed = np.abs(vec.task.view.load.velocity).max()
+    turned = np.array([[0.94, 0.0, 0.342], [0.0, 1.0, 0.0], [-0.342, 0.0, 0.94]])
+    vec.task.place_goal(0, vec.task.goal.position[0], turned)
+    vec.step(np.full((1, 4, 4), 0.2))
+    assert np.abs(vec.task.view.load.velocity).max() < speed + 0.3
+
+
+def test_who_cannot_see_a_tilt_must_be_told_of_a_loss():
+    for level in ("onboard", "blind"):
+        with pytest.raises(ConfigError, match="set task_options"):
+            make("loss", num_envs=1, **{"env.sensing": level})
+
+
+def test_the_true_state_is_no_ones_to_read():
+    vec = make(num_envs=1, **{"env.sensing": "mocap"})
+    with pytest.raises(ConfigError, match="payload_geometric reads the true state"):
+        make_scripted("payload_geometric", vec)
+    assert "payload_geometric" not in fitting_scripts(vec)
+
+
+def test_teams_that_are_measured_have_no_simulated_sensors():
+    team = MeasuredTeam(load_config("hover", {"env.sensing": "mocap"}))
+    assert team.config.env.sensing == "ideal" and team.controller.state is team.world.state
+    with pytest.raises(ConfigError, match="nobody measures the cables' tension"):
+        check_flyable(load_config("hover", {"env.sensing": "onboard"}))
 
 
 def test_conditions_go_below_any_task():

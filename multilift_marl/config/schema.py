@@ -74,7 +74,8 @@ class VehicleConfig(Section):
     """The quadrotors: a preset, and what differs from it (None: as the preset); lists hold one for each drone."""
 
     preset: Annotated[str | tuple[str, ...], AfterValidator(pin_vehicles)] = Field(
-        "falcon", description="falcon, crazyflie, crazyflie_id, hummingbird, iris, or one's own: a name or a YAML file"
+        "falcon",
+        description="falcon, crazyflie, crazyflie_id, hummingbird, iris, x500, or one's own: a name or a YAML file",
     )
     mass: Annotated[PerDrone | None, Between(1e-4, 1e7, "kg")] = Field(None, description="[kg] of the whole drone")
     inertia: Annotated[Moments | tuple[Moments, ...] | None, Between(1e-9, 1e7, "kg m²")] = Field(

@@ -10,6 +10,7 @@ velocity and accelerometer bias, of the heading angle and gyroscope bias.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,16 +34,18 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.sim.earth import Site
 from multilift_marl.sim.sensors import Sensor, Sensors, SensorSuite, white
 from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
 Call = Callable[[int, int], None]  # of environments lo to hi
 
-# Process noise of the filter beside that of the IMU's white noise: what its linear model leaves out, at each sample.
-_MODEL_ACCELERATION = 0.1  # [m/s²] offsets in directions that turn with the drone
-_MODEL_RATE = 2e-3  # [rad/s]
-_BIAS_WALK = 2e-5  # [rad/s, m/s²] of the biases in a sample
+# Process noise of the filter beside the IMU's white noise, as densities: what its linear model leaves out.
+_MODEL_ACCELERATION = 9e-3  # [m/s²/√Hz] offsets of the accelerometer, in directions that turn with the drone
+_MODEL_RATE = 1.8e-4  # [rad/s/√Hz]
+_GYRO_WALK = 3e-4  # [rad/s/√s] of the gyroscope's bias
+_LIFT_WALK = 3e-3  # [m/s²/√s] of the accelerometer's along the vertical
 _CONVERGED = 1e-9  # relative change of the covariance from one correction to the next
 _MAX_CORRECTIONS = 20_000
 
@@ -61,12 +64,15 @@ class Filter(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """Corrections for each unit of an innovation; the columns are those of position and velocity."""
+    """Corrections for each unit of an innovation; the last axis is that of position and velocity.
+
+    A fix is K ticks late when it arrives; entry i corrects the state i ticks after the sample: Aⁱ times the gain.
+    """
 
     level: np.ndarray
-    """(4, 2) of position, velocity, tilt, gyroscope bias."""
+    """(K + 1, 4, 2) of position, velocity, tilt, gyroscope bias."""
     vertical: np.ndarray
-    """(3, 2) of position, velocity, accelerometer bias."""
+    """(K + 1, 3, 2) of position, velocity, accelerometer bias."""
     heading: np.ndarray
     """(2, 1) of heading, gyroscope bias, for an innovation of the heading."""
 
@@ -78,27 +84,27 @@ def nearest_rate(rate: float, ticks_per_second: float) -> float:
 
 def _make_suite(level: str, rate: float) -> SensorSuite:
     """Return the sensors of a level of `env.sensing`, in ticks of `rate` [Hz]."""
-    usual = SensorSuite()
-    tick = 1 / rate
-    accelerometer = Sensor(rate, noise=white(70e-6 * GRAVITY, rate), offset=0.02, drift=0.006, drift_time=300)
-    gyroscope = Sensor(rate, noise=white(np.radians(2.8e-3), rate), offset=1e-3, drift=4e-5, drift_time=1000)
-    magnetometer, position, velocity = usual.magnetometer, usual.position, usual.velocity
+    usual, tick = SensorSuite(), 1 / rate
+    imu = {
+        "accelerometer": replace(usual.accelerometer, rate=rate, noise=white(70e-6 * GRAVITY, rate)),
+        "gyroscope": replace(usual.gyroscope, rate=rate, noise=white(np.radians(2.8e-3), rate)),
+        "barometer": Sensor(nearest_rate(50.0, rate)),  # not used
+    }
     if level == "mocap":
         # Cameras: Vicon and OptiTrack state 0.2 to 0.5 mm; here 1 mm and 8 ms. Their heading, 0.2°, is that of a
-        # magnetometer this good; they measure no velocity.
-        cameras = nearest_rate(125.0, rate)
-        position = Sensor(cameras, delay=tick * round(0.008 / tick), noise=1e-3)
-        velocity = Sensor(cameras, delay=position.delay, noise=1.0)
-        magnetometer = Sensor(cameras, noise=0.075)
-    else:
-        fixes, delay = nearest_rate(position.rate, rate), tick * round(position.delay / tick)
-        position = Sensor(fixes, delay, position.noise, drift=position.drift, drift_time=position.drift_time)
-        velocity = Sensor(fixes, delay, velocity.noise)
-        magnetometer = Sensor(
-            nearest_rate(50.0, rate), 0.0, magnetometer.noise, magnetometer.offset, magnetometer.drift
-        )
-    barometer = Sensor(nearest_rate(50.0, rate))  # not used
-    return SensorSuite(accelerometer, gyroscope, magnetometer, barometer, position, velocity)
+        # magnetometer this good in a level field; what they tell of velocity follows from positions alone.
+        cameras, delay = nearest_rate(125.0, rate), tick * round(0.008 / tick)
+        magnetometer = Sensor(cameras, noise=np.radians(0.2) * Site().field)
+        position, velocity = Sensor(cameras, delay, noise=1e-3), Sensor(cameras, delay, noise=1.0)
+        return SensorSuite(magnetometer=magnetometer, position=position, velocity=velocity, **imu)
+    fixes = {"rate": nearest_rate(usual.position.rate, rate), "delay": tick * round(usual.position.delay / tick)}
+    return replace(
+        usual,
+        magnetometer=replace(usual.magnetometer, rate=nearest_rate(usual.magnetometer.rate, rate)),
+        position=replace(usual.position, **fixes),
+        velocity=replace(usual.velocity, **fixes),
+        **imu,
+    )
 
 
 class StateEstimator:
@@ -118,7 +124,8 @@ class StateEstimator:
         e, n = world.num_envs, world.num_drones
         suite = _make_suite(level, rate)
         self._true, self._rate = true, rate
-        self._sensors = Sensors(suite, true, 1 / rate)
+        site = Site(inclination=0.0) if level == "mocap" else Site()
+        self._sensors = Sensors(suite, true, 1 / rate, site)
         names = ("drone_position", "drone_velocity", "drone_rotation", "drone_body_rates")
         self.state: SystemState = true._replace(**{name: getattr(true, name).copy() for name in names})
         delay = round(suite.position.delay * rate)
@@ -149,31 +156,35 @@ def make_gains(suite: SensorSuite, level_field: float) -> Gains:
         suite: sensors; position and velocity have the same rate and delay.
         level_field: level part of the magnetic field [µT].
     """
-    dt = 1 / suite.gyroscope.rate
-    push = np.hypot(np.max(suite.accelerometer.noise), _MODEL_ACCELERATION)
-    turn = np.hypot(np.max(suite.gyroscope.noise), _MODEL_RATE)
-    noise = np.array([np.max(suite.position.noise), np.max(suite.velocity.noise)])
+    rate, fixes = suite.gyroscope.rate, round(suite.gyroscope.rate / suite.position.rate)
+    dt, delay = 1 / rate, round(suite.position.delay * rate)
+    push = np.hypot(np.max(suite.accelerometer.noise), white(_MODEL_ACCELERATION, rate))
+    turn = np.hypot(np.max(suite.gyroscope.noise), white(_MODEL_RATE, rate))
+    measured = [np.broadcast_to(sensor.noise, 3) for sensor in (suite.position, suite.velocity)]
 
     # A level axis: x' = v, v' = g tilt, tilt' = -bias.
     a = np.eye(4)
     a[0, 1], a[1, 2], a[2, 3] = dt, GRAVITY * dt, -dt
-    q = np.diag([0.0, push * dt, turn * dt, _BIAS_WALK]) ** 2
-    both = np.eye(2, 4)
-    level = steady_gain(a, q, both, noise, round(suite.gyroscope.rate / suite.position.rate))
+    q = np.diag([0.0, push * dt, turn * dt, _GYRO_WALK * np.sqrt(dt)]) ** 2
+    level = _late(a, steady_gain(a, q, np.eye(2, 4), np.array([each[0] for each in measured]), fixes), delay)
 
     # The vertical: z' = w, w' = -bias.
     a = np.eye(3)
     a[0, 1], a[1, 2] = dt, -dt
-    q = np.diag([0.0, push * dt, _BIAS_WALK * GRAVITY]) ** 2
-    vertical = steady_gain(a, q, np.eye(2, 3), noise, round(suite.gyroscope.rate / suite.position.rate))
+    q = np.diag([0.0, push * dt, _LIFT_WALK * np.sqrt(dt)]) ** 2
+    vertical = _late(a, steady_gain(a, q, np.eye(2, 3), np.array([each[2] for each in measured]), fixes), delay)
 
     # The heading: angle' = -bias.
     a = np.array([[1.0, -dt], [0.0, 1.0]])
-    q = np.diag([turn * dt, _BIAS_WALK]) ** 2
+    q = np.diag([turn * dt, _GYRO_WALK * np.sqrt(dt)]) ** 2
     angle = np.array([np.max(suite.magnetometer.noise) / level_field])
-    steps = round(suite.gyroscope.rate / suite.magnetometer.rate)
-    heading = steady_gain(a, q, np.eye(1, 2), angle, steps)
+    heading = steady_gain(a, q, np.eye(1, 2), angle, round(rate / suite.magnetometer.rate))
     return Gains(level, vertical, heading)
+
+
+def _late(a: np.ndarray, gain: np.ndarray, delay: int) -> np.ndarray:
+    """Return what a correction has become 0 to `delay` steps later, (delay + 1, X, Y)."""
+    return np.array([np.linalg.matrix_power(a, i) @ gain for i in range(delay + 1)])
 
 
 def steady_gain(a: np.ndarray, q: np.ndarray, c: np.ndarray, noise: np.ndarray, steps: int) -> np.ndarray:
@@ -265,34 +276,41 @@ def _predict(e, n, readings, channels, state, filter):
 
 
 @kernel
+def _moved(i, row, innovation, gains):
+    """Return how position (row 0) or velocity (1) changes i ticks after the sample by its innovation (6 numbers)."""
+    k, z = gains.level, gains.vertical
+    return (
+        k[i, row, 0] * innovation[0] + k[i, row, 1] * innovation[3],
+        k[i, row, 0] * innovation[1] + k[i, row, 1] * innovation[4],
+        z[i, row, 0] * innovation[2] + z[i, row, 1] * innovation[5],
+    )
+
+
+@kernel
 def _correct_motion(e, n, readings, channels, state, filter, gains):
     """Correct position, velocity, tilt and biases by a fix, against what the filter said when it was taken."""
-    then = filter.past[e, n, (readings.tick[e] - channels.delay[POSITION]) % filter.past.shape[2]]
-    values = readings.values[e, n]
-    off = (values[10] - then[0], values[11] - then[1], values[12] - then[2])
-    fast = (values[13] - then[3], values[14] - then[4], values[15] - then[5])
-    k, z = gains.level, gains.vertical
-    moved = (
-        k[0, 0] * off[0] + k[0, 1] * fast[0],
-        k[0, 0] * off[1] + k[0, 1] * fast[1],
-        z[0, 0] * off[2] + z[0, 1] * fast[2],
-    )
-    pushed = (
-        k[1, 0] * off[0] + k[1, 1] * fast[0],
-        k[1, 0] * off[1] + k[1, 1] * fast[1],
-        z[1, 0] * off[2] + z[1, 1] * fast[2],
-    )
-    put(state.drone_position[e, n], add(vec(state.drone_position, e, n), moved))
-    put(state.drone_velocity[e, n], add(vec(state.drone_velocity, e, n), pushed))
-    for j in range(filter.past.shape[2]):  # so that what is still on its way is compared with the corrected past
-        past = filter.past[e, n, j]
-        put(past[0:3], add((past[0], past[1], past[2]), moved))
-        put(past[3:6], add((past[3], past[4], past[5]), pushed))
-    filter.lift_bias[e, n] += z[2, 0] * off[2] + z[2, 1] * fast[2]
+    delay, size = channels.delay[POSITION], filter.past.shape[2]
+    sampled = readings.tick[e] - delay
+    then, values = filter.past[e, n, sampled % size], readings.values[e, n]
+    off = (
+        values[10] - then[0], values[11] - then[1], values[12] - then[2],
+        values[13] - then[3], values[14] - then[4], values[15] - then[5],
+    )  # fmt: skip
+
+    # The past since the sample, so that later fixes are compared with what is corrected; its last entry is the present.
+    for i in range(delay + 1):
+        past = filter.past[e, n, (sampled + i) % size]
+        put(past[0:3], add((past[0], past[1], past[2]), _moved(i, 0, off, gains)))
+        put(past[3:6], add((past[3], past[4], past[5]), _moved(i, 1, off, gains)))
+    put(state.drone_position[e, n], add(vec(state.drone_position, e, n), _moved(delay, 0, off, gains)))
+    put(state.drone_velocity[e, n], add(vec(state.drone_velocity, e, n), _moved(delay, 1, off, gains)))
+    z = gains.vertical
+    filter.lift_bias[e, n] += z[delay, 2, 0] * off[2] + z[delay, 2, 1] * off[5]
 
     # A tilt θ gives the acceleration θ × g e3 = g (θy, -θx, 0): x tells θy, y tells -θx.
-    along = (k[2, 0] * off[0] + k[2, 1] * fast[0], k[2, 0] * off[1] + k[2, 1] * fast[1])
-    bias = (k[3, 0] * off[0] + k[3, 1] * fast[0], k[3, 0] * off[1] + k[3, 1] * fast[1])
+    k = gains.level
+    along = (k[delay, 2, 0] * off[0] + k[delay, 2, 1] * off[3], k[delay, 2, 0] * off[1] + k[delay, 2, 1] * off[4])
+    bias = (k[delay, 3, 0] * off[0] + k[delay, 3, 1] * off[3], k[delay, 3, 0] * off[1] + k[delay, 3, 1] * off[4])
     _turn(e, n, (-along[1], along[0], 0.0), (-bias[1], bias[0], 0.0), state, filter)
 
 

@@ -65,6 +65,10 @@ def make_scripted(name: str, vec: MultiliftVec) -> Policy:
     if name not in SCRIPTED:
         raise ConfigError(f"unknown scripted policy '{name}'{nearest(name, SCRIPTED)}")
     check_interface(name, vec.config.control.action)
+    if name == "payload_geometric" and (level := vec.config.env.sensing) != "ideal":
+        raise ConfigError(
+            f"payload_geometric reads the true state; set env.sensing=ideal, not {level}, or leave it out"
+        )
     return SCRIPTED[name](vec)
 
 
@@ -72,7 +76,8 @@ def check_interface(name: str, action: str) -> None:
     """Refuse the script `name` with an action interface that it does not act by, by a ConfigError."""
     known = SCRIPTED[name].INTERFACE
     if action != known:
-        fits = "set" if action in ("reference", "rotor") else f"take hold_{action}, set"
+        holds = [other for other, script in SCRIPTED.items() if script.INTERFACE == action and action != "reference"]
+        fits = f"take {holds[0]}, set" if holds else "set"
         raise ConfigError(
             f"the scripted policy '{name}' acts by control.action={known} and cannot fly control.action={action}; "
             f"{fits} control.action={known}, or leave the script out (baseline=none, train.residual=formation)"

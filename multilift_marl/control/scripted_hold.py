@@ -1,8 +1,8 @@
-"""Scripts that hold slots by interfaces below references: velocity, acceleration, its tilt rates, thrust and rates.
+"""Scripts for the action interfaces below `reference`: velocity, acceleration, acc_rates, ctbr.
 
-All are one linear law, the acceleration of each drone as a map of its observation; an interface that commands another
-quantity is given what leads to this acceleration. So each is a map of the observation, too, and a learned policy can
-start from it (`train.residual`). Gains can be searched (`results/search_gains.py`).
+One linear PD law with an integral for the acceleration of each drone, converted to each interface. All are linear maps
+of the observation, so that a learned policy can start from them (`train.residual`) and gains can be searched
+(`results/search_gains.py`). Conversions are those of the first vehicle where a team has several.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 TILT_GAIN = 8.0  # [1/s] of a tilt from the desired one: of `ctbr`, whose rate loops are faster
 YAW_GAIN = 2.0  # [1/s] of the heading
-STIFFNESS, DAMPING = 16.0, 8.0  # [1/s²], [1/s] of a drone about its slot, as those of the controller by default
-INTEGRAL = 8.0  # [1/s³] of the payload's error: as a slot that moves by 0.5/s
+STIFFNESS, DAMPING = 16.0, 8.0  # [1/s²], [1/s] of a drone about its slot: 4 rad/s, critically damped
+OWN_PLANNED = {"slot_error": ("planned_position",), "velocity": ("planned_velocity", "target_velocity")}
+INTEGRAL = 8.0  # [1/s³] of the payload's error: what `formation_integral` does to a slot, times the stiffness
 
 
 class HoldAcceleration(Formation):
@@ -47,10 +48,14 @@ class HoldAcceleration(Formation):
         law = np.zeros((3, len(self._names)), np.float32)
         for name, axis, moved, gain in self.GAINS:
             law[moved, self._column(name, axis)] += gain
-            for planned in (*PLANNED.get(name, ()), *(("target_velocity",) if name == "velocity" else ())):
-                if f"{planned}_{axis}" in self._names:
-                    law[moved, self._column(planned, axis)] -= gain
+            for column in self._planned(name, axis):
+                law[moved, column] -= gain
         return law
+
+    def _planned(self, name: str, axis: int) -> list[int]:
+        """Return where the planned value of what is observed stands, where a task has one."""
+        names = (f"{planned}_{axis}" for planned in (*PLANNED.get(name, ()), *OWN_PLANNED.get(name, ())))
+        return [self._names.index(planned) for planned in names if planned in self._names]
 
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
@@ -99,10 +104,13 @@ class HoldAccRates(HoldAcceleration):
         matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
         matrix[:3] = law / control.max_acceleration
 
-        # The slot error changes by the velocity, and the tilt by jerk / g: outward about the sideways axis.
+        # The slot error changes by the velocity beside the slot's, and the tilt by jerk / g: outward about the sideways
+        # axis.
         for axis, rate, sign in ((0, 4, 1.0), (1, 3, -1.0)):
-            stiffness = law[axis, self._column("slot_error", axis)]
-            matrix[rate, self._column("velocity", axis)] = sign * stiffness / GRAVITY / control.max_tilt_rate
+            gain = sign * law[axis, self._column("slot_error", axis)] / GRAVITY / control.max_tilt_rate
+            matrix[rate, self._column("velocity", axis)] += gain
+            for column in self._planned("velocity", axis):
+                matrix[rate, column] -= gain
         return matrix
 
 
@@ -120,7 +128,7 @@ class HoldCtbr(HoldAcceleration):
         force = system.hook_force[0] + np.array([0.0, 0.0, float(gains.mass[0]) * GRAVITY])  # at rest
         hover = float(np.linalg.norm(force))
 
-        # More or less thrust than at rest; equal shares of the range above, which is the smaller one.
+        # More or less thrust than at rest, by the range above it; that below is about as large.
         matrix[0] = law[2] * mass / (4 * float(np.min(gains.thrust_max)) - hover)
 
         # A tilt from that at rest gives g times as much acceleration of drone and load.
@@ -129,7 +137,7 @@ class HoldCtbr(HoldAcceleration):
             wanted = law[axis] * mass / hover
             wanted[self._column("thrust_axis", axis)] -= 1.0
             if axis == 0:
-                wanted[self._column("heading", 0)] += lean
+                wanted[self._column("heading", 0)] += lean  # the cosine of a small heading stands for 1
             matrix[rate] = sign * TILT_GAIN * wanted / control.max_tilt_rate
         matrix[3] = self._turn_back() / control.max_yaw_rate
         return matrix

@@ -281,5 +281,7 @@ def check_flyable(config: Config) -> None:
         raise ConfigError(
             f"set-points are places, of control.action=reference, not of {config.control.action}; take a policy of that"
         )
+    if config.env.sensing == "onboard":
+        raise ConfigError("role=policy cannot fly policies of env.sensing=onboard: nobody measures the cables' tension")
     if config.task == "loss":
         raise ConfigError("role=policy cannot fly config=loss: nobody measures whose motors have stopped")

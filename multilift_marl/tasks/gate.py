@@ -30,6 +30,7 @@ from multilift_marl.tasks.rewards import (
     velocity,
 )
 from multilift_marl.tasks.starts import hang_team, in_ball
+from multilift_marl.tasks.view import load_row
 
 THICKNESS = 0.1  # [m] of the walls
 PASSED = 0.8  # [m] that a payload is past a wall when its last drone is, too
@@ -143,13 +144,25 @@ def advance_target(e, v):
 
 
 @inlined
-def next_gate(e, v):
-    """Return the gate that the payload has before it, the last one after all."""
-    gates, x = v.settings, v.state.payload_position[e, 0]
+def _gate_before(x, v):
+    """Return the first gate that a payload at x [m] has before it, the last one after all."""
+    gates = v.settings
     for g in range(gates.x.shape[0]):
         if x < gates.x[g] + PASSED:
             return g
     return gates.x.shape[0] - 1
+
+
+@inlined
+def next_gate(e, v):
+    """Return the gate that the payload has before it, the last one after all."""
+    return _gate_before(v.state.payload_position[e, 0], v)
+
+
+@inlined
+def known_gate(e, n, v):
+    """Return the same as drone n knows the payload."""
+    return _gate_before(v.load.position[e, load_row(n, v), 0], v)
 
 
 @inlined
@@ -238,28 +251,27 @@ def target_velocity(e, n, v):
 
 
 @inlined
-def gap_middle(e, v):
-    """Middle of the next gap."""
-    g = next_gate(e, v)
+def gap_middle(e, g, v):
+    """Middle of gap g."""
     return (v.settings.x[g], v.own.gap_y[e, g], v.settings.level)
 
 
 @inlined
 def gap_offset(e, n, v):
     """Own position minus the middle of the next gap."""
-    return sub(vec(v.seen.drone_position, e, n), gap_middle(e, v))
+    return sub(vec(v.seen.drone_position, e, n), gap_middle(e, known_gate(e, n, v), v))
 
 
 @inlined
 def clearance(e, n, v):
     """Own room to the next wall's edges, within ± 0.5 m."""
-    return min(max(_clearance(e, n, next_gate(e, v), v.seen, v), -0.5), 0.5)
+    return min(max(_clearance(e, n, known_gate(e, n, v), v.seen, v), -0.5), 0.5)
 
 
 @inlined
 def payload_gap_offset(e, n, v):
     """Payload's position minus the middle of the next gap."""
-    return sub(row(v.state.payload_position, e), gap_middle(e, v))
+    return sub(row(v.state.payload_position, e), gap_middle(e, next_gate(e, v), v))
 
 
 class Gate(Task):

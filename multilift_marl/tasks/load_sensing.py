@@ -96,7 +96,7 @@ class LoadSensor(NamedTuple):
     """Alpha and beta of attitudes."""
 
 
-ACCELERATION, ANGULAR_ACCELERATION = 2.0, 10.0  # [m/s²], [rad/s²] of a payload between two samples, for the filters
+ACCELERATION, ANGULAR_ACCELERATION = 2.0, 10.0  # [m/s²], [rad/s²] assumed standard deviations, Kalata's σ_w
 
 
 def alpha_beta(maneuver: float, noise: float, dt: float) -> tuple[float, float]:
@@ -130,6 +130,7 @@ def make_sensor(level: str, dt: float, length: float) -> LoadSensor:
         return LoadSensor(
             dt, direction=direction, tension=0.01, follow=alpha_beta(ACCELERATION, direction * length, dt)
         )
+    assert level == "blind", level
     return LoadSensor(dt)
 
 
@@ -264,6 +265,9 @@ def see_cable(lo, hi, true, own, load, planned, rig, resting_tension, memory, se
             along = unit(add(along, off))
             off_tension = memory.tension_offset[e, n] + sensor.tension * normal_pair(e, memory)[0]
             load.tension[e, n] = max(true.cable_tension[e, n] + off_tension * resting_tension[n], 0.0)
+            if true.cable_tension[e, n] == 0.0 and not first:  # slack or broken: it points nowhere
+                put(load.position[e, n], add(vec(load.position, e, n), scale(sensor.dt, vec(load.velocity, e, n))))
+                continue
 
             # The anchor is a nominal length along it; the payload as it is planned to stand about its anchor.
             reach = norm(_planned_cable(e, n, planned, rig))
@@ -292,8 +296,11 @@ def _planned_cable(e, n, planned, rig):
 @kernel
 def _place(e, n, anchor, own, load, planned, rig, sensor, first):
     """Write the payload that has drone n's anchor at a place [m], at the planned attitude and at rest in it."""
+    # It is the anchor that is followed: the planned attitude may leap.
+    known = add(vec(load.position, e, n), mul(mat(load.rotation, e, n), row(rig.anchors, n)))
+    put(load.position[e, n], known)
+    _follow(e, n, anchor, vec(own.drone_velocity, e, n), load, sensor, first)
     attitude = matrow(planned.rotation, e)
-    place = sub(anchor, mul(attitude, row(rig.anchors, n)))
-    _follow(e, n, place, vec(own.drone_velocity, e, n), load, sensor, first)
+    put(load.position[e, n], sub(vec(load.position, e, n), mul(attitude, row(rig.anchors, n))))
     putmat(load.rotation[e, n], attitude)
     put(load.body_rates[e, n], (0.0, 0.0, 0.0))

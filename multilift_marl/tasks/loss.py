@@ -118,7 +118,10 @@ def lowest_corner(e, tilt, v):
 
 @inlined
 def notice_loss(e, v):
-    """Let drones know of a loss: when it is broadcast, or when the payload tilts as it does then."""
+    """Let drones know of a loss: when it is broadcast, or when the payload tilts as it does then.
+
+    What they know of the payload is that of the last policy step where sensors measure it.
+    """
     lost = v.mask.lost[e, v.own.who[e]]
     for n in range(v.own.known.shape[1]):
         tilt = coming_tilt(e, n, v)
@@ -216,6 +219,11 @@ class Loss(Task):
         early, late = option.loss_time
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
+        if not option.broadcast and self.config.env.sensing in ("onboard", "blind"):
+            raise ConfigError(
+                f"env.sensing={self.config.env.sensing} does not show the payload's tilt, by which drones notice "
+                "a loss; set task_options.broadcast=true"
+            )
         self._ranges = make_ranges(option)
         world.breakable = world.breakable or option.snap
         e, n, gains = world.num_envs, world.num_drones, make_gains(control, world.system)

@@ -1,7 +1,7 @@
 """Sensing: what stands between the true state and an observation, and delay of actions.
 
 By `env.sensing` drones observe, and their controllers use, the truth (`ideal`) or estimates from simulated sensors
-(docs/sensing.md). Of the truth, `randomization` can make observations alone noisy and biased: each drone measures its
+(docs/sensing.md). With `ideal`, `randomization` can add noise and bias to observations alone: each drone measures its
 own state, and all observe one measurement of the payload's. Delays are whole policy steps. Success, reward and the
 critic's global state are computed from the true state. docs/randomization.md says the same in a table.
 """
