@@ -36,6 +36,7 @@ FLIGHTS: dict[str, Flight] = {
     ),
     "hover_ctbr": Flight("hover_ctbr", {}, "hover_ctbr", "hover by thrust and body rates, from nothing"),
     "hover_wind": Flight("hover_wind", {}, "hover_wind", "hover in wind of 5 m/s, noise, delay"),
+    "hover_realistic": Flight("hover_realistic", {}, "hover_realistic", "hover, realistic"),
     "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
     "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
     "pose_falcon3": Flight("pose_falcon3", {}, "pose_falcon3", "pose, three drones, tilts to 45°"),
@@ -48,10 +49,17 @@ FLIGHTS: dict[str, Flight] = {
     "track_5_8": Flight(
         "track", FASTEST, "track", "figure-eight, 5 m/s, 8 m/s²", f"19.7 cm: 10 Hz planner, {ESTIMATED}"
     ),
+    "track_realistic_2_4": Flight(
+        "track_realistic", AGILE, "track_realistic", "figure-eight, 2 m/s, 4 m/s², realistic"
+    ),
+    "track_realistic_5_8": Flight(
+        "track_realistic", FASTEST, "track_realistic", "figure-eight, 5 m/s, 8 m/s², realistic"
+    ),
     "track_auto6": Flight("track_auto6", {}, "track_auto6", "figure-eight, 4.5 m/s, 4 m/s², six drones, 7 kg", AUTO),
     "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),
     "land": Flight("land", {}, "land", "land"),
     "gate": Flight("gate", {}, "gate", "gate"),
+    "gate_realistic": Flight("gate_realistic", {}, "gate_realistic", "gate, realistic"),
     "gate_two": Flight("gate_two", {}, "gate", "two gates"),
     "recover": Flight("recover", {}, "recover", "recover"),
     "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),

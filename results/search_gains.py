@@ -20,12 +20,13 @@ from multilift_marl.cli.common import run_command, split_options
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.values import Positive, Section
-from multilift_marl.control.scripted import LINEAR, check_interface
+from multilift_marl.control.scripted import LINEAR
 from multilift_marl.control.scripted_formation import Formation
 from multilift_marl.control.scripted_hold import STIFFNESS
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.evaluation.rollout import fly_episodes
+from multilift_marl.plugins import find_callable
 
 LEVEL = ((0, 0), (1, 1))
 TANGENT = ((2, 1),)
@@ -74,9 +75,25 @@ class Score(NamedTuple):
     """[deg]"""
 
 
+def find_script(name: str) -> type[Formation]:
+    """Return the class of a linear script, or one's own that module:Class names.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name in LINEAR:
+        return LINEAR[name]
+    if ":" not in name:
+        raise ConfigError(f"the search cannot begin with script '{name}'{nearest(name, LINEAR)}")
+    found = find_callable(name, "script")
+    if not (isinstance(found, type) and issubclass(found, Formation)):
+        raise ConfigError(f"the search cannot begin with script '{name}': it has no GAINS; base it on Formation")
+    return found
+
+
 def make_script(script: str, free: Free, changes: np.ndarray) -> type[Formation]:
     """Return a script with `changes` of the gains `free`."""
-    base = LINEAR[script]
+    base = find_script(script)
     rows = tuple(
         (name, axis, moved, float(gain))
         for (name, axes, _), gain in zip(free, changes, strict=True)
@@ -135,7 +152,7 @@ class Options(Section):
 
     config: str = Field("pose_wind", description="the task, a configuration's name or path")
     minutes: Positive = Field(30.0, description="[min] that the search takes")
-    script: str = Field("formation_feedback", description="whose gains it begins with")
+    script: str = Field("formation_feedback", description="whose gains it begins with, a name or module:Class")
     spread: Positive = Field(0.3, description="[-] of the first candidates, over the scales of `SLOTS` or `HELD`")
 
 
@@ -143,10 +160,13 @@ def main(values: dict[str, Any]) -> int:
     """Search, print and test."""
     options, overrides = split_options(Options, values)
     script = options.script
-    if script not in LINEAR:
-        raise ConfigError(f"the search cannot begin with script '{script}'{nearest(script, LINEAR)}")
+    begun = find_script(script)
     config = load_config(options.config, {"env.num_envs": 48, **overrides})
-    check_interface(script, config.control.action)
+    if begun.INTERFACE != config.control.action:
+        raise ConfigError(
+            f"the script '{script}' acts by control.action={begun.INTERFACE} and cannot fly "
+            f"control.action={config.control.action}; set control.action={begun.INTERFACE}"
+        )
     known = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1})).observation_names
     every = SLOTS if config.control.action == "reference" else HELD
     free = tuple(each for each in every if f"{each[0]}_0" in known)
@@ -157,7 +177,7 @@ def main(values: dict[str, Any]) -> int:
         gains[name, axis, moved] = gains.get((name, axis, moved), 0.0) + gain
     for (name, axis, moved), gain in gains.items():
         print(f'        ("{name}", {axis}, {moved}, {gain:.3f}),')
-    for title, each in ((script, LINEAR[script]), ("searched", found)):
+    for title, each in ((script, begun), ("searched", found)):
         config = build_config(config.model_dump(), {"env.num_envs": 256})
         _, success, error, angle = fly(config, each, config.seed + 10**6)
         print(f"{title}: {success:.1%} of 256 new episodes; {100 * error:.2f} cm, {angle:.2f}°")

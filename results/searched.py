@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from multilift_marl.control.scripted_formation import Formation
+from multilift_marl.control.scripted_formation import Formation, FormationLead, FormationNarrow
 from multilift_marl.control.scripted_hold import HoldAcceleration
 
 Gains = tuple[tuple[str, int, int, float], ...]
@@ -71,5 +71,102 @@ class HoverRealisticAcceleration(HoldAcceleration):
     )
 
 
-SEARCHED: dict[str, type[Formation]] = {"hover_realistic": HoverRealistic}
+class GateRealistic(FormationNarrow):
+    """Of `gate_realistic`: 11 minutes from `formation_narrow`, 40 episodes a candidate."""
+
+    GAINS: ClassVar[Gains] = (
+        ("heading", 0, 0, -0.644),
+        ("payload_error_integral", 0, 0, -0.339),
+        ("payload_error_integral", 1, 1, -0.339),
+        ("payload_error_integral", 2, 2, -0.832),
+        ("payload_velocity", 0, 0, -0.307),
+        ("payload_velocity", 1, 1, -0.307),
+        ("payload_error", 0, 0, 0.099),
+        ("payload_error", 1, 1, 0.099),
+        ("payload_error", 2, 2, 0.048),
+        ("payload_velocity", 2, 2, -0.057),
+        ("tracking_error", 0, 0, -0.308),
+        ("tracking_error", 1, 1, -0.308),
+        ("tracking_error", 2, 2, -0.152),
+        ("rotation_error_integral", 1, 2, 0.577),
+        ("payload_rotation_error", 1, 2, 0.099),
+        ("payload_angular_velocity", 1, 2, 0.003),
+        ("rotation_error_integral", 2, 1, -0.498),
+        ("payload_rotation_error", 2, 1, 0.013),
+        ("payload_angular_velocity", 2, 1, -0.016),
+        ("payload_rotation_error", 1, 0, 0.111),
+        ("payload_angular_velocity", 1, 0, -0.052),
+    )
+
+
+class TrackRealistic(FormationLead):
+    """Of `track_realistic` at 2 m/s and 4 m/s²: 11 minutes from `formation_lead`, whose lead these gains change."""
+
+    GAINS: ClassVar[Gains] = (
+        ("payload_error_integral", 0, 0, -0.272),
+        ("payload_error_integral", 1, 1, -0.272),
+        ("payload_error_integral", 2, 2, -0.866),
+        ("payload_error", 0, 0, -0.202),
+        ("payload_error", 1, 1, -0.202),
+        ("payload_error", 2, 2, 0.168),
+        ("payload_velocity", 0, 0, -0.504),
+        ("payload_velocity", 1, 1, -0.504),
+        ("payload_velocity", 2, 2, -0.216),
+        ("tracking_error", 0, 0, 0.286),
+        ("tracking_error", 1, 1, 0.286),
+        ("tracking_error", 2, 2, 0.864),
+        ("rotation_error_integral", 1, 2, 0.632),
+        ("payload_rotation_error", 1, 2, -0.201),
+        ("payload_angular_velocity", 1, 2, -0.021),
+        ("rotation_error_integral", 2, 1, 0.201),
+        ("payload_rotation_error", 2, 1, -0.022),
+        ("payload_angular_velocity", 2, 1, -0.020),
+        ("payload_rotation_error", 1, 0, 0.166),
+        ("payload_angular_velocity", 1, 0, 0.081),
+        ("target_ahead_200ms", 0, 0, 0.446),
+        ("target_ahead_200ms", 1, 1, 0.446),
+        ("target_ahead_400ms", 0, 0, -0.209),
+        ("target_ahead_400ms", 1, 1, -0.209),
+        ("heading", 0, 0, 0.049),
+    )
+
+
+class TrackRealisticFast(FormationLead):
+    """The same at 5 m/s and 8 m/s²: 9 minutes from `TrackRealistic`."""
+
+    GAINS: ClassVar[Gains] = (
+        ("payload_error_integral", 0, 0, -0.290),
+        ("payload_error_integral", 1, 1, -0.290),
+        ("payload_error_integral", 2, 2, -0.880),
+        ("payload_error", 0, 0, -0.437),
+        ("payload_error", 1, 1, -0.437),
+        ("payload_error", 2, 2, 0.147),
+        ("payload_velocity", 0, 0, -0.466),
+        ("payload_velocity", 1, 1, -0.466),
+        ("payload_velocity", 2, 2, -0.271),
+        ("tracking_error", 0, 0, 0.480),
+        ("tracking_error", 1, 1, 0.480),
+        ("tracking_error", 2, 2, 0.979),
+        ("rotation_error_integral", 1, 2, 0.825),
+        ("payload_rotation_error", 1, 2, -0.168),
+        ("payload_angular_velocity", 1, 2, 0.020),
+        ("rotation_error_integral", 2, 1, 0.203),
+        ("payload_rotation_error", 2, 1, -0.091),
+        ("payload_angular_velocity", 2, 1, -0.026),
+        ("payload_rotation_error", 1, 0, 0.300),
+        ("payload_angular_velocity", 1, 0, 0.019),
+        ("target_ahead_200ms", 0, 0, 0.691),
+        ("target_ahead_200ms", 1, 1, 0.691),
+        ("target_ahead_400ms", 0, 0, -0.322),
+        ("target_ahead_400ms", 1, 1, -0.322),
+        ("heading", 0, 0, 0.064),
+    )
+
+
+SEARCHED: dict[str, type[Formation]] = {
+    "hover_realistic": HoverRealistic,
+    "track_realistic_2_4": TrackRealistic,
+    "track_realistic_5_8": TrackRealisticFast,
+    "gate_realistic": GateRealistic,
+}
 """The best one of a flight."""

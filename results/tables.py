@@ -119,6 +119,21 @@ def details(flights: Sequence[str]) -> str:
     return _markdown([title for _, title, _, _ in _DETAILS], rows)
 
 
+def shifts(flights: Sequence[str]) -> str:
+    """Return the learned team and the best script of some flights under each change that `shifts.py` made."""
+    rows = []
+    for flight in flights:
+        for row in json.loads((HERE / flight / "shifts.json").read_text(encoding="utf-8"))["rows"]:
+            change, *teams = row
+            cells = []
+            for team in teams:
+                found = row[team]
+                refused = "refused" in found
+                cells.append("refused" if refused else f"{100 * found['success']:.1f} %, {100 * found['error']:.2f} cm")
+            rows.append([f"{FLIGHTS[flight].title}: {row[change]}", *cells, teams[-1]])
+    return _markdown(["learned", "best script", "which"], rows)
+
+
 def _interval(metric: dict[str, Any] | None, factor: float, digits: int) -> str:
     if metric is None:
         return "-"
@@ -128,13 +143,14 @@ def _interval(metric: dict[str, Any] | None, factor: float, digits: int) -> str:
 
 def write_tables() -> None:
     """Replace the text between the markers in the documents."""
-    marked = re.compile(r"(<!-- results(?: of ([\w ]+))? -->\n).*?(<!-- end of results -->)", re.DOTALL)
+    marked = re.compile(r"(<!-- (results|shifts)(?: of ([\w ]+))? -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         whole = summary if path.name == "README.md" else table
 
         def fill(found: re.Match[str], whole: Callable[[], str] = whole) -> str:
-            content = details(found[2].split()) if found[2] else whole()
-            return f"{found[1]}{content}\n{found[3]}"
+            kind = shifts if found[2] == "shifts" else details
+            content = kind(found[3].split()) if found[3] else whole()
+            return f"{found[1]}{content}\n{found[4]}"
 
         text = path.read_text(encoding="utf-8")
         path.write_text(marked.sub(fill, text), encoding="utf-8")
