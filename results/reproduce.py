@@ -111,6 +111,7 @@ def list_jobs(flight: str, only: str = "") -> list[Job]:
     scripts = fitting_scripts(MultiliftVec(build_config(config.model_dump(), SCRIPTED | {"env.num_envs": 1})))
     weights = sorted((HERE / FLIGHTS[flight].recipe).glob("seed*/policy.pt"))
     scripts += ["searched"] if flight in SEARCHED else []
+    scripts = [name for name in scripts if name in (FLIGHTS[flight].scripts or scripts)]
     jobs = [*(Job(flight, name, "") for name in scripts), *(Job(flight, w.parent.name, str(w)) for w in weights)]
     return [job for job in jobs if only in ("", job.team)]
 

@@ -206,6 +206,15 @@ def test_command_flies_a_script_in_place_of_a_policy(tmp_path, capsys, monkeypat
     assert {"errors.png", "tensions.png", "paths.png"} <= {path.name for path in folder.iterdir()}
 
 
+def test_the_script_of_an_interface_is_its_baseline(tmp_path):
+    short = ["episodes=2", "env.episode_seconds=0.4", f"out={tmp_path}"]
+    assert evaluate(["run=hover_ctbr", *short]) == 0
+    report = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(report["baselines"]) == {"hold_ctbr"}
+    assert evaluate(["policy=formation", "config=hover", *short]) == 0
+    assert "formation_integral" in json.loads((tmp_path / "metrics.json").read_text())["baselines"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -215,6 +224,7 @@ def test_command_flies_a_script_in_place_of_a_policy(tmp_path, capsys, monkeypat
         (["run=hover", "config=hover"], "a run brings its own configuration"),
         (["policy=formation", "config=pose_eas"], "no configuration named 'pose_eas'; did you mean 'pose_easy'?"),
         (["policy=formation", "control.action=ctbr", "baseline=none"], "cannot fly control.action=ctbr"),
+        (["policy=hold_ctbr", "baseline=formation", "control.action=ctbr"], "take hold_ctbr, set"),
     ],
 )
 def test_command_line_errors_of_scripts(capsys, arguments, message):

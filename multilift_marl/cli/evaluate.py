@@ -29,7 +29,8 @@ _USAGE = """Evaluate a team on fixed seeds, beside the scripted ones on the same
   python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
 Scripts are formation, formation_integral, formation_feedback, formation_gusts, formation_lead, formation_narrow,
-formation_redistributed and payload_geometric. task=<other> keeps the configuration's vehicles, payload, cables and
+formation_redistributed and payload_geometric; hold_velocity, hold_acceleration, hold_acc_rates and hold_ctbr with these
+action interfaces. task=<other> keeps the configuration's vehicles, payload, cables and
 control, see python train.py --help.
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
 
@@ -47,8 +48,9 @@ class Options(Section):
     checkpoint: str = Field("best", description="of the run: best, last, or a file")
     episodes: Annotated[Int, Between(1, 1e6)] = Field(200, description="how many")
     seed: Int = Field(1000, ge=0, description="evaluation seed: episode i is the same for every policy")
-    baseline: str = Field(
-        "formation_integral", description="drawn beside the policy, named like it, or a run; none: the policy alone"
+    baseline: str | None = Field(
+        None,
+        description="drawn beside the policy, named like it, or a run; none: the policy alone; None: a script",
     )
     video: bool = Field(False, description="also an mp4 of the first episode")
     camera: Literal["side", "top", "chase"] = Field("side", description="of the video")
@@ -71,17 +73,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _evaluate(values: dict[str, Any]) -> int:
     options, overrides = split_options(Options, values)
     _check_source(options)
-    alone = options.baseline == "none"
-    baseline = None if alone else find_policy(options.baseline, "baseline", ["none"])
+    chosen = options.baseline
+    baseline = None if chosen in (None, "none") else find_policy(chosen, "baseline", ["none"])
     team = _find_run(options) if options.policy is None else _find_named(options, options.policy, overrides)
     limit_torch_threads()
     config = build_config(team.config.model_dump(), {"env.num_threads": 0} | overrides)
     _ = config.system
     probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
-    makers = {team.name: team.make}
+    makers, fitting = {team.name: team.make}, fitting_scripts(probe)
+    if chosen is None:
+        chosen = next((name for name in ("formation_integral", *fitting) if name in fitting), "none")
+        options = options.model_copy(update={"baseline": chosen})
+    if chosen != "none":
+        makers |= {name: find_policy(name).bind for name in fitting if name != team.name}
     if baseline is not None:
-        makers |= {name: find_policy(name).bind for name in fitting_scripts(probe) if name != team.name}
-        makers.setdefault(options.baseline, baseline.bind)
+        makers.setdefault(chosen, baseline.bind)
     for make in makers.values():  # refuses what does not fit, before there is a folder
         make(probe)
     if options.bag is not None:
@@ -151,7 +157,8 @@ def _draw(config: Config, makers: dict[str, Any], team: _Team, options: Options,
     """Plot the first episode of policy and baseline, and the training; film the policy if asked."""
     from multilift_marl.evaluation import plots
 
-    names = dict.fromkeys([team.name] + ([] if options.baseline == "none" else [options.baseline]))
+    beside = [] if options.baseline in (None, "none") else [str(options.baseline)]
+    names = dict.fromkeys([team.name, *beside])
     traces = {name: trace_episode(config, makers[name], 0, options.seed) for name in names if name != team.name}
     traces = {team.name: _trace(config, team, options)} | traces
     plots.plot_errors(out / "errors.png", traces)

@@ -74,12 +74,12 @@ def _train(values: dict[str, Any]) -> int:
     if not finished:
         print(f"stopped after {minutes:.1f} min of training; go on with: python train.py resume={folder}")
         return trainer.status
-    baseline = "formation_integral" if trainer.config.control.action == "reference" else "none"
+    baseline = " baseline=formation_integral" if trainer.config.control.action == "reference" else ""
     print(
         f"trained {trainer.frames:,} steps in {minutes:.1f} min\n"
         f"{_compare(trainer)}\n"
         f"curves:   tensorboard --logdir {folder}\n"
-        f"evaluate: python evaluate.py run={folder} episodes=200 seed=1000 baseline={baseline} video=true"
+        f"evaluate: python evaluate.py run={folder} episodes=200 seed=1000{baseline} video=true"
     )
     return 0
 
