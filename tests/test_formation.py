@@ -11,7 +11,8 @@ from conftest import GRAVITY, make, make_system, refusal
 
 from multilift_marl.config.load import load_config
 from multilift_marl.control.formation import Goal, make_rig, place_formation
-from multilift_marl.control.scripted import INTEGRAL_GAIN, LEAD_GAIN, LINEAR, fitting_scripts, make_scripted
+from multilift_marl.control.scripted import LINEAR, fitting_scripts, make_scripted
+from multilift_marl.control.scripted_formation import INTEGRAL_GAIN, LEAD_GAIN
 from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.rollout import fly_episodes
 from multilift_marl.math3d import axis_angle, rot_z
@@ -114,10 +115,11 @@ def observed(vec, spread=1.0, **values) -> np.ndarray:
 
 @pytest.mark.parametrize("name", LINEAR)
 def test_scripts_act_on_any_batch_within_the_limits(name):
-    vec = make({"formation_narrow": "gate", "formation_redistributed": "loss"}.get(name, "track"), num_envs=1)
+    task = {"formation_narrow": "gate", "formation_redistributed": "loss"}.get(name, "track")
+    vec = make(task, num_envs=1, **{"control.action": LINEAR[name].INTERFACE})
     policy, observation = make_scripted(name, vec), 10 * observed(vec)
-    assert policy.act(observation).shape == (5, 4, 4)
-    assert policy.act(observation[0]).shape == (4, 4)
+    assert policy.act(observation).shape == (5, 4, vec.action_size)
+    assert policy.act(observation[0]).shape == (4, vec.action_size)
     assert np.abs(policy.act(observation)).max() <= 1
     np.testing.assert_array_equal(policy.act(observation)[3], policy.act(observation[3]))
 

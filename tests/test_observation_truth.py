@@ -29,7 +29,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "track": {"task_options.path": "random"},
     "takeoff": {"control.max_offset": 0.01},
     "land": {"control.max_offset": 0.01},
-    "loss": {"task_options.loss_time": [0.2, 0.3]},
+    "loss": {"task_options.loss_time": [0.2, 0.3], "task_options.broadcast": True},
 }
 
 

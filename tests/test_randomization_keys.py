@@ -17,6 +17,7 @@ WIDTHS = {key: 0.04 for key in RandomizationConfig.model_fields} | {
     "observation_delay": (0, 2), "action_delay": (1, 2),
 }  # fmt: skip
 EXTENT = ("payload_inertia", "payload_center_of_mass")  # which a point has not
+NOISE = ("observation_noise", "observation_bias")  # which sensors have of their own
 OFF = {f"randomization.{key}": field.default for key, field in RandomizationConfig.model_fields.items()}
 KINDS = {
     "massless": ("hover", {}),
@@ -27,12 +28,16 @@ KINDS = {
 
 def keys(config: str) -> list[str]:
     """Return the keys that a configuration allows."""
-    point = ml.load_config(config).payload.shape == "point"
-    return [key for key in WIDTHS if not (point and key in EXTENT)]
+    settings = ml.load_config(config)
+    without = EXTENT if settings.payload.shape == "point" else ()
+    without += NOISE if settings.env.sensing != "ideal" else ()
+    return [key for key in WIDTHS if key not in without]
 
 
 def fly(config: str, varied: tuple[str, ...], **overrides) -> None:
     """Start two episodes with these keys alone, twice, and fly two steps of each."""
+    if ml.load_config(config).wind.turbulence:  # which needs a mean wind
+        overrides = {"wind.velocity": [1.0, 0.0, 0.0], **overrides}
     drawn = OFF | {f"randomization.{key}": WIDTHS[key] for key in varied}
     vec = ml.make_vec(config, num_envs=2, num_threads=1, **drawn, **overrides)
     for _ in range(2):

@@ -85,11 +85,16 @@ def test_drones_are_told_their_planned_offset():
     assert (who == 0).any()
 
 
+TOLD = {"task_options.broadcast": True}
+
+
 @pytest.mark.parametrize("name", ["loss", "loss_6"])
 def test_giving_way_halves_the_snatch(name):
     peaks = {}
     for script in ("formation_integral", "formation_redistributed"):
-        vec = make(name, num_envs=16, num_drones=load_config(name).env.num_drones, **{"control.max_offset": 1.0})
+        vec = make(
+            name, num_envs=16, num_drones=load_config(name).env.num_drones, **{"control.max_offset": 1.0, **TOLD}
+        )
         team, (observation, _) = make_scripted(script, vec), vec.reset(seed=0)
         for _ in range(280):  # the last loss is at 4 s, its snatch 0.6 s later
             observation = vec.step(team.act(observation))[0]

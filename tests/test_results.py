@@ -63,7 +63,7 @@ def test_flights_are_flown_a_thousand_times_by_shipped_teams_and_scripts():
         evaluated, reported = (
             {path.stem for path in (ROOT / "results" / name).glob(kind)} for kind in ("*.npz", "*.json")
         )
-        assert evaluated == reported >= set(flight.scripts or fitting)
+        assert evaluated == reported - {"shifts"} >= set(flight.scripts or fitting)
         compared += "seed0" in evaluated and bool(evaluated & set(fitting))
         for team in evaluated:
             reported = json.loads((ROOT / "results" / name / f"{team}.json").read_text(encoding="utf-8"))

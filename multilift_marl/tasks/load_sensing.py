@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import radians, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from multilift_marl._jit import kernel, prebind
-from multilift_marl.control.formation import goal_hook
+from multilift_marl.control.formation import Goal, Rig, goal_hook
 from multilift_marl.math3d import (
     add,
     mat,
@@ -96,6 +96,21 @@ class LoadSensor(NamedTuple):
     """Alpha and beta of attitudes."""
 
 
+class Scene(NamedTuple):
+    """What the sensors of the payload are about."""
+
+    true: SystemState
+    own: SystemState
+    """What the drones know of themselves."""
+    planned: Goal
+    """About which they fly."""
+    rig: Rig
+    resting_tension: np.ndarray
+    """(N,) [N]."""
+    memory: LoadMemory
+    sensor: LoadSensor
+
+
 ACCELERATION, ANGULAR_ACCELERATION = 2.0, 10.0  # [m/s²], [rad/s²] assumed standard deviations, Kalata's σ_w
 
 
@@ -164,12 +179,11 @@ class LoadSensing:
         memory.generator[env] = seed.generate_state(1, np.uint64)[0]
         draw_offsets(env, memory, self._sensor)
 
-    def bind(self, planned: Any, rig: Any, resting_tension: np.ndarray, first: bool) -> Call:
+    def bind(self, planned: Goal, rig: Rig, resting_tension: np.ndarray, first: bool) -> Call:
         """Return the call of (lo, hi) that measures the payload; `first` of an episode, without a past to filter."""
-        common = (self._true, self._own, self.load, planned, rig, resting_tension, self._memory, self._sensor, first)
-        if self._level == "mocap":
-            return prebind(see_payload, self._true, self.load, resting_tension, self._memory, self._sensor, first)
-        return prebind(see_cable if self._level == "onboard" else suppose_cable, *common)
+        see = {"mocap": see_payload, "onboard": see_cable, "blind": suppose_cable}[self._level]
+        scene = Scene(self._true, self._own, planned, rig, resting_tension, self._memory, self._sensor)
+        return prebind(see, scene, self.load, first)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the live arrays that outlive a step."""
@@ -200,18 +214,16 @@ def _follow(e, k, place, velocity, load, sensor, first):
 
 
 @kernel
-def see_payload(lo, hi, true, load, resting_tension, memory, sensor, first):
-    """Measure pose and tension by cameras: `mocap`.
+def see_payload(lo, hi, scene, load, first):
+    """Measure the payload's pose by cameras: `mocap`.
 
     Args:
         lo, hi: the environments.
-        true: SystemState.
+        scene: Scene; the generators of its memory advance.
         load: Load, written.
-        resting_tension: (N,) [N].
-        memory: LoadMemory; its generators advance.
-        sensor: LoadSensor.
         first: whether an episode begins.
     """
+    true, memory, sensor = scene.true, scene.memory, scene.sensor
     for e in range(lo, hi):
         # The pose of `delay` ago, to first order in it.
         velocity, attitude = row(true.payload_velocity, e), matrow(true.payload_rotation, e)
@@ -235,25 +247,13 @@ def see_payload(lo, hi, true, load, resting_tension, memory, sensor, first):
             putmat(load.rotation[e, 0], corrected)
             put(load.body_rates[e, 0], tmul(corrected, add(spin, scale(beta / sensor.dt, gap))))
         for n in range(load.tension.shape[1]):
-            load.tension[e, n] = resting_tension[n]
+            load.tension[e, n] = scene.resting_tension[n]
 
 
 @kernel
-def see_cable(lo, hi, true, own, load, planned, rig, resting_tension, memory, sensor, first):
-    """Measure direction and tension of each drone's own cable: `onboard`.
-
-    Args:
-        lo, hi: the environments.
-        true: SystemState.
-        own: SystemState, what the drones know of themselves.
-        load: Load, written.
-        planned: Goal about which they fly.
-        rig: Rig.
-        resting_tension: (N,) [N].
-        memory: LoadMemory; its generators advance.
-        sensor: LoadSensor.
-        first: whether an episode begins.
-    """
+def see_cable(lo, hi, scene, load, first):
+    """Measure direction and tension of each drone's own cable: `onboard`. Arguments are those of `see_payload`."""
+    true, own, rig, memory, sensor = scene.true, scene.own, scene.rig, scene.memory, scene.sensor
     for e in range(lo, hi):
         payload, payload_attitude = row(true.payload_position, e), matrow(true.payload_rotation, e)
         for n in range(load.tension.shape[1]):
@@ -264,43 +264,45 @@ def see_cable(lo, hi, true, own, load, planned, rig, resting_tension, memory, se
             off = add(vec(memory.offset, e, n), scale(sensor.direction, normal_vector(e, memory)))
             along = unit(add(along, off))
             off_tension = memory.tension_offset[e, n] + sensor.tension * normal_pair(e, memory)[0]
-            load.tension[e, n] = max(true.cable_tension[e, n] + off_tension * resting_tension[n], 0.0)
+            load.tension[e, n] = max(true.cable_tension[e, n] + off_tension * scene.resting_tension[n], 0.0)
             if true.cable_tension[e, n] == 0.0 and not first:  # slack or broken: it points nowhere
                 put(load.position[e, n], add(vec(load.position, e, n), scale(sensor.dt, vec(load.velocity, e, n))))
                 continue
 
             # The anchor is a nominal length along it; the payload as it is planned to stand about its anchor.
-            reach = norm(_planned_cable(e, n, planned, rig))
+            reach = norm(_planned_cable(e, n, scene))
             arm = mul(mat(own.drone_rotation, e, n), add(hook, scale(reach, along)))
-            _place(e, n, add(vec(own.drone_position, e, n), arm), own, load, planned, rig, sensor, first)
+            _place(e, n, add(vec(own.drone_position, e, n), arm), scene, load, first)
 
 
 @kernel
-def suppose_cable(lo, hi, true, own, load, planned, rig, resting_tension, memory, sensor, first):
-    """Suppose each cable as in the resting formation: `blind`. Arguments are those of `see_cable`."""
+def suppose_cable(lo, hi, scene, load, first):
+    """Suppose each cable as in the resting formation: `blind`. Arguments are those of `see_payload`."""
+    own, rig = scene.own, scene.rig
     for e in range(lo, hi):
         for n in range(load.tension.shape[1]):
-            load.tension[e, n] = resting_tension[n]
+            load.tension[e, n] = scene.resting_tension[n]
             hook = mul(mat(own.drone_rotation, e, n), row(rig.drones.hooks, n))
-            arm = sub(hook, _planned_cable(e, n, planned, rig))
-            _place(e, n, add(vec(own.drone_position, e, n), arm), own, load, planned, rig, sensor, True)
+            arm = sub(hook, _planned_cable(e, n, scene))
+            _place(e, n, add(vec(own.drone_position, e, n), arm), scene, load, True)
 
 
 @kernel
-def _planned_cable(e, n, planned, rig):
+def _planned_cable(e, n, scene):
     """Return the cable from anchor to hook at rest at the planned pose, world frame [m]."""
+    planned, rig = scene.planned, scene.rig
     anchor = add(row(planned.position, e), mul(matrow(planned.rotation, e), row(rig.anchors, n)))
     return sub(goal_hook(e, n, planned, rig), anchor)
 
 
 @kernel
-def _place(e, n, anchor, own, load, planned, rig, sensor, first):
+def _place(e, n, anchor, scene, load, first):
     """Write the payload that has drone n's anchor at a place [m], at the planned attitude and at rest in it."""
     # It is the anchor that is followed: the planned attitude may leap.
-    known = add(vec(load.position, e, n), mul(mat(load.rotation, e, n), row(rig.anchors, n)))
-    put(load.position[e, n], known)
-    _follow(e, n, anchor, vec(own.drone_velocity, e, n), load, sensor, first)
-    attitude = matrow(planned.rotation, e)
-    put(load.position[e, n], sub(vec(load.position, e, n), mul(attitude, row(rig.anchors, n))))
+    arm = row(scene.rig.anchors, n)
+    put(load.position[e, n], add(vec(load.position, e, n), mul(mat(load.rotation, e, n), arm)))
+    _follow(e, n, anchor, vec(scene.own.drone_velocity, e, n), load, scene.sensor, first)
+    attitude = matrow(scene.planned.rotation, e)
+    put(load.position[e, n], sub(vec(load.position, e, n), mul(attitude, arm)))
     putmat(load.rotation[e, n], attitude)
     put(load.body_rates[e, n], (0.0, 0.0, 0.0))

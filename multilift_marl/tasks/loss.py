@@ -241,7 +241,8 @@ class Loss(Task):
         start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.hanging)
         self.own.who[env] = rng.integers(self.world.num_drones)
         self.own.when[env] = rng.uniform(*self.options.loss_time)
-        self.mask.lost[env], self.own.peak_tension[env], self.own.known[env] = False, 0.0, False
+        self.mask.lost[env], self.own.peak_tension[env] = False, 0.0
+        self.own.known[env], self.own.known_who[env], self.own.known_when[env] = False, 0, 0.0
 
     def succeeded(self) -> np.ndarray:
         """At rest throughout the last seconds, with a drone less, and never too large a tension."""
