@@ -29,13 +29,27 @@ class Team:
         options.intra_op_num_threads = 1  # for networks this small, more of them only wait for each other
         path = folder / self.contract["network"]["file"]
         self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        self._gru = self.contract["network"].get("memory")  # None for a policy without one
+        self._memory = None
 
     def act(self, observation):
         """Return actions (batch, drones, A) in [-1, 1] for observations (batch, drones, D)."""
-        return self._session.run(["action"], {"observation": np.asarray(observation, np.float32)})[0]
+        inputs = {"observation": np.asarray(observation, np.float32)}
+        if self._gru is not None:
+            if self._memory is None:
+                self._memory = np.zeros((*inputs["observation"].shape[:2], self._gru["size"]), np.float32)
+            inputs[self._gru["input"]] = self._memory
+        action, *after = self._session.run(None, inputs)
+        if after:
+            self._memory = after[0]
+        return action
 
     def reset(self, mask=None):
-        """Do nothing: the policy has no state, its past is part of the observation."""
+        """Forget what was observed in the environments of the mask (None: all); only a GRU remembers anything."""
+        if mask is None:
+            self._memory = None
+        elif self._memory is not None:
+            self._memory[mask] = 0.0
 
 
 def check(contract, vec):

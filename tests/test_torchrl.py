@@ -76,6 +76,9 @@ def test_rollouts_go_on_as_with_torchrls_own_steps_and_resets(num_envs):
         theirs_stepped, theirs_now = theirs.step_and_maybe_reset(theirs_now)
         assert set(ours_now.keys(True, True)) == set(theirs_now.keys(True, True))
         assert bool((ours_stepped == theirs_stepped).all())
+        if ours_stepped["next", "done"].all():  # where EnvBase keeps what a policy has added
+            assert not ours_now.pop("memory").any() and theirs_now.pop("memory").all()
+            assert not ours_now["agents"].pop("action").any() and theirs_now["agents"].pop("action").any()
         assert bool((ours_now == theirs_now).all())
         ended += int(ours_stepped["next", "done"].sum())
     assert ended > num_envs

@@ -29,6 +29,7 @@ from multilift_marl.errors import ConfigError
         {"train.algorithm": "mappo", "train.desired_kl": 0.01},
         {"train.algorithm": "ippo", "env.history": 2},
         {"train.actor": "attention", "train.critic": "set"},
+        {"train.gru": 8, "train.sequence": 16, "env.episode_seconds": 0.5},
     ],
 )
 def test_ten_iterations_equal_five_a_stop_and_five_more(tmp_path, kind):

@@ -37,22 +37,31 @@ _TRACED = (2, 3)  # teams and drones to trace with: neither is 1, which the expo
 
 
 class _Mean(nn.Module):
-    """The deterministic policy: observations (batch, drones, D) to actions (batch, drones, A) within [-1, 1]."""
+    """The deterministic policy: observations (batch, drones, D) to actions (batch, drones, A) within [-1, 1].
+
+    With a GRU also its memory (batch, drones, H) before the step to that after it.
+    """
 
     def __init__(self, actor: Actor):
         super().__init__()
         self.actor = actor
         self.training = False  # which the exporter asks for; of the actor there is one mode only
 
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        return self.actor(observation)[0].clamp(-1, 1)
+    def forward(
+        self, observation: torch.Tensor, memory: torch.Tensor | None = None
+    ) -> torch.Tensor | tuple[torch.Tensor, torch.Tensor]:
+        if memory is None:
+            return self.actor(observation)[0].clamp(-1, 1)
+        memory = self.actor.remember(observation, memory)
+        return self.actor(observation, memory)[0].clamp(-1, 1), memory
 
 
 def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
     """Write policy.onnx and policy.json into a folder, which is made where there is none.
 
     The network takes `observation` (batch, drones, D) float32 and returns `action` (batch, drones, A) in [-1, 1], for
-    any batch and number of drones. What was written is compared with the policy before this returns.
+    any batch and number of drones. That of a policy with a GRU also takes `memory` (batch, drones, H), zeros at first,
+    and returns `next_memory`. What was written is compared with the policy before this returns.
 
     Args:
         policy: what to export.
@@ -68,7 +77,7 @@ def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
     """
     if not isinstance(policy, LearnedPolicy):
         raise ConfigError(f"{policy.source} is exported already; give the run or the checkpoint that it comes from")
-    contract = make_contract(policy)
+    contract, gru = make_contract(policy), policy.config.train.gru
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     model = _convert(policy)
@@ -77,6 +86,7 @@ def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
         "file": NETWORK,
         "input": "observation",
         "output": "action",
+        "memory": {"input": "memory", "output": "next_memory", "size": gru} if gru else None,
         "opset": model.opset_import[0].version,
         "largest_difference": _compare(policy, folder / NETWORK),
     }
@@ -87,12 +97,16 @@ def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
 
 def _convert(policy: LearnedPolicy) -> onnx.ModelProto:
     """Return the network as an ONNX model, without what the exporter notes about this machine's source files."""
-    observation = torch.zeros(*_TRACED, len(policy.observation_names))
+    gru = policy.config.train.gru
+    inputs, outputs = {"observation": torch.zeros(*_TRACED, len(policy.observation_names))}, ["action"]
+    if gru:
+        inputs["memory"] = torch.zeros(*_TRACED, gru)
+        outputs.append("next_memory")
     free = {0: torch.export.Dim("batch"), 1: torch.export.Dim("drones")}
     with _silence(), torch.no_grad():
         program = torch.onnx.export(
-            _Mean(policy.actor), (observation,), dynamo=True, dynamic_shapes={"observation": free},
-            input_names=["observation"], output_names=["action"], verbose=False,
+            _Mean(policy.actor), tuple(inputs.values()), dynamo=True, dynamic_shapes=dict.fromkeys(inputs, free),
+            input_names=list(inputs), output_names=outputs, verbose=False,
         )  # fmt: skip
     assert program is not None
     model = program.model_proto
@@ -112,6 +126,7 @@ def _silence() -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)
+            warnings.filterwarnings("ignore", "# The axis name", UserWarning)  # of dimensions that two inputs share
             yield
     finally:
         logger.setLevel(level)
@@ -120,13 +135,17 @@ def _silence() -> Iterator[None]:
 def _compare(policy: LearnedPolicy, path: Path) -> float:
     """Return the largest difference of onnxruntime's actions from the policy's, over teams of several sizes."""
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    normalizer, rng = policy.actor.normalizer, np.random.default_rng(0)
-    worst = 0.0
+    normalizer, rng, gru = policy.actor.normalizer, np.random.default_rng(0), policy.config.train.gru
+    learned, worst = policy.copy(), 0.0
     for drones in (1, 2, policy.config.env.num_drones, 7):
-        spread = rng.standard_normal((5, drones, len(policy.observation_names)), np.float32)
-        observation = normalizer.shift.numpy() + spread / normalizer.scale.numpy()
-        (action,) = session.run(["action"], {"observation": observation})
-        worst = max(worst, float(np.abs(action - policy.act(observation)).max()))
+        learned.reset()
+        memory = {"memory": np.zeros((5, drones, gru), np.float32)} if gru else {}
+        for _ in range(3 if gru else 1):
+            spread = rng.standard_normal((5, drones, len(policy.observation_names)), np.float32)
+            observation = normalizer.shift.numpy() + spread / normalizer.scale.numpy()
+            action, *after = session.run(None, {"observation": observation} | memory)
+            memory = {"memory": after[0]} if gru else {}
+            worst = max(worst, float(np.abs(action - learned.act(observation)).max()))
     if not worst <= _TOLERANCE:
         raise RuntimeError(
             f"{path} differs from {policy.source} by {worst:.1e} in its actions, more than {_TOLERANCE:.0e}; use other "

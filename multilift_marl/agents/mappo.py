@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.distributions import Independent, Normal
 from torchrl.modules import PopArtValueNorm
@@ -15,22 +16,42 @@ from torchrl.modules import PopArtValueNorm
 from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, TeamNet, draw_action
 from multilift_marl.config.schema import TrainConfig
 from multilift_marl.control.scripted import residual_matrix
+from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
 from multilift_marl.tasks.observations import drone_numbers
 
+_OBSERVATION, _ACTION, _LOG_PROB, _MEMORY = (
+    ("agents", name) for name in ("observation", "action", "action_log_prob", "memory")
+)
 
-class StochasticPolicy(nn.Module):
-    """The policy of the rollouts: actions drawn from the actor's Gaussian, and their log-probabilities."""
+
+class StochasticPolicy(TensorDictModuleBase):
+    """The policy of the rollouts: actions drawn from the actor's Gaussian, and their log-probabilities.
+
+    Reads the observation, writes ("agents", "action") and ("agents", "action_log_prob"). With a GRU it also reads the
+    memory, ("agents", "memory"), and writes the next one, which the environment carries to the next step.
+    """
 
     def __init__(self, actor: Actor):
         super().__init__()
         self.actor = actor
+        self.in_keys: list[NestedKey] = [_OBSERVATION]
+        self.out_keys: list[NestedKey] = [_ACTION, _LOG_PROB]
+        if actor.memory is not None:
+            self.in_keys.append(_MEMORY)
+            self.out_keys.append(("next", *_MEMORY))
 
     @torch.no_grad()
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return actions (..., N, A) and log-probabilities (..., N) for observations (..., N, D)."""
-        return draw_action(self.actor(observation)[0], self.actor.log_std.exp())
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act."""
+        observation, memory = tensordict[_OBSERVATION], None
+        if self.actor.memory is not None:
+            memory = self.actor.remember(observation, tensordict[_MEMORY])
+            tensordict["next", *_MEMORY] = memory
+        mean = self.actor(observation, memory)[0]
+        tensordict[_ACTION], tensordict[_LOG_PROB] = draw_action(mean, self.actor.log_std.exp())
+        return tensordict
 
 
 @dataclass
@@ -40,7 +61,7 @@ class Learner:
     config: TrainConfig
     actor: Actor
     critic: CentralCritic | LocalCritic
-    policy: TensorDictModule
+    policy: StochasticPolicy
     optimizer: torch.optim.Adam
 
     def critic_input(self, batch: TensorDictBase) -> torch.Tensor:
@@ -62,12 +83,8 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     # 1. The policy: own observation to a Gaussian over the own action.
     vec = env.vec
     base = torch.from_numpy(residual_matrix(config.residual, vec))
-    actor = Actor(config.actor, vec.observation_size, vec.action_size, config.hidden, config.initial_std, base)
-    policy = TensorDictModule(
-        StochasticPolicy(actor),
-        in_keys=[("agents", "observation")],
-        out_keys=[("agents", "action"), ("agents", "action_log_prob")],
-    )
+    sizes = (vec.observation_size, vec.action_size)
+    actor = Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru)
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
@@ -81,7 +98,33 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     # 3. The optimiser, with rates of their own.
     groups = [{"params": list(actor.parameters())}, {"params": list(critic.parameters())}]
     optimizer = torch.optim.Adam(groups, lr=config.learning_rate, eps=1e-5, fused=True)
-    return Learner(config, actor, critic, policy, optimizer)
+    return Learner(config, actor, critic, StochasticPolicy(actor), optimizer)
+
+
+def check_batch(train: TrainConfig, vec: MultiliftVec) -> None:
+    """Refuse, by a ConfigError, batches that cannot be divided as asked, or are larger than this machine's memory."""
+    steps = vec.num_envs * train.horizon
+    rows, what = steps, "steps"
+    if train.gru:
+        if train.horizon % train.sequence:
+            raise ConfigError(
+                f"train.horizon={train.horizon} is no multiple of train.sequence={train.sequence}, the steps that "
+                "gradients of a GRU go back; change one of them"
+            )
+        rows, what = steps // train.sequence, "sequences"
+    if train.minibatches > rows:
+        raise ConfigError(
+            f"train.minibatches={train.minibatches} exceeds the {rows} {what} of a batch; lower it or raise "
+            "train.horizon or env.num_envs"
+        )
+    per_drone = 2 * (vec.observation_size + vec.action_size + train.gru) + 6
+    needed = 4 * steps * (2 * vec.state_size + vec.num_drones * per_drone)
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise ConfigError(
+            f"a batch of {steps} steps takes {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
+            "train.horizon or env.num_envs"
+        )
 
 
 @torch.no_grad()
@@ -113,15 +156,16 @@ def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
         batch: what the collector returned; not changed.
     """
     config, start = learner.config, time.perf_counter()
-    observation, critic_input = batch["agents", "observation"], learner.critic_input(batch)
+    observation, critic_input = batch[_OBSERVATION], learner.critic_input(batch)
 
     # 1. Advantages, from values of the critic before the update, normalised over the batch.
     advantage, value = estimate_advantage(learner, batch)
     target = advantage + value
     explained = 1 - (target - value).var() / target.var().clamp(min=1e-8)
     advantage = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
-    action, log_prob = batch["agents", "action"], batch["agents", "action_log_prob"]
-    columns = [each.flatten(0, 1) for each in (observation, action, log_prob, advantage, critic_input, target)]
+    columns = [observation, batch[_ACTION], batch[_LOG_PROB], advantage, critic_input, target]
+    columns += [] if learner.actor.memory is None else [batch[_MEMORY], mark_starts(batch)]
+    columns = [split_batch(column, config.sequence if config.gru else 0) for column in columns]
 
     # 2. Some epochs of minibatches, fewer if the policy moves too far.
     actor_parameters, critic_parameters = (group["params"] for group in learner.optimizer.param_groups)
@@ -131,8 +175,8 @@ def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
         order = torch.randperm(len(columns[0]))
         for chunk in order.chunk(config.minibatches):
             rows = [column.index_select(0, chunk) for column in columns]
-            policy_loss, entropy, kl, clipped = surrogate_loss(learner, *rows[:4])
-            critic_loss = config.value_weight * value_loss(learner, *rows[4:])
+            policy_loss, entropy, kl, clipped = surrogate_loss(learner, *rows[:4], *rows[6:])
+            critic_loss = config.value_weight * value_loss(learner, *rows[4:6])
             total = policy_loss + critic_loss
             if config.entropy > 0:
                 total = total - config.entropy * entropy
@@ -163,12 +207,29 @@ def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
     }
 
 
+def mark_starts(batch: TensorDictBase) -> torch.Tensor:
+    """Return which steps (E, T) of rollouts are the first of an episode; of a batch's first steps nothing is known."""
+    done = batch["next", "done"].squeeze(-1)
+    return torch.cat([torch.zeros_like(done[:, :1]), done[:, :-1]], 1)
+
+
+def split_batch(column: torch.Tensor, sequence: int) -> torch.Tensor:
+    """Return rollouts (E, T, ...) as what minibatches are drawn from: steps, or sequences of so many steps."""
+    return column.flatten(0, 1) if sequence == 0 else column.unflatten(1, (-1, sequence)).flatten(0, 1)
+
+
 def surrogate_loss(
-    learner: Learner, observation: torch.Tensor, action: torch.Tensor, log_prob: torch.Tensor, advantage: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the clipped loss (Schulman et al., arXiv 1707.06347), entropy, approximate KL and clipped share."""
+    learner: Learner, observation: torch.Tensor, action: torch.Tensor, log_prob: torch.Tensor, advantage: torch.Tensor,
+    memory: torch.Tensor | None = None, started: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    """Return the clipped loss (Schulman et al., arXiv 1707.06347), entropy, approximate KL and clipped share.
+
+    With a GRU all is of sequences (B, L, ...), of whose memories (B, L, N, H) in the rollouts the first is taken.
+    """
     clip = torch.tensor(learner.config.clip)
-    distribution = Independent(Normal(*learner.actor(observation)), 1)
+    if memory is not None and started is not None:
+        memory = learner.actor.unroll(observation, memory[:, 0], started)
+    distribution = Independent(Normal(*learner.actor(observation, memory)), 1)
     log_ratio = (distribution.log_prob(action) - log_prob).unsqueeze(-1)
     clipped = log_ratio.clamp((-clip).log1p(), clip.log1p())
     gain = torch.stack([log_ratio.exp() * advantage, clipped.exp() * advantage], -1).min(dim=-1).values

@@ -126,11 +126,40 @@ class TeamNet(nn.Module):
         return self.net(torch.cat([held, others], -1))
 
 
+class Memory(nn.GRUCell):
+    """What each drone remembers of its earlier observations: a gated recurrent unit (Cho et al. 2014)."""
+
+    def remember(self, rows: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:
+        """Return the memory (..., N, H) after the rows (..., N, D) of one step, given that before it."""
+        return self(rows.flatten(0, -2), memory.flatten(0, -2)).reshape(memory.shape)
+
+    def unroll(self, rows: torch.Tensor, memory: torch.Tensor, started: torch.Tensor) -> torch.Tensor:
+        """Return the memories (B, L, N, H) after each step of sequences.
+
+        Args:
+            rows: (B, L, N, D).
+            memory: (B, N, H) before the first step.
+            started: (B, L), steps that are the first of an episode; the first step's memory stands as given.
+        """
+        # Input gates of all steps at once; only the recurrent ones have to wait for each other.
+        reset_in, update_in, new_in = nn.functional.linear(rows, self.weight_ih, self.bias_ih).chunk(3, -1)
+        goes_on = (~started).to(rows.dtype)[..., None, None]
+        memories = []
+        for t in range(rows.shape[1]):
+            if t > 0:
+                memory = memory * goes_on[:, t]
+            reset, update, new = nn.functional.linear(memory, self.weight_hh, self.bias_hh).chunk(3, -1)
+            new = torch.tanh(new_in[:, t] + torch.sigmoid(reset_in[:, t] + reset) * new)
+            memory = torch.lerp(new, memory, torch.sigmoid(update_in[:, t] + update))
+            memories.append(memory)
+        return torch.stack(memories, 1)
+
+
 class Actor(nn.Module):
     """Gaussian policy of a drone, the same for all: observations (..., N, D) to mean and deviation (..., N, A).
 
     Its mean is that of a linear script, `base` (A, D), plus a network whose last layer starts at zero: an untrained
-    team acts as the script.
+    team acts as the script. With a GRU the network takes the drone's memory beside the observation.
 
     Args:
         kind: what drones know of each other; see `TeamNet`. With "local" each acts on its own observation alone.
@@ -138,24 +167,45 @@ class Actor(nn.Module):
         hidden: widths of the hidden layers.
         initial_std: deviation at the start.
         base: of the script.
+        gru: H, size of the memory; 0 for a policy without.
     """
 
     base: torch.Tensor
 
     def __init__(
         self, kind: str, observation_size: int, action_size: int, hidden: Sequence[int], initial_std: float,
-        base: torch.Tensor,
+        base: torch.Tensor, gru: int = 0,
     ):  # fmt: skip
         super().__init__()
         self.normalizer = Normalizer(observation_size)
-        self.team = TeamNet(kind, observation_size, hidden, action_size, gain=0.0)
+        self.team = TeamNet(kind, observation_size + gru, hidden, action_size, gain=0.0)
+        self.memory = Memory(observation_size, gru) if gru else None
         self.register_buffer("base", base)
         self.log_std = nn.Parameter(torch.full((action_size,), math.log(initial_std)))
 
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return mean and standard deviation of the action."""
-        mean = self.team(self.normalizer(observation)) + observation @ self.base.T
+    def forward(
+        self, observation: torch.Tensor, memory: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return mean and standard deviation of the action.
+
+        Args:
+            observation: (..., N, D).
+            memory: (..., N, H) that has taken in this observation, of a policy with a GRU.
+        """
+        rows = self.normalizer(observation)
+        inputs = rows if memory is None else torch.cat([rows, memory], -1)
+        mean = self.team(inputs) + observation @ self.base.T
         return mean, self.log_std.exp().expand_as(mean)
+
+    def remember(self, observation: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:
+        """Return the memory (..., N, H) that has taken in one more observation (..., N, D)."""
+        assert self.memory is not None
+        return self.memory.remember(self.normalizer(observation), memory)
+
+    def unroll(self, observation: torch.Tensor, memory: torch.Tensor, started: torch.Tensor) -> torch.Tensor:
+        """Return the memories (B, L, N, H) of sequences of observations (B, L, N, D); see `Memory.unroll`."""
+        assert self.memory is not None
+        return self.memory.unroll(self.normalizer(observation), memory, started)
 
 
 @torch.no_grad()

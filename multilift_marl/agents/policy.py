@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 from collections.abc import Iterable
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -46,13 +47,34 @@ class TrainedPolicy:
         self.observation_names = tuple(observation_names)
         self.action_names = tuple(action_names)
         self.folder = Path(source).parent
+        self._memory: np.ndarray | None = None  # (B, N, H) of a policy with a GRU
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (..., N, A) float32 within [-1, 1] for observations (..., N, D).
 
+        A policy with a GRU remembers what it has observed since `reset`: ask it once in each policy step.
+
         Raises:
-            ValueError: observations of another size than the policy was trained with.
+            ValueError: observations of another size than the policy was trained with, or of other environments or
+                drones than it remembers.
         """
+        observation = self._checked(observation)
+        teams = observation.reshape(-1, *observation.shape[-2:])
+        if self.config.train.gru == 0:
+            action, _ = self._act(teams, None)
+        else:
+            if self._memory is None:
+                self._memory = np.zeros((*teams.shape[:-1], self.config.train.gru), np.float32)
+            if self._memory.shape[:-1] != teams.shape[:-1]:
+                raise ValueError(
+                    f"the policy of {self.source} remembers (environments, drones) {self._memory.shape[:-1]}, but "
+                    f"observes {teams.shape[:-1]}; call reset() before other environments, or bind(vec) for a copy"
+                )
+            action, self._memory = self._act(teams, self._memory)
+        return action.reshape(*observation.shape[:-1], -1)
+
+    def _act(self, observation: np.ndarray, memory: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return actions (B, N, A) for observations (B, N, D), and the memory (B, N, H) of a policy with a GRU."""
         raise NotImplementedError
 
     def _checked(self, observation: np.ndarray) -> np.ndarray:
@@ -64,15 +86,21 @@ class TrainedPolicy:
             )
         return observation
 
-    def bind(self, vec: MultiliftVec) -> TrainedPolicy:
-        """Return this policy, checked to fit the environments `vec`.
+    def bind(self, vec: MultiliftVec) -> Self:
+        """Return this policy, with a memory of its own, checked to fit the environments `vec`.
 
         Raises:
             ConfigError: it was trained with other actions or observations, see `misfit`.
         """
         if reason := self.misfit(vec):
             raise ConfigError(f"the policy of {self.source} {reason}")
-        return self
+        return self.copy()
+
+    def copy(self) -> Self:
+        """Return this policy with a memory of its own, empty."""
+        other = copy.copy(self)
+        other.reset()
+        return other
 
     def misfit(self, vec: MultiliftVec) -> str:
         """Return why the policy does not fit `vec`, as the rest of a sentence, "" if it does."""
@@ -91,7 +119,11 @@ class TrainedPolicy:
         return ""
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget nothing: the policy has no memory of its own."""
+        """Forget what was observed in the environments of the mask (E,) bool (None: all)."""
+        if mask is None:
+            self._memory = None
+        elif self._memory is not None:
+            self._memory[np.asarray(mask, bool)] = 0.0
 
 
 class LearnedPolicy(TrainedPolicy):
@@ -126,7 +158,8 @@ class LearnedPolicy(TrainedPolicy):
         size = (len(self.observation_names), len(self.action_names))
         train = config.train
         with torch.random.fork_rng(devices=[]):  # initial weights, overwritten at once, must not cost random numbers
-            self.actor = Actor(train.actor, *size, train.hidden, train.initial_std, torch.zeros(size[1], size[0]))
+            base = torch.zeros(size[1], size[0])
+            self.actor = Actor(train.actor, *size, train.hidden, train.initial_std, base, train.gru)
         try:
             check_like(content["actor"], self.actor.state_dict(), "actor")
         except ValueError as error:
@@ -135,17 +168,15 @@ class LearnedPolicy(TrainedPolicy):
             ) from error
         self.actor.load_state_dict(content["actor"])
 
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the mean action (..., N, A) float32 within [-1, 1] for observations (..., N, D).
-
-        Raises:
-            ValueError: observations of another size than the policy was trained with.
-        """
+    def _act(self, observation: np.ndarray, memory: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
         import torch
 
         with torch.no_grad():
-            action: np.ndarray = self.actor(torch.from_numpy(self._checked(observation)))[0].clamp(-1, 1).numpy()
-        return action
+            observed, held = torch.from_numpy(observation), None
+            if memory is not None:
+                held = self.actor.remember(observed, torch.from_numpy(memory))
+            action = self.actor(observed, held)[0].clamp(-1, 1)
+        return action.numpy(), None if held is None else held.numpy()
 
 
 class ExportedPolicy(TrainedPolicy):
@@ -173,12 +204,10 @@ class ExportedPolicy(TrainedPolicy):
         super().__init__(build_config(config), observation, action, str(path))
         self._session = _open(path)
 
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """See `TrainedPolicy.act`."""
-        observation = self._checked(observation)
-        teams = observation.reshape(-1, *observation.shape[-2:])
-        (action,) = self._session.run(["action"], {"observation": teams})
-        return np.clip(action, -1, 1).reshape(*observation.shape[:-1], -1)
+    def _act(self, observation: np.ndarray, memory: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        given = {"observation": observation} | ({} if memory is None else {"memory": memory})
+        action, *after = self._session.run(None, given)
+        return np.clip(action, -1, 1), after[0] if after else None
 
 
 class Script(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import signal
 import tempfile
 import time
@@ -28,11 +27,10 @@ from multilift_marl.agents.checkpoint import (
 )
 from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import RunLog, write_versions
-from multilift_marl.agents.mappo import adapted_rate, make_learner, update
+from multilift_marl.agents.mappo import adapted_rate, check_batch, make_learner, update
 from multilift_marl.agents.policy import check_policy
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, dump_config
-from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason
 from multilift_marl.evaluation.rollout import trace_episode
@@ -62,15 +60,11 @@ class Trainer:
         for key in config.train.overrides:
             if key.partition(".")[0] in ("task", "seed", "train", "eval"):
                 raise ConfigError(f"train.overrides changes the environment and cannot hold '{key}'; set {key} itself")
-        self.env = MultiliftEnv(build_config(config.model_dump(), config.train.overrides))
+        environment = build_config(config.model_dump(), config.train.overrides)
+        self.env = MultiliftEnv(environment, memory=config.train.gru)
         self.frames_per_batch = self.env.vec.num_envs * config.train.horizon
-        _check_memory(self.env.vec, self.frames_per_batch)
+        check_batch(config.train, self.env.vec)
         self.learner = make_learner(config.train, self.env)
-        if config.train.minibatches > self.frames_per_batch:
-            raise ConfigError(
-                f"train.minibatches={config.train.minibatches} exceeds the {self.frames_per_batch} steps of a batch; "
-                "lower it or raise train.horizon or env.num_envs"
-            )
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
         self.evaluator = Evaluator(config)
@@ -338,17 +332,6 @@ def _quietly(show: Callable[..., object], *arguments: Any) -> None:
     """Show something on a terminal that may be gone."""
     with suppress(OSError):
         show(*arguments)
-
-
-def _check_memory(vec: MultiliftVec, steps: int) -> None:
-    """Refuse a batch that is larger than this machine's memory."""
-    numbers = 2 * vec.state_size + vec.num_drones * (2 * vec.observation_size + 2 * vec.action_size + 6)
-    needed, there = 4 * steps * numbers, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > there:
-        raise ConfigError(
-            f"a batch of {steps} steps takes {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
-            "train.horizon or env.num_envs"
-        )
 
 
 def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Trainer:

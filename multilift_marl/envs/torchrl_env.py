@@ -28,6 +28,8 @@ class MultiliftEnv(EnvBase):
         config: what to build.
         purpose: see MultiliftVec.
         first_env: see MultiliftVec.
+        memory: H, of a policy that writes its memory ("next", "agents", "memory") (E, N, H) in each step and reads it
+            as ("agents", "memory") in the next one; 0 where an episode starts.
 
     Attributes:
         vec: the batched core underneath.
@@ -37,13 +39,17 @@ class MultiliftEnv(EnvBase):
         ConfigError: see `MultiliftVec`.
     """
 
-    def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0):
+    def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0, memory: int = 0):
         self.vec = vec = MultiliftVec(config, purpose, first_env)
         super().__init__(device="cpu", batch_size=[vec.num_envs])
         self.group_map = {"agents": [f"drone_{n}" for n in range(vec.num_drones)]}
         e, n, flag = vec.num_envs, vec.num_drones, Binary(1, (vec.num_envs, 1), dtype=torch.bool)
+        agents = {"observation": Unbounded((e, n, vec.observation_size))}
+        self._memory: torch.Tensor | None = None  # before the next step
+        if memory:
+            agents["memory"], self._memory = Unbounded((e, n, memory)), torch.zeros(e, n, memory)
         self.observation_spec = Composite(
-            agents=Composite(observation=Unbounded((e, n, vec.observation_size)), shape=(e, n)),
+            agents=Composite(agents, shape=(e, n)),
             state=Unbounded((e, vec.state_size)),
             info=Composite(
                 success=flag.clone(), failure=flag.clone(), diverged=flag.clone(),
@@ -66,10 +72,15 @@ class MultiliftEnv(EnvBase):
             self._resumed = False  # the restored episodes go on
             observation, info = self.vec.current()
         else:
+            if mask is None and self._memory is not None:
+                self._memory = torch.zeros_like(self._memory)
             seed, self._seed, self._resumed = self._seed, None, False
             observation, info = self.vec.reset(seed, None if mask is None else mask.reshape(-1).numpy())
         ended = torch.from_numpy(self.vec.ended).unsqueeze(-1)  # of environments that this reset leaves alone
-        return self._package(observation, info, ended & self._terminated, ended & ~self._terminated)
+        package = self._package(observation, info, ended & self._terminated, ended & ~self._terminated)
+        if mask is None and self._memory is not None:
+            package["agents", "memory"] = self._memory
+        return package
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["agents", "action"].detach().numpy()
@@ -86,17 +97,21 @@ class MultiliftEnv(EnvBase):
         """Start new episodes where `tensordict`, the root of a next step, is done.
 
         As `EnvBase.maybe_reset` does, but without its merging: all rows of what the environment tells are the core's,
-        those of episodes that go on, too. What a policy has added is 0 where an episode starts, unless all do.
+        those of episodes that go on, too. What a policy has added, such as its memory, is 0 where an episode starts.
         """
         done = tensordict["done"]
-        if not done.any():
-            return tensordict
+        if done.any():
+            tensordict = self._start_where(done, tensordict)
+        if self._memory is not None:
+            self._memory = tensordict["agents", "memory"]
+        return tensordict
+
+    def _start_where(self, done: torch.Tensor, tensordict: TensorDictBase) -> TensorDictBase:
         fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
-        started = done.new_zeros(()) if done.all() else done
         known = set(fresh.keys(True, True))
         for key, value in tensordict.items(True, True):
             if key not in known:
-                fresh.set(key, value.masked_fill(started.reshape(-1, *(1,) * (value.dim() - 1)), 0))
+                fresh.set(key, value.masked_fill(done.reshape(-1, *(1,) * (value.dim() - 1)), 0))
         return fresh
 
     def _package(
@@ -126,7 +141,8 @@ class MultiliftEnv(EnvBase):
 
     def get_state(self) -> dict[str, torch.Tensor]:
         """Return everything that later steps depend on, as tensors."""
-        return {key: torch.from_numpy(array) for key, array in self.vec.state_dict().items()}
+        state = {key: torch.from_numpy(array) for key, array in self.vec.state_dict().items()}
+        return state if self._memory is None else state | {"memory": self._memory}
 
     def set_state(self, saved: dict[str, torch.Tensor]) -> None:
         """Continue bit for bit from what `get_state` returned: the next full reset returns the restored episodes.
@@ -134,6 +150,12 @@ class MultiliftEnv(EnvBase):
         Raises:
             ValueError: see `MultiliftVec.load_state_dict`.
         """
+        saved = dict(saved)
+        if self._memory is not None:
+            memory = saved.pop("memory", None)
+            if memory is None or memory.shape != self._memory.shape or not memory.isfinite().all():
+                raise ValueError(f"'memory' must be a finite tensor {tuple(self._memory.shape)}")
+            self._memory = memory.clone()
         self.vec.load_state_dict({key: np.asarray(tensor) for key, tensor in saved.items()})
         self._resumed = True
 
