@@ -12,7 +12,7 @@ from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError
 from multilift_marl.ros.policy_node import check_flyable
 from multilift_marl.sim.state import SystemState
-from multilift_marl.tasks.load_sensing import alpha_beta
+from multilift_marl.tasks.load_filter import alpha_beta
 
 LEVELS = ("mocap", "onboard", "blind")
 

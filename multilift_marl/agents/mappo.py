@@ -82,6 +82,12 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
         raise ConfigError(f"the last of train.hidden must be a multiple of {TeamNet.HEADS}, the heads of attention")
     # 1. The policy: own observation to a Gaussian over the own action.
     vec = env.vec
+    told = vec.config.env
+    if config.actor != "local" and told.sensing in ("onboard", "blind") and told.communication != "all":
+        raise ConfigError(
+            f"train.actor={config.actor} lets drones know what the others' networks hold, but with env.sensing="
+            f"{told.sensing} they hear of all others only by env.communication=all; set that, or train.actor=local"
+        )
     base = torch.from_numpy(residual_matrix(config.residual, vec))
     sizes = (vec.observation_size, vec.action_size)
     actor = Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru)

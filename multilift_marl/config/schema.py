@@ -58,6 +58,14 @@ class EnvConfig(Section):
     sensing: Literal["ideal", "mocap", "onboard", "blind"] = Field(
         "ideal", description="what drones know of themselves and of the payload (docs/sensing.md)"
     )
+    communication: Literal["none", "neighbours", "all"] = Field(
+        "none", description="whom a drone hears tell where its cable ends, with sensing=onboard or blind"
+    )
+    communication_delay: Int = Field(1, ge=0, le=100, description="[policy steps] until a message is heard")
+    communication_loss: Float = Field(0.0, ge=0, le=1, description="[-] share of the messages that are lost")
+    communication_range: Annotated[Float | None, Between(0, 1e6, "m")] = Field(
+        None, description="[m] beyond which drones do not hear each other; None: no limit"
+    )
     history: Int = Field(1, ge=1, le=50, description="steps that an observation holds, the newest first")
 
 

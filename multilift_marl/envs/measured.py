@@ -13,7 +13,7 @@ from multilift_marl.tasks.failures import CAUSES
 
 Measured = dict[str, np.ndarray]
 """Fields of `SystemState` by name, of one environment."""
-_PERFECT = {"env.sensing": "ideal"} | {
+_PERFECT = {"env.sensing": "ideal", "env.communication": "none"} | {
     f"randomization.{name}": value
     for name, value in (
         ("observation_noise", 0.0), ("observation_bias", 0.0), ("observation_delay", 0), ("action_delay", 0)

@@ -3,13 +3,13 @@
 `mocap`: cameras tell all drones one pose of the payload. `onboard`: a drone measures where its own cable points and how
 strongly it pulls, and takes the cable to be as long, and the payload as level, as planned. `blind`: it measures nothing
 of the load, and takes its cable to hang as in the resting formation. Velocities follow by an alpha-beta filter
-(Kalata, IEEE TAES 20(2), 1984).
+(Kalata, IEEE TAES 20(2), 1984). Drones that hear of others' anchors fit the payload to all that they know.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import radians, sqrt
+from math import radians
 from typing import NamedTuple
 
 import numpy as np
@@ -19,24 +19,23 @@ from multilift_marl.control.formation import Goal, Rig, goal_hook
 from multilift_marl.math3d import (
     add,
     mat,
-    matmul,
     matrow,
     mul,
     norm,
     put,
     putmat,
-    rotation_vector,
     row,
     scale,
     sub,
     tmul,
-    transpose,
     turn_by,
     unit,
     vec,
 )
 from multilift_marl.sim.gusts import normal_pair, normal_vector
 from multilift_marl.sim.state import SystemState
+from multilift_marl.tasks.communication import Links, empty_mail, exchange, make_mail, place_together
+from multilift_marl.tasks.load_filter import alpha_beta, follow_attitude, follow_position, keep_moving
 
 Call = Callable[[int, int], None]  # of environments lo to hi
 
@@ -107,25 +106,16 @@ class Scene(NamedTuple):
     rig: Rig
     resting_tension: np.ndarray
     """(N,) [N]."""
+    anchor: np.ndarray
+    """(E, N, 3) where each drone takes its cable to end, of `onboard` and `blind` [m]."""
+    knows_anchor: np.ndarray
+    """(E, N) whether it does: a slack cable points nowhere."""
     memory: LoadMemory
     sensor: LoadSensor
 
 
 ACCELERATION, ANGULAR_ACCELERATION = 2.0, 10.0  # [m/s²], [rad/s²] assumed standard deviations, Kalata's σ_w
-
-
-def alpha_beta(maneuver: float, noise: float, dt: float) -> tuple[float, float]:
-    """Return the steady gains of a filter of position and velocity (Kalata 1984).
-
-    Args:
-        maneuver: standard deviation of the acceleration between samples.
-        noise: of a measured position.
-        dt: from one sample to the next [s].
-    """
-    index = maneuver * dt**2 / noise
-    r = (4 + index - sqrt(8 * index + index**2)) / 4
-    alpha = 1 - r**2
-    return alpha, 2 * (2 - alpha) - 4 * sqrt(1 - alpha)
+_TURNED = 0.02  # [rad] standard deviation of an attitude that is fitted to anchors, 5 mm of them over 0.25 m
 
 
 def make_sensor(level: str, dt: float, length: float) -> LoadSensor:
@@ -142,11 +132,10 @@ def make_sensor(level: str, dt: float, length: float) -> LoadSensor:
         return LoadSensor(dt, 0.008, place, turned, follow=gains[0], turn=gains[1])
     if level == "onboard":  # an encoder at the hook, a load cell of 1 %
         direction = 5e-3
-        return LoadSensor(
-            dt, direction=direction, tension=0.01, follow=alpha_beta(ACCELERATION, direction * length, dt)
-        )
+        gains = alpha_beta(ACCELERATION, direction * length, dt), alpha_beta(ANGULAR_ACCELERATION, _TURNED, dt)
+        return LoadSensor(dt, direction=direction, tension=0.01, follow=gains[0], turn=gains[1])
     assert level == "blind", level
-    return LoadSensor(dt)
+    return LoadSensor(dt, turn=alpha_beta(ANGULAR_ACCELERATION, _TURNED, dt))
 
 
 class LoadSensing:
@@ -157,12 +146,15 @@ class LoadSensing:
         true, own: the true state, and that which the drones know of themselves.
         dt: a policy step [s].
         length: of the cables, the mean [m].
+        links: by which drones tell each other of their anchors; None: they do not.
 
     Attributes:
         load: Load.
     """
 
-    def __init__(self, level: str, true: SystemState, own: SystemState, dt: float, length: float):
+    def __init__(
+        self, level: str, true: SystemState, own: SystemState, dt: float, length: float, links: Links | None = None
+    ):  # fmt: skip
         e, n = true.cable_tension.shape
         rows = 1 if level == "mocap" else n
         self._level, self._true, self._own = level, true, own
@@ -171,24 +163,48 @@ class LoadSensing:
             np.zeros((e, rows, 3)), np.zeros((e, n)),
         )  # fmt: skip
         self._memory = LoadMemory(np.zeros(e, np.uint64), np.zeros((e, n, 3)), np.zeros((e, n)))
-        self._sensor = make_sensor(level, dt, length)
+        self._anchor, self._knows_anchor = np.zeros((e, n, 3)), np.ones((e, n), bool)
+        self._sensor, self._links = make_sensor(level, dt, length), links
+        self._mail = None if links is None else make_mail(e, n, links.delay)
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:
         """Begin an episode of one environment: draw offsets."""
         memory = self._memory
         memory.generator[env] = seed.generate_state(1, np.uint64)[0]
         draw_offsets(env, memory, self._sensor)
+        if self._mail is not None:
+            empty_mail(env, self._mail, seed.spawn(1)[0])
 
     def bind(self, planned: Goal, rig: Rig, resting_tension: np.ndarray, first: bool) -> Call:
         """Return the call of (lo, hi) that measures the payload; `first` of an episode, without a past to filter."""
-        see = {"mocap": see_payload, "onboard": see_cable, "blind": suppose_cable}[self._level]
-        scene = Scene(self._true, self._own, planned, rig, resting_tension, self._memory, self._sensor)
-        return prebind(see, scene, self.load, first)
+        scene = self._scene(planned, rig, resting_tension)
+        if self._level == "mocap":
+            return prebind(see_payload, scene, self.load, first)
+        see = prebind(see_cable if self._level == "onboard" else suppose_cable, scene, self.load, first)
+        if self._mail is None:
+            stages = [see, prebind(place_alone, scene, self.load, first or self._level == "blind")]
+        else:
+            told = (self._true.drone_position, self._anchor, self._knows_anchor)
+            stages = [see, prebind(exchange, *told, self._links, self._mail)]
+            stages.append(prebind(place_together, scene, self._mail, self.load, first))
+
+        def call(lo: int, hi: int) -> None:
+            for stage in stages:
+                stage(lo, hi)
+
+        return call
+
+    def _scene(self, planned: Goal, rig: Rig, resting_tension: np.ndarray) -> Scene:
+        return Scene(
+            self._true, self._own, planned, rig, resting_tension, self._anchor, self._knows_anchor, self._memory,
+            self._sensor,
+        )  # fmt: skip
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the live arrays that outlive a step."""
         arrays = {f"load_{name}": array for name, array in self.load._asdict().items()}
-        return arrays | {f"load_sensor_{name}": array for name, array in self._memory._asdict().items()}
+        arrays |= {f"load_sensor_{name}": array for name, array in self._memory._asdict().items()}
+        return arrays | ({} if self._mail is None else {f"mail_{k}": a for k, a in self._mail._asdict().items()})
 
 
 @kernel
@@ -197,20 +213,6 @@ def draw_offsets(e, memory, sensor):
     for n in range(memory.offset.shape[1]):
         put(memory.offset[e, n], scale(sensor.direction, normal_vector(e, memory)))
         memory.tension_offset[e, n] = 2.0 * sensor.tension * normal_pair(e, memory)[0]
-
-
-@kernel
-def _follow(e, k, place, velocity, load, sensor, first):
-    """Let position and velocity of row k follow a measured position; `first` they are what is given."""
-    if first:
-        put(load.position[e, k], place)
-        put(load.velocity[e, k], velocity)
-        return
-    alpha, beta = sensor.follow
-    expected = add(vec(load.position, e, k), scale(sensor.dt, vec(load.velocity, e, k)))
-    gap = sub(place, expected)
-    put(load.position[e, k], add(expected, scale(alpha, gap)))
-    put(load.velocity[e, k], add(vec(load.velocity, e, k), scale(beta / sensor.dt, gap)))
 
 
 @kernel
@@ -233,19 +235,8 @@ def see_payload(lo, hi, scene, load, first):
         off = sub(scale(sensor.rotation, normal_vector(e, memory)), scale(sensor.delay, spin))
         measured = turn_by(off, attitude)
 
-        _follow(e, 0, place, velocity, load, sensor, first)
-        if first:
-            putmat(load.rotation[e, 0], measured)
-            put(load.body_rates[e, 0], row(true.payload_body_rates, e))
-        else:
-            # The same filter for attitude and angular velocity, in the world frame.
-            alpha, beta = sensor.turn
-            spin = mul(mat(load.rotation, e, 0), vec(load.body_rates, e, 0))
-            expected = turn_by(scale(sensor.dt, spin), mat(load.rotation, e, 0))
-            gap = rotation_vector(matmul(measured, transpose(expected)))
-            corrected = turn_by(scale(alpha, gap), expected)
-            putmat(load.rotation[e, 0], corrected)
-            put(load.body_rates[e, 0], tmul(corrected, add(spin, scale(beta / sensor.dt, gap))))
+        follow_position(e, 0, place, velocity, load, sensor, first)
+        follow_attitude(e, 0, measured, row(true.payload_body_rates, e), load, sensor, first)
         for n in range(load.tension.shape[1]):
             load.tension[e, n] = scene.resting_tension[n]
 
@@ -265,14 +256,12 @@ def see_cable(lo, hi, scene, load, first):
             along = unit(add(along, off))
             off_tension = memory.tension_offset[e, n] + sensor.tension * normal_pair(e, memory)[0]
             load.tension[e, n] = max(true.cable_tension[e, n] + off_tension * scene.resting_tension[n], 0.0)
-            if true.cable_tension[e, n] == 0.0 and not first:  # slack or broken: it points nowhere
-                put(load.position[e, n], add(vec(load.position, e, n), scale(sensor.dt, vec(load.velocity, e, n))))
-                continue
+            scene.knows_anchor[e, n] = first or true.cable_tension[e, n] > 0.0  # slack or broken: it points nowhere
 
-            # The anchor is a nominal length along it; the payload as it is planned to stand about its anchor.
+            # The anchor is a nominal length along it.
             reach = norm(_planned_cable(e, n, scene))
             arm = mul(mat(own.drone_rotation, e, n), add(hook, scale(reach, along)))
-            _place(e, n, add(vec(own.drone_position, e, n), arm), scene, load, first)
+            put(scene.anchor[e, n], add(vec(own.drone_position, e, n), arm))
 
 
 @kernel
@@ -284,7 +273,7 @@ def suppose_cable(lo, hi, scene, load, first):
             load.tension[e, n] = scene.resting_tension[n]
             hook = mul(mat(own.drone_rotation, e, n), row(rig.drones.hooks, n))
             arm = sub(hook, _planned_cable(e, n, scene))
-            _place(e, n, add(vec(own.drone_position, e, n), arm), scene, load, True)
+            put(scene.anchor[e, n], add(vec(own.drone_position, e, n), arm))
 
 
 @kernel
@@ -296,13 +285,20 @@ def _planned_cable(e, n, scene):
 
 
 @kernel
-def _place(e, n, anchor, scene, load, first):
-    """Write the payload that has drone n's anchor at a place [m], at the planned attitude and at rest in it."""
-    # It is the anchor that is followed: the planned attitude may leap.
-    arm = row(scene.rig.anchors, n)
-    put(load.position[e, n], add(vec(load.position, e, n), mul(mat(load.rotation, e, n), arm)))
-    _follow(e, n, anchor, vec(scene.own.drone_velocity, e, n), load, scene.sensor, first)
-    attitude = matrow(scene.planned.rotation, e)
-    put(load.position[e, n], sub(vec(load.position, e, n), mul(attitude, arm)))
-    putmat(load.rotation[e, n], attitude)
-    put(load.body_rates[e, n], (0.0, 0.0, 0.0))
+def place_alone(lo, hi, scene, load, first):
+    """Write the payloads that have each drone's anchor where it takes it to be, at rest in the planned attitude."""
+    for e in range(lo, hi):
+        for n in range(load.tension.shape[1]):
+            if not scene.knows_anchor[e, n]:
+                keep_moving(e, n, load, scene.sensor)
+                continue
+            # It is the anchor that is followed: the planned attitude may leap.
+            arm = row(scene.rig.anchors, n)
+            put(load.position[e, n], add(vec(load.position, e, n), mul(mat(load.rotation, e, n), arm)))
+            follow_position(
+                e, n, vec(scene.anchor, e, n), vec(scene.own.drone_velocity, e, n), load, scene.sensor, first
+            )
+            attitude = matrow(scene.planned.rotation, e)
+            put(load.position[e, n], sub(vec(load.position, e, n), mul(attitude, arm)))
+            putmat(load.rotation[e, n], attitude)
+            put(load.body_rates[e, n], (0.0, 0.0, 0.0))

@@ -219,10 +219,11 @@ class Loss(Task):
         early, late = option.loss_time
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
-        if not option.broadcast and self.config.env.sensing in ("onboard", "blind"):
+        known = self.config.env
+        if not option.broadcast and known.sensing in ("onboard", "blind") and known.communication == "none":
             raise ConfigError(
-                f"env.sensing={self.config.env.sensing} does not show the payload's tilt, by which drones notice "
-                "a loss; set task_options.broadcast=true"
+                f"env.sensing={known.sensing} does not show the payload's tilt, by which drones notice a loss; set "
+                "env.communication=all, or task_options.broadcast=true"
             )
         self._ranges = make_ranges(option)
         world.breakable = world.breakable or option.snap

@@ -1,0 +1,187 @@
+"""What drones tell each other: who hears whom, when, how far; and the payload that they fit to it."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from conftest import make, make_trainer, same
+
+from multilift_marl.config.load import load_config
+from multilift_marl.config.schema import EnvConfig
+from multilift_marl.control.scripted import make_scripted
+from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.rollout import fly_episodes
+from multilift_marl.tasks.communication import NEVER, exchange, make_links, make_mail, place_together
+
+OTHERS = ~np.eye(5, dtype=bool)
+
+
+def talk(steps, envs=1, position=None, **settings):
+    """Return ages (steps, E, 5, 5) in teams that tell the number of the step and who they are."""
+    links = make_links(EnvConfig(**settings), np.linspace(0, 5, 5))
+    mail = make_mail(envs, 5, links.delay)
+    mail.generator[:] = np.arange(envs) + 1
+    position = np.zeros((envs, 5, 3)) if position is None else position
+    ages = []
+    for step in range(steps):
+        told = np.zeros((envs, 5, 3))
+        told[..., 0], told[..., 1] = step, np.arange(5)
+        exchange(0, envs, position, told, np.ones((envs, 5), bool), links, mail)
+        ages.append(mail.age.copy())
+        fresh = mail.age < NEVER
+        assert (mail.heard[..., 0] == step - mail.age)[fresh].all()  # ages are true, nothing comes from the future
+        assert (mail.heard[..., 1] == np.arange(5))[fresh].all()
+    return np.array(ages)
+
+
+def test_neighbours_stand_beside_each_other():
+    azimuth = np.array([0.0, 2.0, -2.0, 1.0, -1.0])  # in order: 2, 4, 0, 3, 1
+    hears = make_links(EnvConfig(communication="neighbours"), azimuth).partners
+    assert [np.flatnonzero(row).tolist() for row in hears] == [[3, 4], [2, 3], [1, 4], [0, 1], [0, 2]]
+    assert (make_links(EnvConfig(communication="all"), azimuth).partners == OTHERS).all()
+    assert make_links(EnvConfig(communication="neighbours"), np.zeros(2)).partners.sum() == 2
+
+
+@pytest.mark.parametrize("delay", [0, 1, 4])
+def test_messages_come_after_the_delay(delay):
+    ages = talk(8, communication="all", communication_delay=delay)[:, 0, OTHERS]
+    assert (ages[:delay] == NEVER).all() and (ages[delay:] == delay).all()
+
+
+def test_as_many_messages_are_lost_as_stated():
+    ages = talk(2000, envs=4, communication="all", communication_delay=2, communication_loss=0.3)[10:, :, OTHERS]
+    assert (ages == 2).mean() == pytest.approx(0.7, abs=0.01)
+    assert (ages == 3).mean() == pytest.approx(0.7 * 0.3, abs=0.01)  # losses are independent
+    assert (talk(20, communication="all", communication_loss=1.0) == NEVER).all()
+
+
+def test_who_is_too_far_away_is_not_heard():
+    position = np.zeros((1, 5, 3))
+    position[0, :, 0] = [0.0, 1.0, 2.0, 3.0, 10.0]
+    ages = talk(4, communication="all", communication_range=2.5, position=position)
+    hears = (ages[-1, 0] < NEVER).astype(int)
+    assert hears.tolist() == [[0, 1, 1, 0, 0], [1, 0, 1, 1, 0], [1, 1, 0, 1, 0], [0, 1, 1, 0, 0], [0] * 5]
+
+
+def fit(vec, place, turned, known):
+    """Return position and attitude of the payload as drone 0 fits it to the true anchors of the drones it knows."""
+    view, sensing = vec.task.view, vec._sensing._load_sensing
+    sensing.bind(view.planned, view.rig, view.resting_tension, True)(0, 1)
+    anchors = place + view.rig.anchors @ turned.T
+    sensing._anchor[0] = sensing._mail.heard[0] = anchors
+    sensing._mail.age[0] = np.where(known, 0, NEVER)
+    scene = sensing._scene(view.planned, view.rig, view.resting_tension)
+    place_together(0, 1, scene, sensing._mail, sensing.load, True)
+    return sensing.load.position[0, 0], sensing.load.rotation[0, 0]
+
+
+def turn(vector):
+    """Return the matrix exponential of a rotation vector."""
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    term, whole = np.eye(3), np.eye(3)
+    for k in range(1, 20):
+        term = term @ cross / k
+        whole = whole + term
+    return whole
+
+
+def angle(matrix):
+    return np.arccos(np.clip((np.trace(matrix, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
+
+
+@pytest.mark.parametrize("known", [4, 3, 2, 1])
+def test_the_fit_is_the_least_squares_that_it_claims(known):
+    """No pose nearby fits better to anchors of 2 cm and an attitude of 0.1 rad about the planned one."""
+    vec = make(num_envs=1, **{"env.sensing": "onboard", "env.communication": "all"})
+    vec.reset(seed=1)
+    planned, arms = vec.task.view.planned.rotation[0], vec.task.view.rig.anchors
+    place, turned = np.array([0.1, -0.2, 1.3]), turn((0.2, -0.1, 0.15)) @ planned
+    position, rotation = fit(vec, place, turned, np.arange(4) < known)
+
+    def cost(move, spin):
+        attitude = turn(spin) @ rotation
+        off = (place + arms @ turned.T - position - move - arms @ attitude.T)[:known]
+        return (off**2).sum() / 0.02**2 + (angle(attitude @ planned.T) / 0.1) ** 2
+
+    best = cost(np.zeros(3), np.zeros(3))
+    for i in range(3):
+        for sign in (1, -1):
+            step = 1e-3 * sign * np.eye(3)[i]
+            assert cost(step, np.zeros(3)) > best and cost(np.zeros(3), step) > best
+    if known == 4:
+        assert angle(rotation @ turned.T) < 0.5 * angle(planned @ turned.T)
+
+
+def test_where_nothing_is_heard_the_first_observation_is_as_without_communication():
+    alone = make(num_envs=3, **{"env.sensing": "onboard"})
+    deaf = make(num_envs=3, **{"env.sensing": "onboard", "env.communication": "all", "env.communication_loss": 1.0})
+    np.testing.assert_allclose(alone.reset(seed=3)[0], deaf.reset(seed=3)[0], atol=1e-6)
+
+
+def test_talking_drones_agree_on_the_payload():
+    apart, off = {}, {}
+    for kind in ("none", "neighbours", "all"):
+        vec = make(num_envs=32, **{"env.sensing": "onboard", "env.communication": kind})
+        seen, _ = vec.reset(seed=1)
+        script = make_scripted("formation_integral", vec)
+        for _ in range(200):
+            seen, *_ = vec.step(script.act(seen))
+        load, state = vec.task.view.load, vec.world.state
+        apart[kind] = load.position.std(axis=1).mean()
+        off[kind] = np.sqrt(((load.position - state.payload_position[:, None]) ** 2).sum(-1).mean())
+    assert apart["all"] < 0.3 * apart["none"] and apart["neighbours"] < 0.8 * apart["none"], apart
+    assert off["all"] < 0.7 * off["none"], off
+
+
+@pytest.mark.slow
+def test_talking_teams_hold_the_payload_more_level():
+    angle = {}
+    for kind in ("none", "all"):
+        settings = {"env.sensing": "onboard", "env.communication": kind, "env.communication_loss": 0.2}
+        episodes = fly_episodes(
+            load_config("hover", settings), partial(make_scripted, "formation_integral"), 64, seed=5
+        )
+        angle[kind] = episodes["payload_attitude_error_deg"].mean()
+    assert angle["all"] < 0.75 * angle["none"]
+
+
+def test_talk_resumes_and_depends_on_neither_threads_nor_company():
+    settings = {"env.sensing": "onboard", "env.communication": "neighbours", "env.communication_loss": 0.3,
+                "env.communication_delay": 2, "env.communication_range": 2.0}  # fmt: skip
+    alone, crowd = make(num_envs=1, first_env=3, **settings), make(num_envs=5, num_threads=2, **settings)
+    alone.reset(seed=7), crowd.reset(seed=7)
+    rng = np.random.default_rng(0)
+    for step in range(40):
+        action = rng.uniform(-0.3, 0.3, (5, 4, 4))
+        one, many = alone.step(action[3:4]), crowd.step(action)
+        np.testing.assert_array_equal(one[0][0], many[0][3])
+        if step == 20:
+            saved = make(num_envs=5, **settings)
+            saved.load_state_dict(crowd.state_dict())
+        elif step > 20:
+            assert same(saved.step(action)[0], many[0])
+
+
+def test_a_new_episode_begins_in_silence():
+    vec = make(num_envs=2, **{"env.sensing": "onboard", "env.communication": "all", "env.communication_delay": 3})
+    vec.reset(seed=0)
+    for _ in range(10):
+        vec.step(np.zeros((2, 4, 4)))
+    age = vec._sensing._load_sensing._mail.age
+    assert (age[:, ~np.eye(4, dtype=bool)] == 3).all()
+    vec.reset(mask=np.array([True, False]))
+    assert (age[0] == NEVER).all() and (age[1, ~np.eye(4, dtype=bool)] == 3).all()
+
+
+@pytest.mark.parametrize("level", ["ideal", "mocap"])
+def test_communication_needs_something_to_tell(level):
+    with pytest.raises(ConfigError, match=f"with env.sensing={level} all drones know one payload; set env"):
+        make(num_envs=1, **{"env.sensing": level, "env.communication": "all"})
+
+
+@pytest.mark.parametrize("kind", ["set", "attention"])
+def test_networks_of_teams_that_do_not_talk_are_refused(tmp_path, kind):
+    with pytest.raises(ConfigError, match=rf"train\.actor={kind} lets drones know .* set that, or train\.actor=local"):
+        make_trainer(tmp_path, **{"train.actor": kind, "env.sensing": "onboard"})
+    make_trainer(tmp_path, **{"train.actor": kind, "env.sensing": "onboard", "env.communication": "all"})
