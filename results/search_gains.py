@@ -51,6 +51,8 @@ SLOTS: Free = (
     ("payload_angular_velocity", TANGENT, 0.05),
     ("payload_rotation_error", RADIAL, 0.15),
     ("payload_angular_velocity", RADIAL, 0.05),
+    ("target_velocity", LEVEL, 0.05),
+    ("target_acceleration", LEVEL, 0.05),
     ("target_ahead_200ms", LEVEL, 0.5),
     ("target_ahead_400ms", LEVEL, 0.25),
     ("heading", ((0, 0),), 0.1),

@@ -131,6 +131,38 @@ class TrackRealistic(FormationLead):
     )
 
 
+class TrackFollow(Formation):
+    """Of `track_follow` at 2 m/s and 4 m/s²: 20 minutes from `formation_feedback`, 32 episodes a candidate."""
+
+    GAINS: ClassVar[Gains] = (
+        ("payload_error_integral", 0, 0, -0.414),
+        ("payload_error_integral", 1, 1, -0.414),
+        ("payload_error_integral", 2, 2, -0.677),
+        ("payload_error", 0, 0, -0.337),
+        ("payload_error", 1, 1, -0.337),
+        ("payload_velocity", 0, 0, -0.633),
+        ("payload_velocity", 1, 1, -0.633),
+        ("payload_velocity", 2, 2, -0.195),
+        ("tracking_error", 0, 0, -0.555),
+        ("tracking_error", 1, 1, -0.555),
+        ("rotation_error_integral", 1, 2, 0.728),
+        ("payload_rotation_error", 1, 2, 0.185),
+        ("payload_error", 2, 2, 0.116),
+        ("tracking_error", 2, 2, 0.359),
+        ("payload_angular_velocity", 1, 2, 0.051),
+        ("rotation_error_integral", 2, 1, -0.009),
+        ("payload_rotation_error", 2, 1, -0.126),
+        ("payload_angular_velocity", 2, 1, -0.001),
+        ("payload_rotation_error", 1, 0, 0.060),
+        ("payload_angular_velocity", 1, 0, 0.067),
+        ("target_velocity", 0, 0, -0.050),
+        ("target_velocity", 1, 1, -0.050),
+        ("target_acceleration", 0, 0, 0.017),
+        ("target_acceleration", 1, 1, 0.017),
+        ("heading", 0, 0, 0.272),
+    )
+
+
 class TrackRealisticFast(FormationLead):
     """The same at 5 m/s and 8 m/s²: 9 minutes from `TrackRealistic`."""
 
@@ -201,5 +233,6 @@ SEARCHED: dict[str, type[Formation]] = {
     "track_realistic_2_4": TrackRealistic,
     "track_realistic_5_8": TrackRealisticFast,
     "gate_realistic": GateRealistic,
+    "track_follow_2_4": TrackFollow,
 }
 """The best one of a flight."""

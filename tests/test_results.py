@@ -156,6 +156,12 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "task_options.success_angle",
         "task_options.broadcast",
         "env.sensing",
+        "env.communication",
+        "env.communication_delay",
+        "env.communication_loss",
+        "env.communication_range",
+        "train.gru",
+        "train.sequence",
     }
     own |= {key for key in stored if stored[key] == {} and any(name.startswith(f"{key}.") for name in later)}
     for key in ("control.attitude_frequency", "control.position_frequency"):

@@ -163,6 +163,18 @@ def test_drones_are_told_where_the_target_will_be():
     np.testing.assert_allclose(told["target_velocity"], turned(velocity), atol=1e-6)
 
 
+def test_without_a_preview_nothing_of_the_future_is_observed():
+    known, unknown = (track(num_envs=1, **{"task_options.preview": preview}) for preview in (True, False))
+    names = [name for name in known.observation_names if not name.startswith("target_ahead")]
+    assert unknown.observation_names == tuple(names) and len(known.observation_names) == len(names) + 12
+    for _ in range(60):
+        rows = [vec.step(zeros(vec))[0][0, 0] for vec in (known, unknown)]
+    pick = [known.observation_names.index(name) for name in names]
+    np.testing.assert_array_equal(rows[0][pick], rows[1])
+    np.testing.assert_array_equal(known.state(), unknown.state())  # the critic knows
+    assert refusal(make_scripted, "formation_lead", unknown).startswith("formation_lead needs to observe")
+
+
 def test_success_is_never_to_be_far():
     vec = track(num_envs=2, **{"env.episode_seconds": 1.0})
     vec.step(zeros(vec))

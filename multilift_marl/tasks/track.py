@@ -9,6 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import inlined, kernel
+from multilift_marl.config.config import Config
+from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Choice, Float, Section, Span, Vector
 from multilift_marl.control.formation import place_formation, set_heading
 from multilift_marl.errors import ConfigError
@@ -66,6 +68,9 @@ class TrackOptions(Section):
     room: Vector = Field((3.0, 3.0, 0.5), description="[m] random way-points within ± this of the start")
     height: Float = Field(2.0, gt=0, description="[m] of the path's centre")
     start_radius: Float = Field(0.1, ge=0, description="[m] start within a ball of this radius about the path's start")
+    preview: bool = Field(
+        True, description="whether drones observe where the target will be; if not, its velocity and acceleration alone"
+    )
     success_distance: Float = Field(0.5, gt=0, description="[m] payload never farther than this from its target")
     rmse_from: Float = Field(5.0, ge=0, description="[s] errors count for payload_rmse_m from this time on")
 
@@ -251,6 +256,14 @@ class Track(Task):
     KERNELS: ClassVar[Kernels] = Kernels(never, plan=advance_target, update=note_worst, preview=preview_target)
     EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")
+
+    @classmethod
+    def extra(cls, config: Config) -> tuple[Component, ...]:
+        """See `Task.extra`; without a preview what the target will do is left out."""
+        parts = super().extra(config)
+        if validate(TrackOptions, config.task_options, "task_options").preview:
+            return parts
+        return tuple(part for part in parts if not part.name.startswith("target_ahead"))
 
     def prepare(self) -> None:
         """See `Task.prepare`."""
