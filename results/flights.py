@@ -18,6 +18,7 @@ AUTO = "41 cm: path of 2.8 m/s², start included; MPC, no motor lag, no drag"
 CRAZYMARL = "79.7 %: motor commands, noise, pushes"
 
 
+FOLLOWING = ("formation_feedback", "searched")
 FAST_SCRIPTS = ("formation_lead", "formation_gusts", "searched")  # others are off by 10 cm and more
 
 
@@ -59,6 +60,12 @@ FLIGHTS: dict[str, Flight] = {
     ),
     "track_realistic_5_8": Flight(
         "track_realistic", FASTEST, "track_realistic", "figure-eight, 5 m/s, 8 m/s², realistic", scripts=FAST_SCRIPTS
+    ),
+    "track_follow_2_2": Flight(
+        "track_follow", FASTER, "track_follow", "figure-eight, 2 m/s, 2 m/s², no preview", scripts=FOLLOWING
+    ),
+    "track_follow_2_4": Flight(
+        "track_follow", AGILE, "track_follow", "figure-eight, 2 m/s, 4 m/s², no preview", scripts=FOLLOWING
     ),
     "track_auto6": Flight("track_auto6", {}, "track_auto6", "figure-eight, 4.5 m/s, 4 m/s², six drones, 7 kg", AUTO),
     "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),

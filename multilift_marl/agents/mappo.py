@@ -14,7 +14,7 @@ from torch.distributions import Independent, Normal
 from torchrl.modules import PopArtValueNorm
 
 from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, TeamNet, draw_action
-from multilift_marl.config.schema import TrainConfig
+from multilift_marl.config.schema import EnvConfig, TrainConfig
 from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
@@ -82,12 +82,6 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
         raise ConfigError(f"the last of train.hidden must be a multiple of {TeamNet.HEADS}, the heads of attention")
     # 1. The policy: own observation to a Gaussian over the own action.
     vec = env.vec
-    told = vec.config.env
-    if config.actor != "local" and told.sensing in ("onboard", "blind") and told.communication != "all":
-        raise ConfigError(
-            f"train.actor={config.actor} lets drones know what the others' networks hold, but with env.sensing="
-            f"{told.sensing} they hear of all others only by env.communication=all; set that, or train.actor=local"
-        )
     base = torch.from_numpy(residual_matrix(config.residual, vec))
     sizes = (vec.observation_size, vec.action_size)
     actor = Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru)
@@ -105,6 +99,16 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     groups = [{"params": list(actor.parameters())}, {"params": list(critic.parameters())}]
     optimizer = torch.optim.Adam(groups, lr=config.learning_rate, eps=1e-5, fused=True)
     return Learner(config, actor, critic, StochasticPolicy(actor), optimizer)
+
+
+def check_communication(train: TrainConfig, env: EnvConfig) -> None:
+    """Refuse, by a ConfigError, networks of a team whose drones do not all hear each other."""
+    if train.actor != "local" and env.sensing in ("onboard", "blind") and env.communication != "all":
+        raise ConfigError(
+            f"train.actor={train.actor} lets drones know what the others' networks hold, but with env.sensing="
+            f"{env.sensing} they hear of all others only by onboard and env.communication=all; set these, or "
+            "train.actor=local"
+        )
 
 
 def check_batch(train: TrainConfig, vec: MultiliftVec) -> None:
@@ -170,8 +174,10 @@ def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
     explained = 1 - (target - value).var() / target.var().clamp(min=1e-8)
     advantage = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
     columns = [observation, batch[_ACTION], batch[_LOG_PROB], advantage, critic_input, target]
-    columns += [] if learner.actor.memory is None else [batch[_MEMORY], mark_starts(batch)]
+    columns += [] if learner.actor.memory is None else [mark_starts(batch)]
     columns = [split_batch(column, config.sequence if config.gru else 0) for column in columns]
+    if learner.actor.memory is not None:
+        columns.append(batch[_MEMORY][:, :: config.sequence].flatten(0, 1))
 
     # 2. Some epochs of minibatches, fewer if the policy moves too far.
     actor_parameters, critic_parameters = (group["params"] for group in learner.optimizer.param_groups)
@@ -226,15 +232,16 @@ def split_batch(column: torch.Tensor, sequence: int) -> torch.Tensor:
 
 def surrogate_loss(
     learner: Learner, observation: torch.Tensor, action: torch.Tensor, log_prob: torch.Tensor, advantage: torch.Tensor,
-    memory: torch.Tensor | None = None, started: torch.Tensor | None = None,
+    started: torch.Tensor | None = None, memory: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     """Return the clipped loss (Schulman et al., arXiv 1707.06347), entropy, approximate KL and clipped share.
 
-    With a GRU all is of sequences (B, L, ...), of whose memories (B, L, N, H) in the rollouts the first is taken.
+    With a GRU all is of sequences (B, L, ...), `started` (B, L) of `Memory.unroll`, and `memory` (B, N, H) that of the
+    rollouts before the first step.
     """
     clip = torch.tensor(learner.config.clip)
     if memory is not None and started is not None:
-        memory = learner.actor.unroll(observation, memory[:, 0], started)
+        memory = learner.actor.unroll(observation, memory, started)
     distribution = Independent(Normal(*learner.actor(observation, memory)), 1)
     log_ratio = (distribution.log_prob(action) - log_prob).unsqueeze(-1)
     clipped = log_ratio.clamp((-clip).log1p(), clip.log1p())

@@ -71,7 +71,7 @@ class TrainedPolicy:
                     f"observes {teams.shape[:-1]}; call reset() before other environments, or bind(vec) for a copy"
                 )
             action, self._memory = self._act(teams, self._memory)
-        return action.reshape(*observation.shape[:-1], -1)
+        return action.reshape(*observation.shape[:-1], len(self.action_names))
 
     def _act(self, observation: np.ndarray, memory: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
         """Return actions (B, N, A) for observations (B, N, D), and the memory (B, N, H) of a policy with a GRU."""

@@ -27,7 +27,7 @@ from multilift_marl.agents.checkpoint import (
 )
 from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import RunLog, write_versions
-from multilift_marl.agents.mappo import adapted_rate, check_batch, make_learner, update
+from multilift_marl.agents.mappo import adapted_rate, check_batch, check_communication, make_learner, update
 from multilift_marl.agents.policy import check_policy
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, dump_config
@@ -61,6 +61,8 @@ class Trainer:
             if key.partition(".")[0] in ("task", "seed", "train", "eval"):
                 raise ConfigError(f"train.overrides changes the environment and cannot hold '{key}'; set {key} itself")
         environment = build_config(config.model_dump(), config.train.overrides)
+        for env in (config.env, environment.env):
+            check_communication(config.train, env)
         self.env = MultiliftEnv(environment, memory=config.train.gru)
         self.frames_per_batch = self.env.vec.num_envs * config.train.horizon
         check_batch(config.train, self.env.vec)

@@ -151,13 +151,18 @@ class MultiliftEnv(EnvBase):
             ValueError: see `MultiliftVec.load_state_dict`.
         """
         saved = dict(saved)
-        if self._memory is not None:
-            memory = saved.pop("memory", None)
-            if memory is None or memory.shape != self._memory.shape or not memory.isfinite().all():
-                raise ValueError(f"'memory' must be a finite tensor {tuple(self._memory.shape)}")
-            self._memory = memory.clone()
+        memory = None if self._memory is None else _checked_memory(saved.pop("memory", None), self._memory)
         self.vec.load_state_dict({key: np.asarray(tensor) for key, tensor in saved.items()})
+        self._memory = memory
         self._resumed = True
+
+
+def _checked_memory(found: Any, expected: torch.Tensor) -> torch.Tensor:
+    """Return a copy of a saved memory, or raise a ValueError."""
+    fits = isinstance(found, torch.Tensor) and found.shape == expected.shape and found.dtype == expected.dtype
+    if not fits or not found.isfinite().all():
+        raise ValueError(f"'memory' must be a finite {expected.dtype} tensor {tuple(expected.shape)}")
+    return found.clone()
 
 
 def _unchecked(source: dict[str, Any], *batch_size: int) -> TensorDict:

@@ -14,6 +14,7 @@ import numpy as np
 
 from multilift_marl._jit import kernel
 from multilift_marl.config.schema import EnvConfig
+from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import (
     add,
     cross,
@@ -70,6 +71,20 @@ class Mail(NamedTuple):
     """(E, N, N) of it [steps]."""
 
 
+def check_links(env: EnvConfig) -> None:
+    """Refuse, by a ConfigError, communication that could tell nothing."""
+    if env.sensing != "onboard":
+        raise ConfigError(
+            f"drones tell each other what they measure with env.sensing=onboard, not {env.sensing}; set "
+            "env.communication=none, or env.sensing=onboard"
+        )
+    if (seconds := env.communication_delay / env.policy_hz) > TOO_OLD:
+        raise ConfigError(
+            f"env.communication_delay={env.communication_delay} is {seconds:g} s, but nothing older than {TOO_OLD} s "
+            "is used; lower it, or set env.communication=none"
+        )
+
+
 def make_links(config: EnvConfig, azimuth: np.ndarray) -> Links:
     """Return the links of a team whose slots are at these azimuths (N,) [rad]; neighbours are adjacent."""
     n = len(azimuth)
@@ -100,8 +115,10 @@ def empty_mail(env: int, mail: Mail, seed: np.random.SeedSequence) -> None:
 
 
 @kernel
-def exchange(lo, hi, position, told, told_any, links, mail):
+def exchange(lo, hi, position, told, told_any, links, mail, first):
     """Send and hear the messages of a step in environments lo to hi.
+
+    Drones have talked before an episode begins: they know what those in range have to tell at its start.
 
     Args:
         lo, hi: the environments.
@@ -110,6 +127,7 @@ def exchange(lo, hi, position, told, told_any, links, mail):
         told_any: whether it has (E, N).
         links: Links.
         mail: Mail, advanced.
+        first: whether an episode begins.
     """
     count = position.shape[1]
     for e in range(lo, hi):
@@ -125,7 +143,10 @@ def exchange(lo, hi, position, told, told_any, links, mail):
                 mail.age[e, n, m] = min(mail.age[e, n, m] + 1, NEVER)
                 arrives = uniform(e, mail) > links.loss  # drawn in any case: the draws of others stay the same
                 near = norm(sub(vec(position, e, n), vec(position, e, m))) <= links.range
-                if arrives and near and then >= 0 and mail.has_sent[e, then % kept, m]:
+                if first and near:
+                    put(mail.heard[e, n, m], vec(told, e, m))
+                    mail.age[e, n, m] = 0
+                elif arrives and near and then >= 0 and mail.has_sent[e, then % kept, m]:
                     put(mail.heard[e, n, m], vec(mail.sent[e], then % kept, m))
                     mail.age[e, n, m] = links.delay
         mail.steps[e] = now + 1
@@ -139,7 +160,7 @@ def place_together(lo, hi, scene, mail, load, first):
     """
     for e in range(lo, hi):
         for n in range(load.tension.shape[1]):
-            position, attitude, count = _fit(e, n, scene, mail, load)
+            position, attitude, count = _fit(e, n, scene, mail)
             if count == 0:
                 keep_moving(e, n, load, scene.sensor)
                 continue
@@ -148,13 +169,13 @@ def place_together(lo, hi, scene, mail, load, first):
 
 
 @kernel
-def _fit(e, n, scene, mail, load):
+def _fit(e, n, scene, mail):
     """Return position and attitude of the payload as drone n knows it, and how many anchors it knows."""
-    anchors, attitude, team = scene.rig.anchors, matrow(scene.planned.rotation, e), load.tension.shape[1]
+    anchors, attitude, team = scene.rig.anchors, matrow(scene.planned.rotation, e), scene.anchor.shape[1]
     # The mean of the known anchors, in the world and in the payload.
     mean, arm, count = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
     for m in range(team):
-        known, place = _known_anchor(e, n, m, scene, mail, load)
+        known, place = _known_anchor(e, n, m, scene, mail)
         if known:
             mean, arm, count = add(mean, place), add(arm, row(anchors, m)), count + 1
     if count == 0:
@@ -168,7 +189,7 @@ def _fit(e, n, scene, mail, load):
         moment = scale(-weight, turned)
         x, y, z = (weight, 0.0, 0.0), (0.0, weight, 0.0), (0.0, 0.0, weight)
         for m in range(team):
-            known, place = _known_anchor(e, n, m, scene, mail, load)
+            known, place = _known_anchor(e, n, m, scene, mail)
             if known:
                 b = mul(attitude, sub(row(anchors, m), arm))
                 moment = add(moment, cross(b, sub(place, mean)))
@@ -184,9 +205,10 @@ def _fit(e, n, scene, mail, load):
 
 
 @kernel
-def _known_anchor(e, n, m, scene, mail, load):
+def _known_anchor(e, n, m, scene, mail):
     """Return whether drone n knows where drone m's cable ends, and that place [m] now."""
     if n == m:
         return scene.knows_anchor[e, n], vec(scene.anchor, e, n)
     age = scene.sensor.dt * mail.age[e, n, m]
-    return age <= TOO_OLD, add(vec(mail.heard[e], n, m), scale(age, vec(load.velocity, e, n)))
+    # At the own drone's velocity: the filter's would feed the fit back into itself, and late news make that unstable.
+    return age <= TOO_OLD, add(vec(mail.heard[e], n, m), scale(age, vec(scene.own.drone_velocity, e, n)))

@@ -109,7 +109,7 @@ class Scene(NamedTuple):
     anchor: np.ndarray
     """(E, N, 3) where each drone takes its cable to end, of `onboard` and `blind` [m]."""
     knows_anchor: np.ndarray
-    """(E, N) whether it does: a slack cable points nowhere."""
+    """(E, N) whether it does: a slack cable points nowhere, that of `blind` is supposed."""
     memory: LoadMemory
     sensor: LoadSensor
 
@@ -135,7 +135,7 @@ def make_sensor(level: str, dt: float, length: float) -> LoadSensor:
         gains = alpha_beta(ACCELERATION, direction * length, dt), alpha_beta(ANGULAR_ACCELERATION, _TURNED, dt)
         return LoadSensor(dt, direction=direction, tension=0.01, follow=gains[0], turn=gains[1])
     assert level == "blind", level
-    return LoadSensor(dt, turn=alpha_beta(ANGULAR_ACCELERATION, _TURNED, dt))
+    return LoadSensor(dt)
 
 
 class LoadSensing:
@@ -185,7 +185,7 @@ class LoadSensing:
             stages = [see, prebind(place_alone, scene, self.load, first or self._level == "blind")]
         else:
             told = (self._true.drone_position, self._anchor, self._knows_anchor)
-            stages = [see, prebind(exchange, *told, self._links, self._mail)]
+            stages = [see, prebind(exchange, *told, self._links, self._mail, first)]
             stages.append(prebind(place_together, scene, self._mail, self.load, first))
 
         def call(lo: int, hi: int) -> None:

@@ -21,7 +21,7 @@ from multilift_marl.math3d import add, mat, matrow, put, putmat, row, scale, tur
 from multilift_marl.sim.gusts import normal_vector
 from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
-from multilift_marl.tasks.communication import make_links
+from multilift_marl.tasks.communication import check_links, make_links
 from multilift_marl.tasks.load_sensing import LoadSensing, true_load
 from multilift_marl.tasks.observations import OBSERVATION_SIZE
 from multilift_marl.tasks.view import Errors, View, reduce_view, update_errors
@@ -86,11 +86,8 @@ class Sensing:
                 f"env.sensing={level} has noise of its own; set randomization.observation_noise and observation_bias "
                 "to none, or env.sensing=ideal"
             )
-        if config.env.communication != "none" and level not in ("onboard", "blind"):
-            raise ConfigError(
-                f"with env.sensing={level} all drones know one payload; set env.communication=none, or "
-                "env.sensing=onboard or blind"
-            )
+        if config.env.communication != "none":
+            check_links(config.env)
         self.delays_observation, self.delays_action = latest > 0, slowest > 0
         acted, observed = (slowest + 1) * self.delays_action, (latest + 1) * self.delays_observation
         sent, seen, action_delay, observation_delay = (np.zeros(e, np.int64) for _ in range(4))
