@@ -125,7 +125,7 @@ def test_help_explains_every_key(capsys):
     ("arguments", "starts", "end", "absent"),
     [
         (["config=hover"], "env.num_envs 160", "(default 128)", "Task track"),
-        (["config=hover"], "train.overrides.<name> {'reward.precision': 1.0}", "name (default -)", "Task track"),
+        (["config=hover"], "train.overrides.<name> {'reward.precision': 1.0,", "name (default -)", "Task track"),
         (["config=hover"], "payload.drag_area 0.09", "smaller faces)", "reward.alignment"),
         (["config=pose", "wind.wash=true"], "wind.wash True", "(default False)", "Task hover"),
         (["config=pose", "reward.position=7"], "reward.position.weight 7", "its target", "Task hover"),
@@ -198,3 +198,14 @@ def test_impossible_system_makes_no_run_folder(tmp_path, monkeypatch):
         _ = load_config("hover", {"payload.mass": 50}).system
     assert train(["payload.mass=50"]) == 2
     assert not (tmp_path / "runs").exists()
+
+
+def test_what_a_recipe_overrides_in_training_is_said(monkeypatch, capsys, tmp_path):
+    """A key of the environment that training does not follow is no silent loss."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("multilift_marl.agents.trainer.new_run", lambda config, name: pytest.fail(str(config.train)))
+    for more, said in (([], True), (["train.overrides={}"], False)):
+        with pytest.raises(pytest.fail.Exception):
+            train(["config=hover", "randomization.cable_length=0.3", *more])
+        note = "note: training has randomization.cable_length=0.1, by train.overrides; "
+        assert capsys.readouterr().out.startswith(note) == said

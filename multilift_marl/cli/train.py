@@ -67,9 +67,7 @@ def _train(values: dict[str, Any]) -> int:
         config = load_config(options.config, overrides)
         for key in config.train.overrides.keys() & overrides.keys():
             value = config.train.overrides[key]
-            print(
-                f'note: training itself has {key}={value}, by train.overrides; "train.overrides={{{key}: ...}}" sets it'
-            )
+            print(f'note: training has {key}={value}, by train.overrides; "train.overrides={{{key}: ...}}" sets it')
         _ = config.system  # refuse an impossible system before the long wait
         trainer = new_run(config, title(values))
         folder = trainer.folder
