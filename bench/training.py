@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> dict:
     repeats = int(values.pop("repeats", 15))
     trainer = Trainer(load_config("hover", {"train.target_kl": 1e3} | values), Path("runs"))  # nothing is written there
     spent: dict[str, float] = {}
-    vec, network = trainer.env.vec, trainer.learner.policy.module
+    vec, network = trainer.env.vec, trainer.learner.policy
     vec.world.run = timed(vec.world.run, "core", spent)
     vec.reset = timed(vec.reset, "starts", spent)
     network.forward = timed(network.forward, "actor", spent)

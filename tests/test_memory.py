@@ -147,6 +147,11 @@ def test_the_exported_policy_remembers_as_the_policy_does(tmp_path, kind):
     assert [each.shape for each in session.get_outputs()] == [["batch", "drones", 4], ["batch", "drones", 12]]
 
 
+def test_a_batch_shorter_than_a_sequence_is_one(tmp_path):
+    trainer = make_trainer(tmp_path, **(GRU | {"train.sequence": 100, "train.horizon": 10, "train.minibatches": 2}))
+    assert abs(trainer.step()["approx_kl"]) < 1.0
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

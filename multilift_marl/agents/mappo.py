@@ -116,12 +116,13 @@ def check_batch(train: TrainConfig, vec: MultiliftVec) -> None:
     steps = vec.num_envs * train.horizon
     rows, what = steps, "steps"
     if train.gru:
-        if train.horizon % train.sequence:
+        length = sequence_length(train)
+        if train.horizon % length:
             raise ConfigError(
                 f"train.horizon={train.horizon} is no multiple of train.sequence={train.sequence}, the steps that "
                 "gradients of a GRU go back; change one of them"
             )
-        rows, what = steps // train.sequence, "sequences"
+        rows, what = steps // length, "sequences"
     if train.minibatches > rows:
         raise ConfigError(
             f"train.minibatches={train.minibatches} exceeds the {rows} {what} of a batch; lower it or raise "
@@ -175,9 +176,9 @@ def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
     advantage = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
     columns = [observation, batch[_ACTION], batch[_LOG_PROB], advantage, critic_input, target]
     columns += [] if learner.actor.memory is None else [mark_starts(batch)]
-    columns = [split_batch(column, config.sequence if config.gru else 0) for column in columns]
+    columns = [split_batch(column, sequence_length(config)) for column in columns]
     if learner.actor.memory is not None:
-        columns.append(batch[_MEMORY][:, :: config.sequence].flatten(0, 1))
+        columns.append(batch[_MEMORY][:, :: sequence_length(config)].flatten(0, 1))
 
     # 2. Some epochs of minibatches, fewer if the policy moves too far.
     actor_parameters, critic_parameters = (group["params"] for group in learner.optimizer.param_groups)
@@ -217,6 +218,11 @@ def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
         "stopped_early": float(stop),
         "learning_seconds": time.perf_counter() - start,
     }
+
+
+def sequence_length(train: TrainConfig) -> int:
+    """Return the steps that gradients of a GRU go back, the whole of a shorter batch; 0 without one."""
+    return min(train.sequence, train.horizon) if train.gru else 0
 
 
 def mark_starts(batch: TensorDictBase) -> torch.Tensor:

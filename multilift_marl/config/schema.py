@@ -309,7 +309,7 @@ class TrainConfig(Section):
         0, ge=0, le=8192, description="units of each drone's memory of earlier observations, a GRU; 0: no memory"
     )
     sequence: Int = Field(
-        32, ge=1, le=100_000, description="steps that gradients of a GRU go back; train.horizon is a multiple of it"
+        32, ge=1, le=100_000, description="steps that gradients of a GRU go back: train.horizon, or a part of it"
     )
     critic: Literal["flat", "set", "attention"] = Field(
         "flat", description="of mappo; set, attention: the same value in whatever order the drones stand"

@@ -31,6 +31,7 @@ class OwnPolicy:
             is called with the environments and returns an object with `act(observation)` and `reset(mask)`, the mask
             (E,) bool.
         vec: the environments, with any action interface.
+        key: that names it, for messages.
 
     Attributes:
         policy: that object.
@@ -40,9 +41,9 @@ class OwnPolicy:
             returns anything but finite floating point numbers (E, N, A).
     """
 
-    def __init__(self, name: str, vec: MultiliftVec):
-        self._name, self._shape = f"policy {name}", (vec.num_envs, vec.num_drones, vec.action_size)
-        self.policy = self._call("", find_callable(name, "policy"), vec)
+    def __init__(self, name: str, vec: MultiliftVec, key: str = "policy"):
+        self._name, self._shape = f"{key} {name}", (vec.num_envs, vec.num_drones, vec.action_size)
+        self.policy = self._call("", find_callable(name, key), vec)
         for method in ("act", "reset"):
             if not callable(getattr(self.policy, method, None)):
                 raise ConfigError(f"{self._name} has no method '{method}': it needs act(observation) and reset(mask)")

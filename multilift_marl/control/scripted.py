@@ -98,8 +98,7 @@ def residual_matrix(name: str, vec: MultiliftVec) -> np.ndarray:
     shape = vec.action_size, vec.observation_size
     if name == "formation":
         return np.zeros(shape, np.float32)
-    policy = make_scripted(name, vec)
-    policy = policy.policy if isinstance(policy, OwnPolicy) else policy
+    policy = OwnPolicy(name, vec, "train.residual").policy if ":" in name else make_scripted(name, vec)
     matrix = policy.matrix() if hasattr(policy, "matrix") else None
     if not isinstance(matrix, np.ndarray) or matrix.shape != shape or not np.isfinite(matrix).all():
         raise ConfigError(
