@@ -4,14 +4,20 @@ from functools import partial
 
 import numpy as np
 import pytest
-from conftest import make, make_trainer, same
+from conftest import make, make_trainer
 
 from multilift_marl.config.load import load_config
 from multilift_marl.config.schema import EnvConfig
 from multilift_marl.control.scripted import make_scripted
 from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.rollout import fly_episodes
-from multilift_marl.tasks.communication import NEVER, exchange, make_links, make_mail, place_together
+from multilift_marl.tasks.communication import (
+    NEVER,
+    exchange_messages,
+    make_links,
+    make_messages,
+    update_shared_estimate,
+)
 
 OTHERS = ~np.eye(5, dtype=bool)
 
@@ -19,18 +25,19 @@ OTHERS = ~np.eye(5, dtype=bool)
 def talk(steps, envs=1, position=None, **settings):
     """Return ages (steps, E, 5, 5) in teams that tell the number of the step and who they are."""
     links = make_links(EnvConfig(**settings), np.linspace(0, 5, 5))
-    mail = make_mail(envs, 5, links.delay)
-    mail.generator[:] = np.arange(envs) + 1
+    messages = make_messages(envs, 5, links.delay)
+    messages.generator[:] = np.arange(envs) + 1
     position = np.zeros((envs, 5, 3)) if position is None else position
     ages = []
     for step in range(steps):
         told = np.zeros((envs, 5, 3))
         told[..., 0], told[..., 1] = step, np.arange(5)
-        exchange(0, envs, position, told, np.ones((envs, 5), bool), links, mail, False)
-        ages.append(mail.age.copy())
-        fresh = mail.age < NEVER
-        assert (mail.heard[..., 0] == step - mail.age)[fresh].all()  # ages are true, nothing comes from the future
-        assert (mail.heard[..., 1] == np.arange(5))[fresh].all()
+        exchange_messages(0, envs, position, told, np.ones((envs, 5), bool), links, messages, False)
+        ages.append(messages.age.copy())
+        fresh = messages.age < NEVER
+        # Ages are true, and nothing comes from the future.
+        assert (messages.heard[..., 0] == step - messages.age)[fresh].all()
+        assert (messages.heard[..., 1] == np.arange(5))[fresh].all()
     return np.array(ages)
 
 
@@ -68,10 +75,10 @@ def fit(vec, place, turned, known):
     view, sensing = vec.task.view, vec._sensing._load_sensing
     sensing.bind(view.planned, view.rig, view.resting_tension, True)(0, 1)
     anchors = place + view.rig.anchors @ turned.T
-    sensing._anchor[0] = sensing._mail.heard[0] = anchors
-    sensing._mail.age[0] = np.where(known, 0, NEVER)
+    sensing._anchor[0] = sensing._messages.heard[0] = anchors
+    sensing._messages.age[0] = np.where(known, 0, NEVER)
     scene = sensing._scene(view.planned, view.rig, view.resting_tension)
-    place_together(0, 1, scene, sensing._mail, sensing.load, True)
+    update_shared_estimate(0, 1, scene, sensing._messages, sensing.load, True)
     return sensing.load.position[0, 0], sensing.load.rotation[0, 0]
 
 
@@ -140,37 +147,20 @@ def test_talking_teams_hold_the_payload_more_level():
     assert angle["all"] < 0.75 * angle["none"]
 
 
-def test_talk_resumes_and_depends_on_neither_threads_nor_company():
-    settings = {"env.sensing": "onboard", "env.communication": "neighbours", "env.communication_loss": 0.3,
-                "env.communication_delay": 2, "env.communication_range": 2.0}  # fmt: skip
-    alone, crowd = make(num_envs=1, first_env=3, **settings), make(num_envs=5, num_threads=2, **settings)
-    alone.reset(seed=7), crowd.reset(seed=7)
-    rng = np.random.default_rng(0)
-    for step in range(40):
-        action = rng.uniform(-0.3, 0.3, (5, 4, 4))
-        one, many = alone.step(action[3:4]), crowd.step(action)
-        np.testing.assert_array_equal(one[0][0], many[0][3])
-        if step == 20:
-            saved = make(num_envs=5, **settings)
-            saved.load_state_dict(crowd.state_dict())
-        elif step > 20:
-            assert same(saved.step(action)[0], many[0])
-
-
 def test_drones_have_talked_before_an_episode():
     vec = make(num_envs=2, **{"env.sensing": "onboard", "env.communication": "all", "env.communication_delay": 3})
     vec.reset(seed=0)
-    mail = vec._sensing._load_sensing._mail
+    messages = vec._sensing._load_sensing._messages
     off = ~np.eye(4, dtype=bool)
-    assert (mail.age[:, off] == 0).all()
-    np.testing.assert_array_equal(mail.heard[:, 0, 1], vec._sensing._load_sensing._anchor[:, 1])
+    assert (messages.age[:, off] == 0).all()
+    np.testing.assert_array_equal(messages.heard[:, 0, 1], vec._sensing._load_sensing._anchor[:, 1])
     ages = []
     for _ in range(10):
         vec.step(np.zeros((2, 4, 4)))
-        ages.append(mail.age[0, 0, 1])
+        ages.append(messages.age[0, 0, 1])
     assert ages == [1, 2, 3, 3, 3, 3, 3, 3, 3, 3]
     vec.reset(mask=np.array([True, False]))
-    assert (mail.age[0, off] == 0).all() and (mail.age[1, off] == 3).all()
+    assert (messages.age[0, off] == 0).all() and (messages.age[1, off] == 3).all()
 
 
 @pytest.mark.parametrize(
@@ -208,7 +198,7 @@ def test_news_that_nobody_would_use_are_refused():
 def test_a_loss_that_cannot_be_noticed_has_to_be_announced(settings):
     known = {"env.sensing": "onboard", "env.communication": "all", "task_options.broadcast": False}
     make("loss", num_envs=1, **known)
-    with pytest.raises(ConfigError, match=r"does not show the payload's tilt|tell each other what they measure"):
+    with pytest.raises(ConfigError, match=r"does not show the payload's tilt|communicate what they measure"):
         make("loss", num_envs=1, **(known | settings))
 
 

@@ -144,9 +144,13 @@ def test_critic_reward_and_success_know_the_truth(level):
     np.testing.assert_allclose(vec.task.errors.position, true, atol=1e-15)
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_results_depend_on_neither_threads_nor_company_and_resume(level):
-    settings = {"env.sensing": level, "randomization.action_delay": [0, 2]}
+LINKS = {"env.communication": "neighbours", "env.communication_loss": 0.3, "env.communication_delay": 2,
+         "env.communication_range": 2.0}  # fmt: skip
+
+
+@pytest.mark.parametrize(("level", "links"), [*((level, {}) for level in LEVELS), ("onboard", LINKS)])
+def test_results_depend_on_neither_threads_nor_company_and_resume(level, links):
+    settings = {"env.sensing": level, "randomization.action_delay": [0, 2]} | links
     alone = make(num_envs=1, first_env=3, **settings)
     crowd = make(num_envs=5, num_threads=2, **settings)
     alone.reset(seed=7), crowd.reset(seed=7)

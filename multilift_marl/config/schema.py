@@ -59,7 +59,7 @@ class EnvConfig(Section):
         "ideal", description="what drones know of themselves and of the payload (docs/sensing.md)"
     )
     communication: Literal["none", "neighbours", "all"] = Field(
-        "none", description="whom a drone hears tell where its cable ends, with sensing=onboard"
+        "none", description="with sensing=onboard: which drones a drone receives the end of their cables from"
     )
     communication_delay: Int = Field(1, ge=0, le=100, description="[policy steps] until a message is heard")
     communication_loss: Float = Field(0.0, ge=0, le=1, description="[-] share of the messages that are lost")

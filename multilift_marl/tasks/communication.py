@@ -1,4 +1,4 @@
-"""What drones tell each other of the payload: where their cables end, over links that lose and delay messages.
+"""Communication of drones about the payload: where their cables end, over links that lose and delay messages.
 
 `env.communication` says whom a drone hears. A message is heard `env.communication_delay` steps after it was sent, with
 the probability 1 - `env.communication_loss`, and only where the two are closer than `env.communication_range` when it
@@ -33,10 +33,10 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.sim.gusts import uniform
-from multilift_marl.tasks.load_filter import follow_attitude, follow_position, keep_moving
+from multilift_marl.tasks.load_filter import follow_attitude, follow_position, predict_position
 
-TOO_OLD = 0.5  # [s] what was heard longer ago is not used
-LEVEL = 0.02 / 0.1  # [m] of an anchor's error over [rad] of a payload's attitude about the planned one
+MAX_AGE = 0.5  # [s] what was heard longer ago is not used
+ATTITUDE_PRIOR = 0.02 / 0.1  # [m] of an anchor's error over [rad] of a payload's attitude about the planned one
 NEVER = 1 << 30
 """Age of what has not been heard in this episode [steps]."""
 
@@ -54,7 +54,7 @@ class Links(NamedTuple):
     """Of the radio [m]."""
 
 
-class Mail(NamedTuple):
+class Messages(NamedTuple):
     """What has been sent and heard; environment first."""
 
     generator: np.ndarray
@@ -72,15 +72,15 @@ class Mail(NamedTuple):
 
 
 def check_links(env: EnvConfig) -> None:
-    """Refuse, by a ConfigError, communication that could tell nothing."""
+    """Refuse, by a ConfigError, communication that could transmit nothing."""
     if env.sensing != "onboard":
         raise ConfigError(
-            f"drones tell each other what they measure with env.sensing=onboard, not {env.sensing}; set "
+            f"drones communicate what they measure with env.sensing=onboard, not {env.sensing}; set "
             "env.communication=none, or env.sensing=onboard"
         )
-    if (seconds := env.communication_delay / env.policy_hz) > TOO_OLD:
+    if (seconds := env.communication_delay / env.policy_hz) > MAX_AGE:
         raise ConfigError(
-            f"env.communication_delay={env.communication_delay} is {seconds:g} s, but nothing older than {TOO_OLD} s "
+            f"env.communication_delay={env.communication_delay} is {seconds:g} s, but nothing older than {MAX_AGE} s "
             "is used; lower it, or set env.communication=none"
         )
 
@@ -97,85 +97,85 @@ def make_links(config: EnvConfig, azimuth: np.ndarray) -> Links:
     return Links(partners, config.communication_delay, config.communication_loss, most)
 
 
-def make_mail(e: int, n: int, delay: int) -> Mail:
-    """Return the mail of E teams of N drones, empty."""
+def make_messages(e: int, n: int, delay: int) -> Messages:
+    """Return the messages of E teams of N drones, empty."""
     k = delay + 1
-    return Mail(
+    return Messages(
         np.zeros(e, np.uint64), np.zeros(e, np.int64), np.zeros((e, k, n, 3)), np.zeros((e, k, n), bool),
         np.zeros((e, n, n, 3)), np.full((e, n, n), NEVER),
     )  # fmt: skip
 
 
-def empty_mail(env: int, mail: Mail, seed: np.random.SeedSequence) -> None:
+def clear_messages(env: int, messages: Messages, seed: np.random.SeedSequence) -> None:
     """Begin an episode of one environment: nothing has been sent."""
-    mail.generator[env] = seed.generate_state(1, np.uint64)[0]
-    mail.steps[env] = 0
-    mail.has_sent[env] = False
-    mail.age[env] = NEVER
+    messages.generator[env] = seed.generate_state(1, np.uint64)[0]
+    messages.steps[env] = 0
+    messages.has_sent[env] = False
+    messages.age[env] = NEVER
 
 
 @kernel
-def exchange(lo, hi, position, told, told_any, links, mail, first):
+def exchange_messages(lo, hi, position, content, has_message, links, messages, first):
     """Send and hear the messages of a step in environments lo to hi.
 
-    Drones have talked before an episode begins: they know what those in range have to tell at its start.
+    At the start of an episode drones know what those in range have to send.
 
     Args:
         lo, hi: the environments.
         position: of the drones, true (E, N, 3) [m].
-        told: what each has to tell (E, N, 3) [m].
-        told_any: whether it has (E, N).
+        content: what each has to send (E, N, 3) [m].
+        has_message: whether it has (E, N).
         links: Links.
-        mail: Mail, advanced.
+        messages: Messages, advanced.
         first: whether an episode begins.
     """
     count = position.shape[1]
     for e in range(lo, hi):
-        now, kept = mail.steps[e], mail.sent.shape[1]
+        now, kept = messages.steps[e], messages.sent.shape[1]
         for n in range(count):
-            put(mail.sent[e, now % kept, n], vec(told, e, n))
-            mail.has_sent[e, now % kept, n] = told_any[e, n]
+            put(messages.sent[e, now % kept, n], vec(content, e, n))
+            messages.has_sent[e, now % kept, n] = has_message[e, n]
         then = now - links.delay
         for n in range(count):
             for m in range(count):
                 if not links.partners[n, m]:
                     continue
-                mail.age[e, n, m] = min(mail.age[e, n, m] + 1, NEVER)
-                arrives = uniform(e, mail) > links.loss  # drawn in any case: the draws of others stay the same
+                messages.age[e, n, m] = min(messages.age[e, n, m] + 1, NEVER)
+                arrives = uniform(e, messages) > links.loss  # drawn in any case: the draws of others stay the same
                 near = norm(sub(vec(position, e, n), vec(position, e, m))) <= links.range
                 if first and near:
-                    put(mail.heard[e, n, m], vec(told, e, m))
-                    mail.age[e, n, m] = 0
-                elif arrives and near and then >= 0 and mail.has_sent[e, then % kept, m]:
-                    put(mail.heard[e, n, m], vec(mail.sent[e], then % kept, m))
-                    mail.age[e, n, m] = links.delay
-        mail.steps[e] = now + 1
+                    put(messages.heard[e, n, m], vec(content, e, m))
+                    messages.age[e, n, m] = 0
+                elif arrives and near and then >= 0 and messages.has_sent[e, then % kept, m]:
+                    put(messages.heard[e, n, m], vec(messages.sent[e], then % kept, m))
+                    messages.age[e, n, m] = links.delay
+        messages.steps[e] = now + 1
 
 
 @kernel
-def place_together(lo, hi, scene, mail, load, first):
-    """Write the payloads that fit all anchors which each drone knows, its own and those it has heard of.
+def update_shared_estimate(lo, hi, scene, messages, load, first):
+    """Estimate each payload from all anchors that a drone knows, its own and those it has heard of.
 
     The planned attitude counts as a measurement, too, so that any number of anchors will do.
     """
     for e in range(lo, hi):
         for n in range(load.tension.shape[1]):
-            position, attitude, count = _fit(e, n, scene, mail)
+            position, attitude, count = _fit(e, n, scene, messages)
             if count == 0:
-                keep_moving(e, n, load, scene.sensor)
+                predict_position(e, n, load, scene.sensor)
                 continue
             follow_position(e, n, position, vec(scene.own.drone_velocity, e, n), load, scene.sensor, first)
             follow_attitude(e, n, attitude, (0.0, 0.0, 0.0), load, scene.sensor, first)
 
 
 @kernel
-def _fit(e, n, scene, mail):
+def _fit(e, n, scene, messages):
     """Return position and attitude of the payload as drone n knows it, and how many anchors it knows."""
     anchors, attitude, team = scene.rig.anchors, matrow(scene.planned.rotation, e), scene.anchor.shape[1]
     # The mean of the known anchors, in the world and in the payload.
     mean, arm, count = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
     for m in range(team):
-        known, place = _known_anchor(e, n, m, scene, mail)
+        known, place = _known_anchor(e, n, m, scene, messages)
         if known:
             mean, arm, count = add(mean, place), add(arm, row(anchors, m)), count + 1
     if count == 0:
@@ -184,12 +184,12 @@ def _fit(e, n, scene, mail):
 
     # Least squares of the turn θ from the planned attitude, Gauss-Newton with b an anchor's arm about the mean:
     # (Σ (b² I - b bᵀ) + λ I) θ = Σ b × (place - mean) - λ (turn so far).
-    turned, weight = (0.0, 0.0, 0.0), LEVEL**2
+    turned, weight = (0.0, 0.0, 0.0), ATTITUDE_PRIOR**2
     for _ in range(3):
         moment = scale(-weight, turned)
         x, y, z = (weight, 0.0, 0.0), (0.0, weight, 0.0), (0.0, 0.0, weight)
         for m in range(team):
-            known, place = _known_anchor(e, n, m, scene, mail)
+            known, place = _known_anchor(e, n, m, scene, messages)
             if known:
                 b = mul(attitude, sub(row(anchors, m), arm))
                 moment = add(moment, cross(b, sub(place, mean)))
@@ -205,10 +205,10 @@ def _fit(e, n, scene, mail):
 
 
 @kernel
-def _known_anchor(e, n, m, scene, mail):
+def _known_anchor(e, n, m, scene, messages):
     """Return whether drone n knows where drone m's cable ends, and that place [m] now."""
     if n == m:
         return scene.knows_anchor[e, n], vec(scene.anchor, e, n)
-    age = scene.sensor.dt * mail.age[e, n, m]
+    age = scene.sensor.dt * messages.age[e, n, m]
     # At the own drone's velocity: the filter's would feed the fit back into itself, and late news make that unstable.
-    return age <= TOO_OLD, add(vec(mail.heard[e], n, m), scale(age, vec(scene.own.drone_velocity, e, n)))
+    return age <= MAX_AGE, add(vec(messages.heard[e], n, m), scale(age, vec(scene.own.drone_velocity, e, n)))

@@ -67,6 +67,6 @@ def follow_attitude(e, k, measured, body_rates, load, sensor, first):
 
 
 @kernel
-def keep_moving(e, n, load, sensor):
-    """Let the payload of which nothing is measured keep its velocity."""
+def predict_position(e, n, load, sensor):
+    """Predict the position of a payload of which nothing is measured, by its velocity."""
     put(load.position[e, n], add(vec(load.position, e, n), scale(sensor.dt, vec(load.velocity, e, n))))

@@ -34,8 +34,14 @@ from multilift_marl.math3d import (
 )
 from multilift_marl.sim.gusts import normal_pair, normal_vector
 from multilift_marl.sim.state import SystemState
-from multilift_marl.tasks.communication import Links, empty_mail, exchange, make_mail, place_together
-from multilift_marl.tasks.load_filter import alpha_beta, follow_attitude, follow_position, keep_moving
+from multilift_marl.tasks.communication import (
+    Links,
+    clear_messages,
+    exchange_messages,
+    make_messages,
+    update_shared_estimate,
+)
+from multilift_marl.tasks.load_filter import alpha_beta, follow_attitude, follow_position, predict_position
 
 Call = Callable[[int, int], None]  # of environments lo to hi
 
@@ -165,15 +171,15 @@ class LoadSensing:
         self._memory = LoadMemory(np.zeros(e, np.uint64), np.zeros((e, n, 3)), np.zeros((e, n)))
         self._anchor, self._knows_anchor = np.zeros((e, n, 3)), np.ones((e, n), bool)
         self._sensor, self._links = make_sensor(level, dt, length), links
-        self._mail = None if links is None else make_mail(e, n, links.delay)
+        self._messages = None if links is None else make_messages(e, n, links.delay)
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:
         """Begin an episode of one environment: draw offsets."""
         memory = self._memory
         memory.generator[env] = seed.generate_state(1, np.uint64)[0]
         draw_offsets(env, memory, self._sensor)
-        if self._mail is not None:
-            empty_mail(env, self._mail, seed.spawn(1)[0])
+        if self._messages is not None:
+            clear_messages(env, self._messages, seed.spawn(1)[0])
 
     def bind(self, planned: Goal, rig: Rig, resting_tension: np.ndarray, first: bool) -> Call:
         """Return the call of (lo, hi) that measures the payload; `first` of an episode, without a past to filter."""
@@ -181,12 +187,12 @@ class LoadSensing:
         if self._level == "mocap":
             return prebind(see_payload, scene, self.load, first)
         see = prebind(see_cable if self._level == "onboard" else suppose_cable, scene, self.load, first)
-        if self._mail is None:
-            stages = [see, prebind(place_alone, scene, self.load, first or self._level == "blind")]
+        if self._messages is None:
+            stages = [see, prebind(update_own_estimate, scene, self.load, first or self._level == "blind")]
         else:
-            told = (self._true.drone_position, self._anchor, self._knows_anchor)
-            stages = [see, prebind(exchange, *told, self._links, self._mail, first)]
-            stages.append(prebind(place_together, scene, self._mail, self.load, first))
+            sent = (self._true.drone_position, self._anchor, self._knows_anchor)
+            stages = [see, prebind(exchange_messages, *sent, self._links, self._messages, first)]
+            stages.append(prebind(update_shared_estimate, scene, self._messages, self.load, first))
 
         def call(lo: int, hi: int) -> None:
             for stage in stages:
@@ -204,7 +210,9 @@ class LoadSensing:
         """Return the live arrays that outlive a step."""
         arrays = {f"load_{name}": array for name, array in self.load._asdict().items()}
         arrays |= {f"load_sensor_{name}": array for name, array in self._memory._asdict().items()}
-        return arrays | ({} if self._mail is None else {f"mail_{k}": a for k, a in self._mail._asdict().items()})
+        return arrays | (
+            {} if self._messages is None else {f"message_{k}": a for k, a in self._messages._asdict().items()}
+        )
 
 
 @kernel
@@ -285,12 +293,12 @@ def _planned_cable(e, n, scene):
 
 
 @kernel
-def place_alone(lo, hi, scene, load, first):
-    """Write the payloads that have each drone's anchor where it takes it to be, at rest in the planned attitude."""
+def update_own_estimate(lo, hi, scene, load, first):
+    """Estimate each payload from a drone's own anchor alone, at rest in the planned attitude."""
     for e in range(lo, hi):
         for n in range(load.tension.shape[1]):
             if not scene.knows_anchor[e, n]:
-                keep_moving(e, n, load, scene.sensor)
+                predict_position(e, n, load, scene.sensor)
                 continue
             # It is the anchor that is followed: the planned attitude may leap.
             arm = row(scene.rig.anchors, n)

@@ -101,8 +101,8 @@ class Sensing:
         self.state = world.state
         if estimator is not None:
             dt, length = 1 / config.env.policy_hz, float(np.mean(world.system.cable_length))
-            told = config.env.communication != "none"
-            links = make_links(config.env, world.system.slot_azimuth) if told else None
+            talks = config.env.communication != "none"
+            links = make_links(config.env, world.system.slot_azimuth) if talks else None
             self._load_sensing = LoadSensing(level, world.state, estimator.state, dt, length, links)
             unknown: Any = dict.fromkeys(name for name in SystemState._fields if name.startswith("payload_"))
             self.state = estimator.state._replace(**unknown)
