@@ -155,7 +155,30 @@ def test_the_same_numbers_move_a_team_alike_whatever_the_azimuths(action):
     assert np.abs(seen[0][0, own]).max() > 0.05
 
 
-@pytest.mark.parametrize("action", ["ctbr", "rotor"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("hook", [[0, 0, 0], [0.02, 0.0, -0.01]])
+def test_ctbm_gives_the_moments_asked_for_about_the_axes_of_the_slot(axis, hook):
+    vec = flying("ctbm", num_drones=3, **{"cable.hook": hook})
+    vehicle, state = vec.world.system.vehicle, vec.world.state
+    attitude = state.drone_rotation.copy()
+    step(vec, 0, 0, 0, 0)
+    at_rest = vec.world.thrust @ vehicle.allocation.T
+    vec.reset(seed=0)
+    step(vec, 0, *(0.05 * np.eye(3)[axis]))
+    wrench = vec.world.thrust @ vehicle.allocation.T - at_rest
+    np.testing.assert_allclose(wrench[..., 0], 0.0, atol=1e-9)
+    turn = np.arctan2(*vec.task.goal.slot_frame[..., ::-1].transpose(2, 0, 1)) - np.arctan2(
+        -attitude[..., 0, 1], attitude[..., 1, 1]
+    )
+    c, s = np.cos(turn), np.sin(turn)
+    frame = np.stack(
+        [np.stack([c, s, 0 * c], -1), np.stack([-s, c, 0 * c], -1), np.broadcast_to([0, 0, 1], (*c.shape, 3))], -2
+    )
+    expected = 0.05 * 200.0 * np.asarray(vehicle.inertia) * frame[..., axis, :]
+    np.testing.assert_allclose(wrench[..., 1:], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("action", ["ctbr", "ctbm", "rotor"])
 def test_thrust_goes_from_limit_to_limit_by_the_hover_thrust(action):
     vec = flying(action)
     vehicle = vec.world.system.vehicle
@@ -189,10 +212,12 @@ def test_whatever_is_asked_rotors_stay_within_their_limits(action):
 
 @pytest.mark.parametrize("action", OTHERS)
 def test_an_environment_replays_alone_and_continues_from_its_saved_state(action):
+    share = 0.02 if action == "ctbm" else 0.2  # nothing holds the attitude
+
     def fly(vec, steps, first_env=0):
         seen = []
         for k in steps:
-            observation, reward, terminated, truncated, _ = vec.step(0.2 * bold_actions(vec, k, first_env, hold=2))
+            observation, reward, terminated, truncated, _ = vec.step(share * bold_actions(vec, k, first_env, hold=2))
             seen.append((observation, reward))
             assert not (terminated | truncated).any()
         return seen
@@ -218,7 +243,7 @@ def test_an_unknown_interface_is_refused():
     assert "control.action" in refusal(ml.make_vec, "hover", num_envs=1, **{"control.action": "motors"})
 
 
-@pytest.mark.parametrize("action", ["acc_rates", "ctbr"])
+@pytest.mark.parametrize("action", ["acc_rates", "ctbr", "ctbm"])
 def test_a_team_trains_with_the_interface(tmp_path, action):
     trainer = make_trainer(tmp_path, **{"control.action": action, "train.frames": 256})
     before = trainer.learner.actor.team.net[0].weight.detach().clone()

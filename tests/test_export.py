@@ -124,6 +124,7 @@ READ = {
     ("ctbr", "thrust"): lambda vec: vec.controller._setpoint.thrust[0, 0],
     ("ctbr", "outward_rate"): lambda vec: slot_body_rates(vec)[0],
     ("ctbr", "yaw_rate"): lambda vec: vec.controller._setpoint.rates[0, 0, 2],
+    ("ctbm", "thrust"): lambda vec: vec.controller._setpoint.thrust[0, 0],
     ("rotor", "rotor_2"): lambda vec: vec.world.thrust[0, 0, 2],
 }
 

@@ -261,3 +261,42 @@ def test_every_number_of_an_observation_is_what_the_documents_say(task):
                 seen, expected[part.name], rtol=1e-5, atol=2e-5, err_msg=f"{part.name}, step {k}"
             )
         assert at == vec.observation_size
+
+
+def test_the_global_state_holds_what_an_episode_hides():
+    ranges = {
+        "payload_inertia": 0.2, "payload_center_of_mass": [0.01, 0.01, 0.01], "action_delay": [0, 3],
+        "cable_length": 0.1, "vehicle_mass": 0.05, "vehicle_thrust_coefficient": 0.05,
+        "vehicle_rotor_time_constant": 0.2,
+    }  # fmt: skip
+    plain = make("hover", num_envs=3, num_drones=3)
+    vec = make(
+        "hover", num_envs=3, num_drones=3, **{f"randomization.{k}": v for k, v in ranges.items()},
+        **{"wind.velocity": [3.0, 1.0, 0.0], "wind.turbulence": True},
+    )  # fmt: skip
+    _, info = vec.reset(seed=4)
+    for _ in range(5):
+        _, _, _, _, info = vec.step(zeros(vec))
+    drawn, system, n = info["randomization"], vec.config.system, 3
+    first, _, size = vec.task.drone_numbers
+    state, action = vec.state(), vec.action_size
+    assert vec.state_size == plain.state_size + n * 4 + 8
+    of_drones = state[:, first : first + n * size].reshape(3, n, size)
+    expected = np.stack(
+        [
+            drawn["cable_length"] / system.cable_length - 1, drawn["vehicle_mass"] / system.drone_mass - 1,
+            drawn["vehicle_thrust_coefficient"] - 1, drawn["vehicle_rotor_time_constant"] - 1,
+        ],
+        axis=-1,
+    )  # fmt: skip
+    np.testing.assert_allclose(of_drones[..., size - action - 4 : size - action], expected, atol=1e-6)
+    assert (np.abs(expected).max(axis=(0, 1)) > 0.01).all()
+    gust = turned(heading(vec.task.goal.rotation), vec.world.air.gust)
+    rest = [
+        drawn["payload_inertia"][:, None] - 1,
+        drawn["payload_center_of_mass"],
+        drawn["action_delay"][:, None],
+        gust,
+    ]
+    np.testing.assert_allclose(state[:, -8:], np.concatenate(rest, axis=1), atol=1e-6)
+    assert (np.abs(gust[:, :2]) > 1e-3).all()

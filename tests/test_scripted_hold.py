@@ -27,7 +27,7 @@ def test_they_hold_the_payload_at_its_target(action):
     assert vec.task.errors.distance.mean() < 0.01
 
 
-@pytest.mark.parametrize("action", ["velocity", "acceleration", "acc_rates", "ctbr"])
+@pytest.mark.parametrize("action", ["velocity", "acceleration", "acc_rates", "ctbr", "ctbm"])
 def test_a_drone_off_its_slot_begins_to_move_by_the_law(action):
     vec, script = make_holding(action, **{"num_envs": 1, "env.sensing": "ideal", "randomization.payload_force": 0.0})
     vec.reset(seed=1)
@@ -35,12 +35,12 @@ def test_a_drone_off_its_slot_begins_to_move_by_the_law(action):
     names = vec.observation_names
     seen[..., names.index("heading_0")] = 1.0  # at rest but for 5 cm outward
     seen[..., names.index("slot_error_0")] = 0.05
-    if action == "ctbr":  # at rest drones lean outward, against their cables
+    if action in ("ctbr", "ctbm"):  # at rest drones lean outward, against their cables
         force = vec.world.system.hook_force[0] + np.array([0.0, 0.0, vec.world.system.vehicle.mass * 9.81])
         lean = np.hypot(*force[:2]) / np.linalg.norm(force)
         seen[..., names.index("thrust_axis_0")] = lean
     action_taken = script.act(seen)[0, 0]
-    moving = {"velocity": 0, "acceleration": 0, "acc_rates": 0, "ctbr": 2}[action]
+    moving = {"velocity": 0, "acceleration": 0, "acc_rates": 0, "ctbr": 2, "ctbm": 2}[action]
     assert action_taken[moving] < -0.05  # inward, or its tilt that way
     rest = np.delete(action_taken, moving)
     assert np.abs(rest).max() < 1e-4

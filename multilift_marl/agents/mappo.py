@@ -19,7 +19,6 @@ from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
-from multilift_marl.tasks.observations import drone_numbers
 
 _OBSERVATION, _ACTION, _LOG_PROB, _MEMORY = (
     ("agents", name) for name in ("observation", "action", "action_log_prob", "memory")
@@ -90,8 +89,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
     critic: CentralCritic | LocalCritic
     if config.algorithm == "mappo":
-        drones = drone_numbers(vec.num_drones, vec.action_size)
-        critic = CentralCritic(config.critic, vec.state_size, drones, config.hidden, value_norm)
+        critic = CentralCritic(config.critic, vec.state_size, vec.task.drone_numbers, config.hidden, value_norm)
     else:
         critic = LocalCritic(vec.observation_size, config.hidden, value_norm)
 

@@ -31,6 +31,7 @@ from multilift_marl.config.values import (
 RESIDUALS = (
     "formation", "formation_integral", "formation_feedback", "formation_gusts", "formation_lead", "formation_narrow",
     "formation_redistributed", "hold_velocity", "hold_acceleration", "hold_acc_rates", "hold_ctbr",
+    "hold_ctbm",
 )  # fmt: skip
 
 
@@ -189,7 +190,7 @@ class CableConfig(Section):
 class ControlConfig(Section):
     """The drones' geometric controller and its action interface."""
 
-    action: Literal["reference", "velocity", "acceleration", "acc_rates", "ctbr", "rotor"] = Field(
+    action: Literal["reference", "velocity", "acceleration", "acc_rates", "ctbr", "ctbm", "rotor"] = Field(
         "reference", description="what an action means (docs/control.md)"
     )
     max_offset: Annotated[Float, Between(0, 100, "m")] = Field(
@@ -207,6 +208,9 @@ class ControlConfig(Section):
     )
     max_yaw_rate: Annotated[Float, Between(0, 100, "rad/s")] = Field(
         1.5, gt=0, description="[rad/s] of a full action of `velocity`, `acceleration`, `ctbr`"
+    )
+    max_angular_acceleration: Annotated[Float, Between(0, 1e4, "rad/s²")] = Field(
+        200.0, gt=0, description="[rad/s²] of a full action of `ctbm`, about each axis"
     )
     reference_frequency: Annotated[Float, Between(0.01, 1e4, "rad/s")] = Field(
         6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference"

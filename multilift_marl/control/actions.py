@@ -22,7 +22,7 @@ from multilift_marl.control.formation import Goal, Reference, Smoothing, smooth,
 from multilift_marl.control.gains import Gains, drone_gains
 from multilift_marl.control.geometric import fly, fly_rates, hook_moment
 from multilift_marl.control.setpoints import Setpoint, smooth_velocity, track_own_state, track_own_state_to_yaw
-from multilift_marl.math3d import add, heading, mat, norm, put, thrust_frame, turn, vec
+from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, turn, vec
 from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.state import SystemState
 
@@ -227,8 +227,44 @@ class CtbrAction(Interface):
         return (bind(fly_rates, lo, hi, team.state, team.setpoint, team.cable_force, team.thrust, team.gains),)
 
 
+class CtbmAction(Interface):
+    """Collective thrust and body moments: as much as the rotors' own thrusts, in the slot body frame.
+
+    Moments are given as the angular accelerations of the drone that they cause. Nothing else holds the attitude.
+    """
+
+    numbers = (
+        CtbrAction.numbers[0],
+        *(
+            ActionComponent(
+                f"{name}_moment", "slot body", "rad/s²", "max_angular_acceleration", f"angular acceleration {where}"
+            )
+            for name, where in (
+                ("outward", "about the axis that points outward"), ("sideways", "about that to its left"),
+                ("yaw", "about body z"),
+            )
+        ),
+    )  # fmt: skip
+    by_rates = True
+
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+        """See `Interface.set_action`."""
+        return bind(_command_moments, lo, hi, action, team, self.settings.max_angular_acceleration)
+
+    def thrusts(self, team: Team) -> np.ndarray:
+        """See `Interface.thrusts`."""
+        return team.setpoint.thrust[..., None]
+
+    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+        """See `Interface.control_step`."""
+        return ()
+
+
 class RotorAction(Interface):
-    """Thrust of each rotor, zero: its own at hover, ± 1: its limits. Nothing else holds the attitude."""
+    """Thrust of each rotor, zero: its own at hover, ± 1: its limits. Nothing else holds the attitude.
+
+    Which rotor is on the outside differs from drone to drone: `ctbm` means the same to all of them.
+    """
 
     numbers = tuple(ActionComponent(f"rotor_{k}", "body", "N", THRUST, f"thrust of rotor {k}") for k in range(4))
 
@@ -320,6 +356,26 @@ def _command_rates(lo, hi, action, team, max_tilt_rate, max_yaw_rate):
 
 
 @kernel
+def _command_moments(lo, hi, action, team, max_angular_acceleration):
+    track_own_state(lo, hi, team.state, team.reference, 0.0)
+    g = team.gains
+    for e in range(lo, hi):
+        for n in range(action.shape[1]):
+            d = drone_gains(g, n)
+            cable, attitude = vec(team.cable_force, e, n), mat(team.state.drone_rotation, e, n)
+            hover = norm(_hover_force(cable, d.mass))
+            total = _between(action[e, n, 0], 4.0 * d.thrust_min, hover, 4.0 * d.thrust_max)
+            team.setpoint.thrust[e, n] = total
+            asked = scale(max_angular_acceleration, (action[e, n, 1], action[e, n, 2], action[e, n, 3]))
+            asked = from_slot_body(asked, heading(attitude), team.goal.slot_frame[e, n])
+            moment = (d.inertia[0] * asked[0], d.inertia[1] * asked[1], d.inertia[2] * asked[2])
+            moment = add(moment, hook_moment(n, attitude, cable, (0.0, 0.0, 0.0), g))
+            rotors = allocate(total, moment, d.allocation, d.thrust_min, d.thrust_max)
+            for k in range(4):
+                team.thrust[e, n, k] = rotors[k]
+
+
+@kernel
 def _command_rotors(lo, hi, action, team):
     track_own_state(lo, hi, team.state, team.reference, 0.0)
     g = team.gains
@@ -344,5 +400,6 @@ ACTIONS: dict[str, type[Interface]] = {
     "acceleration": AccelerationAction,
     "acc_rates": AccRatesAction,
     "ctbr": CtbrAction,
+    "ctbm": CtbmAction,
     "rotor": RotorAction,
 }

@@ -17,7 +17,7 @@ from multilift_marl.control.scripted_formation import (
     FormationNarrow,
     FormationRedistributed,
 )
-from multilift_marl.control.scripted_hold import HoldAcceleration, HoldAccRates, HoldCtbr, HoldVelocity
+from multilift_marl.control.scripted_hold import HoldAcceleration, HoldAccRates, HoldCtbm, HoldCtbr, HoldVelocity
 from multilift_marl.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ LINEAR: dict[str, type[Formation]] = {
     "hold_acceleration": HoldAcceleration,
     "hold_acc_rates": HoldAccRates,
     "hold_ctbr": HoldCtbr,
+    "hold_ctbm": HoldCtbm,
 }
 """Scripts that are maps of the observation."""
 SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {

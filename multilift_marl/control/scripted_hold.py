@@ -1,4 +1,4 @@
-"""Scripts for the action interfaces below `reference`: velocity, acceleration, acc_rates, ctbr.
+"""Scripts for the action interfaces below `reference`: velocity, acceleration, acc_rates, ctbr, ctbm.
 
 One linear PD law with an integral for the acceleration of each drone, converted to each interface. All are linear maps
 of the observation, so that a learned policy can start from them (`train.residual`) and gains can be searched
@@ -17,7 +17,6 @@ from multilift_marl.rig.vehicles import GRAVITY
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
-TILT_GAIN = 8.0  # [1/s] of a tilt from the desired one: of `ctbr`, whose rate loops are faster
 YAW_GAIN = 2.0  # [1/s] of the heading
 STIFFNESS, DAMPING = 16.0, 8.0  # [1/s²], [1/s] of a drone about its slot: 4 rad/s, critically damped
 OWN_PLANNED = {"slot_error": ("planned_position",), "velocity": ("planned_velocity", "target_velocity")}
@@ -118,6 +117,7 @@ class HoldCtbr(HoldAcceleration):
     """The same law by thrust and body rates: tilts lead to level accelerations, thrust to the vertical one."""
 
     INTERFACE = "ctbr"
+    TILT_GAIN: ClassVar[float] = 8.0  # [1/s] of a tilt from the desired one; rate loops are faster
 
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
@@ -138,6 +138,23 @@ class HoldCtbr(HoldAcceleration):
             wanted[self._column("thrust_axis", axis)] -= 1.0
             if axis == 0:
                 wanted[self._column("heading", 0)] += lean  # the cosine of a small heading stands for 1
-            matrix[rate] = sign * TILT_GAIN * wanted / control.max_tilt_rate
+            matrix[rate] = sign * self.TILT_GAIN * wanted / control.max_tilt_rate
         matrix[3] = self._turn_back() / control.max_yaw_rate
+        return matrix
+
+
+class HoldCtbm(HoldCtbr):
+    """The same law by thrust and moments: those that turn a drone at the body rates of `hold_ctbr`."""
+
+    INTERFACE = "ctbm"
+    TILT_GAIN = 9.0
+    RATE_GAIN: ClassVar[float] = 45.0  # [1/s] of a body rate from the desired one, at 50 Hz
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        control, matrix = self._vec.config.control, super().matrix()
+        for axis, full in enumerate((control.max_tilt_rate, control.max_tilt_rate, control.max_yaw_rate)):
+            matrix[1 + axis] *= full
+            matrix[1 + axis, self._column("turned_rates", axis)] -= 1.0
+            matrix[1 + axis] *= self.RATE_GAIN / control.max_angular_acceleration
         return matrix

@@ -21,7 +21,7 @@ from multilift_marl.sim.world import World
 from multilift_marl.tasks.failures import FailureMask, find_cause, make_limits
 from multilift_marl.tasks.load_sensing import true_load
 from multilift_marl.tasks.observation_kernels import check_written, compose_observation, compose_state
-from multilift_marl.tasks.observations import SENSED, Component, list_components, list_state, state_size
+from multilift_marl.tasks.observations import SENSED, Component, list_components, state_components
 from multilift_marl.tasks.rewards import RestBounds, Term, compose_reward, is_at_rest
 from multilift_marl.tasks.sensing import Sensing
 from multilift_marl.tasks.starts import make_hanging, true_hanging
@@ -98,6 +98,7 @@ class Task:
         view: View, what its kernels read and write; the following are fields of it: goal, planned, errors, mask, rig,
             limits, time, cause, terms, good_time, min_separation, action, previous, dt, control_dt, own, settings.
         weights, margins: of the reward terms (T,), (T, M), in the order of `REWARD`.
+        drone_numbers: where the drones' numbers stand in the global state.
         rmse_after: time from which errors count for `payload_rmse_m` [s].
         hanging: numbers of a hanging team; in `start`, the true ones of the environment, else nominal.
         nominal_hanging: always nominal, for goals.
@@ -132,7 +133,10 @@ class Task:
         size = sensing.action_size
         self.action, self.previous = np.zeros((2, e, n, size))
         self.observation = np.zeros((e, n, sensing.observation_size), np.float32)
-        self.critic = np.zeros((e, state_size(n, size, self.EXTRA_STATE)), np.float32)
+        varied = system.varied | ({"gust"} if config.wind.turbulence or any(config.wind.gust) else set())
+        self._state = state_components(varied, self.EXTRA_STATE)
+        self.drone_numbers = self._state.drone_numbers(n, size)
+        self.critic = np.zeros((e, self._state.size(n, size)), np.float32)
         self.cause, self.time, self.good_time, self.min_separation = np.zeros(e, np.int64), *np.zeros((3, e))
         self.terms = np.zeros((e, len(self.REWARD)))
         self.rmse_after = 0.0
@@ -145,6 +149,9 @@ class Task:
             true_load=true_load(world.state),
             true_errors=self.errors.as_rows(),
             loads=world.hidden_loads,
+            parameters=world.parameters,
+            gust=world.air.gust,
+            action_delay=sensing.memory.action_delay,
             goal=self.goal,
             planned=self.planned,
             has_plan=self.planned is not self.goal,
@@ -249,7 +256,7 @@ class Task:
         """Refuse, by a ConfigError, components of observation or global state that are not written in a first step."""
         size, parts = self.action.shape[2], list_components(self.config.control.action, self.extra(self.config))
         check_written(self.observation[env], parts, "observation")
-        check_written(self.critic[env], list_state(self.world.num_drones, size, self.EXTRA_STATE), "global state")
+        check_written(self.critic[env], self._state.listed(self.world.num_drones, size), "global state")
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""
@@ -285,7 +292,7 @@ class Task:
             "observe": self._bind(observe, v, self.observation),
         }
         true = v._replace(seen=v.state, load=v.true_load, seen_errors=v.true_errors)
-        stages["observe state"] = self._bind(compose_state(self.EXTRA_STATE, kernels.preview, size), true, self.critic)
+        stages["observe state"] = self._bind(compose_state(self._state, kernels.preview, size), true, self.critic)
         if kernels.plan is not None:
             stages["plan"] = self._bind(compose_plan(kernels.plan), v)
         return stages

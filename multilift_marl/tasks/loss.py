@@ -28,6 +28,7 @@ from multilift_marl.tasks.rewards import (
 from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
 from multilift_marl.tasks.view import load_row
 
+HARMLESS = 0.75  # tensions up to this share of the limit are no snatch
 LEAD = 0.1  # [s] by which a tilt is foreseen: 4 drones notice a loss 0.13 s after it, 6 after 0.17 s
 
 
@@ -63,6 +64,8 @@ class LossArrays(NamedTuple):
     """(E,) number of the drone, int64."""
     peak_tension: np.ndarray
     """(E,) largest tension in the episode over that at rest [-]."""
+    counted_tension: np.ndarray
+    """(E,) the same, as the reward has counted it [-]."""
     known: np.ndarray
     """(E, N) bool, drones that know of the loss."""
     known_who: np.ndarray
@@ -75,6 +78,8 @@ class LossSettings(NamedTuple):
     """Constants of the task."""
 
     bounds: RestBounds
+    tension: float
+    """Largest tension of a success over that at rest [-]."""
     snap: bool
     """Whether the lost drone's cable breaks."""
     broadcast: bool
@@ -130,6 +135,20 @@ def notice_loss(e, v):
             v.own.known[e, n] = True
             v.own.known_who[e, n] = v.own.who[e] if v.settings.broadcast else lowest_corner(e, tilt, v)
             v.own.known_when[e, n] = v.own.when[e] if v.settings.broadcast else v.time[e]
+
+
+@inlined
+def snatch(e, v):
+    """By how much the largest tension of the episode rose in this step, over the limit; harmless ones do not count."""
+    counted = max(v.own.counted_tension[e], HARMLESS * v.settings.tension)
+    return max(v.own.peak_tension[e] - counted, 0.0) / v.settings.tension
+
+
+@inlined
+def end_step(e, v):
+    """Let drones know of a loss, and the next step count what tension it adds."""
+    notice_loss(e, v)
+    v.own.counted_tension[e] = v.own.peak_tension[e]
 
 
 @inlined
@@ -191,9 +210,10 @@ class Loss(Task):
         "precision": Term(0.25, distance, 0.03, "m"),
         "attitude": Term(0.15, attitude, 20.0, "deg"),
         "stillness": Term(0.15, stillness, (0.2, 0.3), "m/s, rad/s"),
+        "snatch": Term(0.0, snatch),
         "action_rate": Term(-0.05, action_rate),
     }
-    KERNELS: ClassVar[Kernels] = Kernels(plan=stop_motors, update=notice_loss)
+    KERNELS: ClassVar[Kernels] = Kernels(plan=stop_motors, update=end_step)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("lost", 1, "-", "-", "1 if the own motors have stopped", lost),
         Component("team_lost", 1, "-", "-", "1 if those of any drone have, as one knows", knows_loss),
@@ -230,11 +250,16 @@ class Loss(Task):
         e, n, gains = world.num_envs, world.num_drones, make_gains(control, world.system)
         offsets = redistributed_slots(world.system, gains, not option.snap, control.max_offset)
         self.own = LossArrays(
-            np.zeros(e), np.zeros(e, np.int64), np.zeros(e), np.zeros((e, n), bool), np.zeros((e, n), np.int64),
-            np.zeros((e, n)),
+            np.zeros(e), np.zeros(e, np.int64), np.zeros(e), np.zeros(e), np.zeros((e, n), bool),
+            np.zeros((e, n), np.int64), np.zeros((e, n)),
         )  # fmt: skip
         self.settings = LossSettings(
-            RestBounds.of(option), option.snap, option.broadcast, radians(option.noticed_angle), offsets
+            RestBounds.of(option),
+            option.success_tension,
+            option.snap,
+            option.broadcast,
+            radians(option.noticed_angle),
+            offsets,
         )
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
@@ -242,7 +267,7 @@ class Loss(Task):
         start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.hanging)
         self.own.who[env] = rng.integers(self.world.num_drones)
         self.own.when[env] = rng.uniform(*self.options.loss_time)
-        self.mask.lost[env], self.own.peak_tension[env] = False, 0.0
+        self.mask.lost[env], self.own.peak_tension[env], self.own.counted_tension[env] = False, 0.0, 0.0
         self.own.known[env], self.own.known_who[env], self.own.known_when[env] = False, 0, 0.0
 
     def succeeded(self) -> np.ndarray:

@@ -13,11 +13,9 @@ from multilift_marl.control.actions import ACTIONS
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import turn
 from multilift_marl.tasks.observations import (
-    DRONE_STATE,
     OBSERVATION_SIZE,
-    STATE,
     Component,
-    drone_numbers,
+    StateComponents,
     list_components,
 )
 
@@ -41,26 +39,26 @@ def compose_observation(extra: tuple[Component, ...], action: str) -> Any:
     return compose("observe", "\n".join(lines) + "\n", functions)
 
 
-def compose_state(extra: tuple[Component, ...], preview: Callable[..., Any] | None, action_size: int) -> Any:
+def compose_state(parts: StateComponents, preview: Callable[..., Any] | None, action_size: int) -> Any:
     """Return the kernel of (lo, hi, View, critic (E, S)) that writes the global state, in the target's heading frame.
 
     Args:
-        extra: what the task adds at the end.
+        parts: what it holds.
         preview: inlined kernel of (e, View), called first; None for none.
         action_size: numbers of an action.
     """
     functions: dict[str, Any] = {"turn": turn, "cos": cos, "sin": sin} | ({"preview": preview} if preview else {})
-    first, _, size = drone_numbers(0, action_size)
-    drone = _write("out", "at + ", "n", DRONE_STATE, functions)
+    first, _, size = parts.drone_numbers(0, action_size)
+    drone = _write("out", "at + ", "n", parts.drone, functions)
     drone += [f"out[at + {size - action_size + k}] = v.action[e, n, {k}]" for k in range(action_size)]
     lines = ["def observe_state(lo, hi, v, critic):", "    for e in range(lo, hi):", "        out = critic[e]"]
     lines += ["        preview(e, v)"] if preview else []
     lines.append("        c, s = cos(v.goal.yaw[e]), -sin(v.goal.yaw[e])")  # world to the target's heading frame
-    lines += [f"        {line}" for line in _write("out", "", "0", STATE, functions)]
+    lines += [f"        {line}" for line in _write("out", "", "0", parts.team, functions)]
     lines += ["        for n in range(v.action.shape[1]):", f"            at = {first} + n * {size}"]
     lines += [f"            {line}" for line in drone]
     lines.append(f"        at = {first} + v.action.shape[1] * {size}")
-    lines += [f"        {line}" for line in _write("out", "at + ", "0", extra, functions)]
+    lines += [f"        {line}" for line in _write("out", "at + ", "0", parts.rest, functions)]
     return compose("observe_state", "\n".join(lines) + "\n", functions)
 
 

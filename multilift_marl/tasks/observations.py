@@ -9,7 +9,7 @@ field of `SystemState` must first be computed there, and measured in `tasks/sens
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from math import cos, sin
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ FRAMES = {
     "world": "z up",
     "target": "the world, turned about z to the heading atan2(-R01, R11) of the payload's target attitude R",
     "slot": "x horizontal, outward from the target payload position through the drone's slot, y to the left, z up",
+    "payload": "of the payload itself",
     "body": "of the drone itself: x forward, y left, z along the thrust",
     "slot body": "the body's, turned about its z axis so that x points outward through the drone's slot",
 }
@@ -194,6 +195,54 @@ def payload_mass(e, n, v):
 
 
 @inlined
+def gust(e, n, v):
+    """Wind beside the mean."""
+    return row(v.gust, e)
+
+
+@inlined
+def payload_inertia(e, n, v):
+    """Payload inertia over that of its mass, minus 1."""
+    return v.parameters.payload_inertia[e] - 1.0
+
+
+@inlined
+def payload_center_of_mass(e, n, v):
+    """Payload centre of mass from the nominal one."""
+    return row(v.parameters.payload_center_of_mass, e)
+
+
+@inlined
+def action_delay(e, n, v):
+    """Delay of actions."""
+    return float(v.action_delay[e])
+
+
+@inlined
+def cable_length(e, n, v):
+    """Cable length over the nominal one, minus 1."""
+    return v.parameters.cable_length[e, n] / v.nominal.length[n] - 1.0
+
+
+@inlined
+def vehicle_mass(e, n, v):
+    """Mass over the nominal one, minus 1."""
+    return v.parameters.vehicle_mass[e, n] / v.nominal.drones.mass[n] - 1.0
+
+
+@inlined
+def thrust_coefficient(e, n, v):
+    """Thrust coefficient over the nominal one, minus 1."""
+    return v.parameters.vehicle_thrust_coefficient[e, n] - 1.0
+
+
+@inlined
+def rotor_time_constant(e, n, v):
+    """Time constant of the rotors over the nominal one, minus 1."""
+    return v.parameters.vehicle_rotor_time_constant[e, n] - 1.0
+
+
+@inlined
 def target_height(e, n, v):
     """Height of the target."""
     return v.goal.position[e, 2]
@@ -286,6 +335,30 @@ DRONE_STATE = (  # then of each drone, and its last action
 )
 
 
+HIDDEN = {  # what the global state holds beside, where `randomization` varies it
+    "payload_inertia": Component(
+        "payload_inertia", 1, "-", "-", "payload inertia over that of its mass, minus 1", payload_inertia
+    ),
+    "payload_center_of_mass": Component(
+        "payload_center_of_mass", 3, "payload", "m", "payload centre of mass from the nominal one",
+        payload_center_of_mass,
+    ),
+    "action_delay": Component("action_delay", 1, "-", "policy steps", "delay of actions", action_delay),
+    "gust": Component("gust", 3, "target", "m/s", "turbulence and gusts", gust),
+}  # fmt: skip
+DRONE_HIDDEN = {  # the same of each drone
+    "cable_length": Component("cable_length", 1, "-", "-", "cable length over the nominal one, minus 1", cable_length),
+    "vehicle_mass": Component("vehicle_mass", 1, "-", "-", "mass over the nominal one, minus 1", vehicle_mass),
+    "vehicle_thrust_coefficient": Component(
+        "thrust_coefficient", 1, "-", "-", "thrust coefficient over the nominal one, minus 1", thrust_coefficient
+    ),
+    "vehicle_rotor_time_constant": Component(
+        "rotor_time_constant", 1, "-", "-", "time constant of the rotors over the nominal one, minus 1",
+        rotor_time_constant,
+    ),
+}  # fmt: skip
+
+
 OBSERVATION_SIZE = sum(part.size for part in OBSERVATION)
 """Numbers of an observation before the own last action."""
 
@@ -298,19 +371,35 @@ class DroneNumbers(NamedTuple):
     size: int
 
 
-def drone_numbers(num_drones: int, action_size: int) -> DroneNumbers:
-    """Return where the drones' numbers stand in the global state."""
-    return DroneNumbers(_count(STATE), num_drones, _count(DRONE_STATE) + action_size)
+class StateComponents(NamedTuple):
+    """What the global state holds, in order: `team`, for each drone `drone` and its last action, `rest`."""
+
+    team: tuple[Component, ...]
+    drone: tuple[Component, ...]
+    rest: tuple[Component, ...]
+
+    def drone_numbers(self, num_drones: int, action_size: int) -> DroneNumbers:
+        """Return where the drones' numbers stand."""
+        return DroneNumbers(_count(self.team), num_drones, _count(self.drone) + action_size)
+
+    def listed(self, num_drones: int, action_size: int) -> tuple[Component, ...]:
+        """Return all components, one after the other."""
+        return (*self.team, *num_drones * (*self.drone, _previous_action(action_size)), *self.rest)
+
+    def size(self, num_drones: int, action_size: int) -> int:
+        """Return how many numbers they are."""
+        return _count(self.listed(num_drones, action_size))
 
 
-def list_state(num_drones: int, action_size: int, extra: tuple[Component, ...] = ()) -> tuple[Component, ...]:
-    """Return what the global state holds: shared components, each drone's with its last action, a task's own."""
-    return (*STATE, *num_drones * (*DRONE_STATE, _previous_action(action_size)), *extra)
+def state_components(varied: Set[str], extra: tuple[Component, ...] = ()) -> StateComponents:
+    """Return what the global state holds.
 
-
-def state_size(num_drones: int, action_size: int, extra: tuple[Component, ...] = ()) -> int:
-    """Return how many numbers the global state holds."""
-    return _count(list_state(num_drones, action_size, extra))
+    Args:
+        varied: keys of `HIDDEN` and `DRONE_HIDDEN` by which environments differ.
+        extra: what the task adds.
+    """
+    hidden, of_drone = (tuple(part for key, part in table.items() if key in varied) for table in (HIDDEN, DRONE_HIDDEN))
+    return StateComponents(STATE, (*DRONE_STATE, *of_drone), (*extra, *hidden))
 
 
 def _count(parts: Sequence[Component]) -> int:

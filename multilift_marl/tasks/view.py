@@ -11,6 +11,7 @@ import numpy as np
 from multilift_marl._jit import inlined
 from multilift_marl.control.formation import Goal, Reference, Rig
 from multilift_marl.math3d import clip, mat, matmul, matrow, norm, put, rotation_vector, row, sub, transpose, vec
+from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.state import HiddenLoads, SystemState
 from multilift_marl.tasks.failures import FailureMask, Limits
 from multilift_marl.tasks.load_sensing import Load
@@ -59,6 +60,12 @@ class View(NamedTuple):
     true_errors: Errors
     """`errors` with one row."""
     loads: HiddenLoads
+    parameters: Parameters
+    """True."""
+    gust: np.ndarray
+    """(E, 3) wind beside the mean, world frame [m/s]."""
+    action_delay: np.ndarray
+    """(E,) int64 [policy steps]."""
     goal: Goal
     planned: Goal
     """What the drones fly about: `goal` itself, unless a plan leads there."""
