@@ -19,7 +19,6 @@ CRAZYMARL = "79.7 %: motor commands, noise, pushes"
 
 
 FOLLOWING = ("formation_feedback", "searched")
-FAST_SCRIPTS = ("formation_lead", "formation_gusts", "searched")  # others are off by 10 cm and more
 
 
 class Flight(NamedTuple):
@@ -56,10 +55,10 @@ FLIGHTS: dict[str, Flight] = {
         "track", FASTEST, "track", "figure-eight, 5 m/s, 8 m/s²", f"19.7 cm: 10 Hz planner, {ESTIMATED}"
     ),
     "track_realistic_2_4": Flight(
-        "track_realistic", AGILE, "track_realistic", "figure-eight, 2 m/s, 4 m/s², realistic", scripts=FAST_SCRIPTS
+        "track_realistic", AGILE, "track_realistic", "figure-eight, 2 m/s, 4 m/s², realistic", scripts=FOLLOWING
     ),
     "track_realistic_5_8": Flight(
-        "track_realistic", FASTEST, "track_realistic", "figure-eight, 5 m/s, 8 m/s², realistic", scripts=FAST_SCRIPTS
+        "track_realistic", FASTEST, "track_realistic", "figure-eight, 5 m/s, 8 m/s², realistic", scripts=FOLLOWING
     ),
     "track_follow_2_2": Flight(
         "track_follow", FASTER, "track_follow", "figure-eight, 2 m/s, 2 m/s², no preview", scripts=FOLLOWING
@@ -76,8 +75,12 @@ FLIGHTS: dict[str, Flight] = {
     ),
     "gate_two": Flight("gate_two", {}, "gate", "two gates"),
     "recover": Flight("recover", {}, "recover", "recover"),
+    "recover_realistic": Flight("recover_realistic", {}, "recover_realistic", "recover, realistic", scripts=FOLLOWING),
     "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),
     "loss": Flight("loss", {}, "loss", "loss, 4 drones"),
+    "loss_realistic": Flight(
+        "loss_realistic", {}, "loss_realistic", "loss, realistic", scripts=("formation_redistributed",)
+    ),
     "loss_6": Flight("loss_6", {}, "loss_6", "loss, 6 drones"),
     "loss_snap": Flight("loss_snap", {}, "loss", "loss with its cable"),
 }

@@ -131,6 +131,21 @@ def test_the_snatch_of_the_lost_drone_itself_does_not_count():
     assert not vec.task.own.peak_tension.any()
 
 
+def test_the_reward_counts_what_a_snatch_adds_to_the_largest_tension():
+    vec = make("loss", num_envs=8, **{"reward.snatch": -2.0})
+    observation, _ = vec.reset(seed=0)
+    script, column = make_scripted("formation_integral", vec), vec.reward_terms.index("snatch")
+    paid, peak = np.zeros(8), np.zeros(8)
+    for _ in range(250):
+        observation, _, terminated, _, _ = vec.step(script.act(observation))
+        assert not terminated.any()
+        paid += vec.task.terms[:, column]
+        peak = np.maximum(peak, vec.task.own.peak_tension)
+    limit = vec.task.options.success_tension
+    assert peak.max() > 0.75 * limit  # it stays where it is, and the falling drone snatches
+    np.testing.assert_allclose(paid, -2.0 * np.maximum(peak - 0.75 * limit, 0.0) / limit, atol=1e-12)
+
+
 def test_one_drone_cannot_lose_itself():
     assert "raise env.num_drones" in refusal(make, "loss", num_drones=1)
     for task in ("loss", "recover"):

@@ -10,7 +10,7 @@ import pytest
 from conftest import make, refusal, same, zeros
 
 from multilift_marl._jit import compose, inlined, kernel
-from multilift_marl.config.load import load_config
+from multilift_marl.config.load import build_config, load_config
 from multilift_marl.tasks import TASKS
 from multilift_marl.tasks.hover import Hover
 from multilift_marl.tasks.observations import Component, own_velocity
@@ -59,6 +59,10 @@ def test_weight_and_margins_are_configuration():
     assert paid(both, angle=np.radians(12.0))["attitude"] == pytest.approx(0.075)
     both.world.state.payload_velocity[0], both.world.state.payload_body_rates[0] = [0, 1.0, 0], [0, 0, 2.0]
     assert paid(both)["stillness"] == pytest.approx(0.1 / 4)
+    mixed = load_config("hover", {"reward.position": 0.7, "reward.position.margin": 0.5, "reward.level": 0.3})
+    assert mixed.reward["position"].model_dump() == {"weight": 0.7, "margin": (0.5,)}
+    later = build_config(mixed.model_dump(), {"reward.position": 0.9})  # the weight alone
+    assert later.reward["position"].model_dump() == {"weight": 0.9, "margin": (0.5,)}
     stored = load_config("hover", {"reward.position.margin": [0.5], "reward.level": 0.3}).model_dump()["reward"]
     assert stored == {
         "position": {"weight": None, "margin": (0.5,)}, "level": {"weight": 0.3, "margin": None},

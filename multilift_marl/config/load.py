@@ -330,9 +330,11 @@ def _import_all(stored: Any, more: Any) -> Any:
 
 
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` with `changes`, section by section."""
+    """Return `base` with `changes`, section by section; of a reward term a bare number is the weight alone."""
     merged = dict(base)
     for key, value in changes.items():
+        if key == "reward" and isinstance(value, Mapping):
+            value = {term: own if isinstance(own, Mapping) else {"weight": own} for term, own in value.items()}
         known = merged.get(key)
         merged[key] = (
             _merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
