@@ -14,7 +14,10 @@ from typing import Any
 import matplotlib.pyplot as plt
 from flights import HERE, ROOT
 
-RECIPES = {"hover_acc_rates": "accelerations and tilt rates", "hover_ctbr": "thrust and body rates"}
+RECIPES = {
+    "hover_acc_rates": "accelerations and tilt rates", "hover_ctbr": "thrust and body rates",
+    "hover_ctbm": "thrust and moments",
+}  # fmt: skip
 SCRIPTS = {"formation_integral": "--", "formation_feedback": ":"}
 PANELS = (  # column of the curves, metric of the scripts, factor, label
     ("eval/return", "return", 1.0, "return of an episode"),
