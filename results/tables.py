@@ -65,9 +65,15 @@ def _markdown(columns: list[str], rows: list[list[str]]) -> str:
 
 
 def best_script(flight: str) -> str:
-    """Return the script with the most successes, of several the one with the least error; "" if none was evaluated."""
+    """Return the script with the least error of those that succeed most often, within noise; "" if there is none.
+
+    Within noise: the 95 % interval of the paired difference from the largest success does not leave out zero.
+    """
     scripts = {name: np.load(path) for name in TEAMS if (path := HERE / flight / f"{name}.npz").is_file()}
-    return min(scripts, default="", key=lambda name: (-scripts[name]["success"].mean(), scripts[name]["error"].mean()))
+    success = {name: script["success"].astype(float) for name, script in scripts.items()}
+    most = max(success.values(), default=None, key=np.mean)
+    good = [name for name, own in success.items() if bootstrap(own - most)[1] >= 0]
+    return min(good, default="", key=lambda name: (scripts[name]["error"].mean(), -success[name].mean()))
 
 
 def gain(flight: str) -> str:

@@ -118,6 +118,17 @@ def test_the_gain_of_learning_is_paired_with_the_best_script(tmp_path, monkeypat
     assert "gains nothing" not in tables.gain("gate") and tables.gain("gate").startswith("+50.0 (")
 
 
+def test_the_best_script_is_the_most_exact_of_those_that_succeed_as_often_within_noise(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "HERE", tmp_path)
+    assert tables.best_script("gate") == ""
+    folder = tmp_path / "gate"
+    write_episodes(folder, "formation", [True] * 1000, np.full(1000, 0.2))
+    write_episodes(folder, "formation_gusts", [True] * 998 + [False] * 2, np.full(1000, 0.1))
+    assert tables.best_script("gate") == "formation_gusts"
+    write_episodes(folder, "formation_lead", [True] * 980 + [False] * 20, np.full(1000, 0.01))
+    assert tables.best_script("gate") == "formation_gusts"
+
+
 def test_judging_can_be_stopped_and_started_again(tmp_path, monkeypatch):
     monkeypatch.setattr(reproduce, "HERE", tmp_path)
     monkeypatch.setattr(reproduce, "EPISODES", 2)
