@@ -5,7 +5,7 @@ import torch
 from torchrl.modules import PopArtValueNorm
 
 from multilift_marl.agents.networks import Actor, CentralCritic, Tanh, draw_action
-from multilift_marl.tasks.observations import DroneNumbers
+from multilift_marl.tasks.global_state import DroneNumbers
 
 KINDS = ("local", "set", "attention")
 SHARED, SIZE, REST = 5, 7, 3

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from multilift_marl.tasks.observations import DroneNumbers
+from multilift_marl.tasks.global_state import DroneNumbers
 
 if TYPE_CHECKING:  # policies need torch only
     from torchrl.modules import ValueNorm

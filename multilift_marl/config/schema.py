@@ -30,8 +30,7 @@ from multilift_marl.config.values import (
 
 RESIDUALS = (
     "formation", "formation_integral", "formation_feedback", "formation_gusts", "formation_lead", "formation_narrow",
-    "formation_redistributed", "hold_velocity", "hold_acceleration", "hold_acc_rates", "hold_ctbr",
-    "hold_ctbm",
+    "formation_redistributed", "hold_velocity", "hold_acceleration", "hold_acc_rates", "hold_ctbr", "hold_ctbm",
 )  # fmt: skip
 
 
@@ -286,9 +285,7 @@ class WindConfig(Section):
     gust: Annotated[Vector, Between(-60, 60, "m/s")] = Field(
         (0.0, 0.0, 0.0), description='[m/s] amplitude of a "1 - cosine" gust in the world frame'
     )
-    gust_start: Annotated[Float, Between(0, 1e6, "s")] = Field(
-        2.0, ge=0, description="[s] when the gust begins, from the start of the episode"
-    )
+    gust_start: Annotated[Float, Between(0, 1e6, "s")] = Field(2.0, ge=0, description="[s] when the gust begins")
     gust_rise: Annotated[Float, Between(1e-3, 1e6, "s")] = Field(
         0.5, gt=0, description="[s] in which it rises, and falls"
     )

@@ -52,12 +52,22 @@ def vector_components(unit: str, limit: str, meaning: str) -> tuple[ActionCompon
     )
 
 
+AXES = "about the axis that points outward", "about that to its left", "about body z"
+
+
 def tilt_rate_components(meaning: str) -> tuple[ActionComponent, ...]:
     """Return the body rates that tilt a drone; `meaning` says of what."""
+    names = ("outward_rate", "sideways_rate")
     return tuple(
-        ActionComponent(f"{name}_rate", "slot body", "rad/s", "max_tilt_rate", f"{meaning} {where}")
-        for name, where in (("outward", "about the axis that points outward"), ("sideways", "about that to its left"))
+        ActionComponent(name, "slot body", "rad/s", "max_tilt_rate", f"{meaning} {axis}")
+        for name, axis in zip(names, AXES[:2], strict=True)
     )
+
+
+def moment_component(name: str, axis: str) -> ActionComponent:
+    """Return the moment about one of `AXES`, as the angular acceleration that it causes."""
+    full = "max_angular_acceleration"
+    return ActionComponent(f"{name}_moment", "slot body", "rad/s²", full, f"angular acceleration {axis}")
 
 
 YAW_RATE = ActionComponent("yaw_rate", "world", "rad/s", "max_yaw_rate", "change of the heading, about the vertical")
@@ -227,33 +237,17 @@ class CtbrAction(Interface):
         return (bind(fly_rates, lo, hi, team.state, team.setpoint, team.cable_force, team.thrust, team.gains),)
 
 
-class CtbmAction(Interface):
+class CtbmAction(CtbrAction):
     """Collective thrust and body moments: as much as the rotors' own thrusts, in the slot body frame.
 
     Moments are given as the angular accelerations of the drone that they cause. Nothing else holds the attitude.
     """
 
-    numbers = (
-        CtbrAction.numbers[0],
-        *(
-            ActionComponent(
-                f"{name}_moment", "slot body", "rad/s²", "max_angular_acceleration", f"angular acceleration {where}"
-            )
-            for name, where in (
-                ("outward", "about the axis that points outward"), ("sideways", "about that to its left"),
-                ("yaw", "about body z"),
-            )
-        ),
-    )  # fmt: skip
-    by_rates = True
+    numbers = (CtbrAction.numbers[0], *map(moment_component, ("outward", "sideways", "yaw"), AXES))
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
         """See `Interface.set_action`."""
         return bind(_command_moments, lo, hi, action, team, self.settings.max_angular_acceleration)
-
-    def thrusts(self, team: Team) -> np.ndarray:
-        """See `Interface.thrusts`."""
-        return team.setpoint.thrust[..., None]
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
         """See `Interface.control_step`."""

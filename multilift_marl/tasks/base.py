@@ -19,9 +19,10 @@ from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.failures import FailureMask, find_cause, make_limits
+from multilift_marl.tasks.global_state import state_components
 from multilift_marl.tasks.load_sensing import true_load
 from multilift_marl.tasks.observation_kernels import check_written, compose_observation, compose_state
-from multilift_marl.tasks.observations import SENSED, Component, list_components, state_components
+from multilift_marl.tasks.observations import SENSED, Component, list_components
 from multilift_marl.tasks.rewards import RestBounds, Term, compose_reward, is_at_rest
 from multilift_marl.tasks.sensing import Sensing
 from multilift_marl.tasks.starts import make_hanging, true_hanging

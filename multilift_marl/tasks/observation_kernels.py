@@ -12,10 +12,10 @@ from multilift_marl._jit import compose, kernel
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import turn
+from multilift_marl.tasks.global_state import StateComponents
 from multilift_marl.tasks.observations import (
     OBSERVATION_SIZE,
     Component,
-    StateComponents,
     list_components,
 )
 
