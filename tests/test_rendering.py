@@ -153,6 +153,7 @@ def test_pettingzoo_renders():
 
 @needs_gl
 def test_a_machine_without_display_needs_no_settings_and_exits_quietly():
+    ml.make_vec(num_envs=1, num_threads=1).reset(seed=0)  # compiles the kernels, which would be told of otherwise
     code = (
         "import multilift_marl as ml\nfrom multilift_marl.rendering import Renderer\n"
         "vec = ml.make_vec(num_envs=1, num_threads=1)\nvec.reset(seed=0)\nrenderer = Renderer(vec, 64, 36)\n"
