@@ -40,9 +40,7 @@ FLIGHTS: dict[str, Flight] = {
         "hover_acc_rates", {}, "hover_acc_rates", "hover by accelerations and tilt rates, from nothing"
     ),
     "hover_ctbr": Flight("hover_ctbr", {}, "hover_ctbr", "hover by thrust and body rates, from nothing"),
-    "hover_ctbm": Flight(
-        "hover_ctbm", {}, "hover_ctbm", "hover by thrust and moments, from nothing", scripts=("formation_integral",)
-    ),
+    "hover_ctbm": Flight("hover_ctbm", {}, "hover_ctbm", "hover by thrust and moments, from nothing"),
     "hover_wind": Flight("hover_wind", {}, "hover_wind", "hover in wind of 5 m/s, noise, delay"),
     "hover_realistic": Flight("hover_realistic", {}, "hover_realistic", "hover, realistic"),
     "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
@@ -58,10 +56,10 @@ FLIGHTS: dict[str, Flight] = {
         "track", FASTEST, "track", "figure-eight, 5 m/s, 8 m/s²", f"19.7 cm: 10 Hz planner, {ESTIMATED}"
     ),
     "track_realistic_2_4": Flight(
-        "track_realistic", AGILE, "track_realistic", "figure-eight, 2 m/s, 4 m/s², realistic", scripts=FOLLOWING
+        "track_realistic", {}, "track_realistic", "figure-eight, 2 m/s, 4 m/s², realistic", scripts=FOLLOWING
     ),
     "track_realistic_5_8": Flight(
-        "track_realistic", FASTEST, "track_realistic", "figure-eight, 5 m/s, 8 m/s², realistic", scripts=FOLLOWING
+        "track_realistic_fast", {}, "track_realistic_fast", "figure-eight, 5 m/s, 8 m/s², realistic", scripts=FOLLOWING
     ),
     "track_follow_2_2": Flight(
         "track_follow", FASTER, "track_follow", "figure-eight, 2 m/s, 2 m/s², no preview", scripts=FOLLOWING
@@ -76,7 +74,12 @@ FLIGHTS: dict[str, Flight] = {
     "gate_realistic": Flight(
         "gate_realistic", {}, "gate_realistic", "gate, realistic", scripts=("formation_narrow", "searched")
     ),
-    "gate_two": Flight("gate_two", {}, "gate", "two gates"),
+    "gate_two": Flight(
+        "gate_two", {}, "gate_two", "two gates, 0.8 to 1.2 m wide", scripts=("formation_narrow", "searched")
+    ),
+    "gate_three": Flight(
+        "gate_three", {}, "gate_three", "three gates, 0.8 to 1.2 m wide", scripts=("formation_narrow", "searched")
+    ),
     "recover": Flight("recover", {}, "recover", "recover"),
     "recover_realistic": Flight("recover_realistic", {}, "recover_realistic", "recover, realistic", scripts=FOLLOWING),
     "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),

@@ -55,6 +55,7 @@ SLOTS: Free = (
     ("target_acceleration", LEVEL, 0.05),
     ("target_ahead_200ms", LEVEL, 0.5),
     ("target_ahead_400ms", LEVEL, 0.25),
+    ("gap", LEVEL, 0.2),
     ("heading", ((0, 0),), 0.1),
 )
 """Observation; axes in the slot frame, of it and of the slot's offset, that share a gain; scale of the search. Of these

@@ -31,14 +31,14 @@ def run(vec, seconds: float):
     return np.array(path), causes
 
 
-@pytest.mark.parametrize("gates", [1, 2])
-def test_the_target_flies_straight_through_every_gap(gates):
+@pytest.mark.parametrize(("gates", "reach"), [(1, 2.0), (2, 2.0), (3, 2.75)])
+def test_the_target_flies_straight_through_every_gap(gates, reach):
     vec = reset(gates=gates, gap_width=4.0, gap_height=10.0)
     middles = vec.task.own.gap_y.copy()
     path, causes = run(vec, 12.0)
     assert not causes
-    np.testing.assert_allclose(path[0], np.tile([-2, 0, 1.3], (4, 1)), atol=1e-9)
-    np.testing.assert_allclose(path[-1], np.tile([2, 0, 1.3], (4, 1)), atol=1e-9)
+    np.testing.assert_allclose(path[0], np.tile([-reach, 0, 1.3], (4, 1)), atol=1e-9)
+    np.testing.assert_allclose(path[-1], np.tile([reach, 0, 1.3], (4, 1)), atol=1e-9)
     for e in range(4):
         for x, y in zip(vec.task.settings.x, middles[e], strict=True):
             inside = np.abs(path[:, e, 0] - x) < 0.2
@@ -127,22 +127,41 @@ def test_a_cable_touches_too():
     assert _cable_room(0, 0, (0.3, 2.0, 1.3), (0.5, 2.0, 2.0), view) == 1
 
 
-def test_drones_are_told_the_gap_and_their_room():
-    vec = reset(num_envs=4)
-    observation, _ = vec.current()
+def test_each_gap_is_as_wide_as_was_drawn_for_it_and_the_walls_are_so():
+    vec = reset(num_envs=200, gates=3, gap_width=[0.8, 1.2])
+    widths = 2 * vec.task.own.half_width
+    assert widths.shape == (200, 3) and (0.8 <= widths).all() and (widths <= 1.2).all()
+    assert np.abs(np.quantile(widths, [0.25, 0.5, 0.75]) - [0.9, 1.0, 1.1]).max() < 0.02
+    assert np.abs(np.corrcoef(widths.T) - np.eye(3)).max() < 0.2
+    left, right = vec.task.scenery(7)[3:5]  # of the second wall
+    np.testing.assert_allclose(right.position[1] - left.position[1] - 2 * left.size[1], widths[7, 1], rtol=1e-9)
+
+
+def test_a_width_that_is_given_draws_nothing():
+    given, drawn = reset(gates=2), reset(gates=2, gap_width=[0.8, 1.2])
+    np.testing.assert_array_equal(given.task.own.gap_y, drawn.task.own.gap_y)
+    assert (given.task.own.half_width == 0.5).all()
+
+
+def test_a_drone_is_told_its_own_next_gap_and_its_room():
+    vec = reset(num_envs=1, gates=2, gap_width=[0.8, 1.2])
     names, state, task = vec.observation_names, vec.world.state, vec.task
-    at = names.index("gap_0")
-    for e in range(4):
-        for n in range(4):
-            c, s = task.goal.slot_frame[e, n]
-            away = state.drone_position[e, n] - [0.0, task.own.gap_y[e, 0], 1.3]
-            expected = [c * away[0] + s * away[1], c * away[1] - s * away[0]]
-            np.testing.assert_allclose(observation[e, n, at : at + 2], expected, atol=1e-5)
-    half = task.settings.drone[0]
-    reach = np.abs(state.drone_rotation.reshape(4, 4, 3, 3)[:, :, 1]) @ half
-    room = 0.5 - np.abs(state.drone_position[..., 1] - task.own.gap_y) - reach
-    np.testing.assert_allclose(observation[..., names.index("clearance_0")], room.clip(-0.5, 0.5), atol=1e-5)
-    assert (room.min(axis=1) < -0.1).all()
+    task.own.gap_y[0] = [0.2, -0.1]
+    edge = 0.05 + np.hypot(*task.settings.drone[0, :2]) + 0.05  # from where on nothing of a drone is in a wall
+    x = np.array([-1.0, -0.75 + 0.9 * edge, -0.75 + 1.1 * edge, 0.75 + 1.1 * edge])
+    state.drone_position[0] = [[at, 0.05, 2.0] for at in x]
+    state.drone_rotation[0] = np.eye(3)
+    task.stages["observe"](0, 1)
+    observation = task.observation[0]
+    half = task.own.half_width[0]
+    told = {name: observation[:, names.index(name)] for name in ("gap_0", "gap_1", "clearance_0", "gap_distance_0")}
+    c, s = task.goal.slot_frame[0].T
+    across = np.array([-0.15, -0.15, 0.15, 0.0])  # y of the drones from the middles: of the first gap, second, none
+    np.testing.assert_allclose(told["gap_0"], s * across, atol=1e-6)
+    np.testing.assert_allclose(told["gap_1"], c * across, atol=1e-6)
+    room = np.array([half[0], half[0], half[1]]) - 0.15 - task.settings.drone[0, 1]
+    np.testing.assert_allclose(told["clearance_0"], [*room, 0.5], atol=1e-6)
+    np.testing.assert_allclose(told["gap_distance_0"], x - [-0.75, -0.75, 0.75, 0.75], atol=1e-6)
 
 
 def test_a_formation_drawn_in_passes_level():

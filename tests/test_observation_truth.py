@@ -151,15 +151,17 @@ def eased(m: Moment, begin: float, end: float) -> float:
 
 def gate(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
     """See docs/gate.md: one wall at x = 0, its gap 1 m wide; the drone's box must pass between the edges."""
-    task, state = m.vec.task, m.state
-    middle = np.stack([np.zeros(len(task.own.gap_y)), task.own.gap_y[:, 0], np.zeros(len(task.own.gap_y))], axis=1)
-    away = (state["drone_position"] - middle[:, None]) * [1, 1, 0]
-    half = np.abs(state["drone_rotation"][..., 1, :]) @ task.limits.drone_half[0]  # how far the box reaches along y
-    room = 0.5 - np.abs(away[..., 1]) - half
+    task, position = m.vec.task, m.state["drone_position"]
+    x, middle, half = position[..., 0], task.own.gap_y, task.limits.drone_half[0]
+    before = x < 0.05 + np.hypot(half[0], half[1]) + 0.05
+    room = 0.5 - np.abs(position[..., 1] - middle) - np.abs(m.state["drone_rotation"][..., 1, :]) @ half
+    lateral = np.zeros_like(position)
+    lateral[..., 1] = np.where(before, position[..., 1] - middle, 0)
     return {
         "target_velocity": m.in_slot_frame(m.goal["velocity"])[..., :2],
-        "gap": m.in_slot_frame(away)[..., :2],
-        "clearance": np.clip(room, -0.5, 0.5)[..., None],
+        "gap": m.in_slot_frame(lateral)[..., :2],
+        "gap_distance": x[..., None],
+        "clearance": np.where(before, np.clip(room, -0.5, 0.5), 0.5)[..., None],
     }
 
 

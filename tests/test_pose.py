@@ -52,6 +52,23 @@ def test_the_attitude_has_the_heading_and_tilt_that_were_drawn():
     assert turned[2, 1] == pytest.approx(np.sin(0.3)) and -turned[2, 0] == pytest.approx(np.cos(0.3) * np.sin(-0.4))
 
 
+def test_without_a_plan_the_same_targets_leap_and_drones_fly_to_their_slots():
+    near = {f"task_options.target_{key}": value for key, value in (("xy", 0.2), ("yaw", 20.0), ("tilt", 5.0))}
+    planned, leaping = (
+        make("pose", num_envs=8, **CALM, **near, **{"task_options.plan": plan}) for plan in (True, False)
+    )
+    names = set(planned.observation_names) - set(leaping.observation_names)
+    assert {name.rsplit("_", 1)[0] for name in names} == {"planned_position", "planned_velocity", "planned_rotation"}
+    references = []
+    for (step, _), _ in zip(flown(leaping, 150), flown(planned, 150), strict=True):
+        for field in ("position", "rotation", "slots"):
+            assert same(getattr(leaping.task.goal, field), getattr(planned.task.goal, field))
+        references.append(np.linalg.norm(leaping.world.state.drone_position - leaping.task.goal.slots, axis=2))
+        if step == 0:  # nothing but the filter of the references is between a drone and its slot
+            assert same(leaping.task.planned.position, leaping.task.goal.position)
+    assert references[0].mean() > 0.4 and references[-1].mean() < 0.1
+
+
 def test_a_new_target_comes_every_four_seconds_and_is_not_seen_before():
     vec = make("pose", num_envs=2)
     told = vec.observation_names.index("payload_error_0")

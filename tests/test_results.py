@@ -123,8 +123,9 @@ def test_the_best_script_is_the_most_exact_of_those_that_succeed_as_often_within
     assert tables.best_script("gate") == ""
     folder = tmp_path / "gate"
     write_episodes(folder, "formation", [True] * 1000, np.full(1000, 0.2))
-    write_episodes(folder, "formation_gusts", [True] * 998 + [False] * 2, np.full(1000, 0.1))
-    assert tables.best_script("gate") == "formation_gusts"
+    for failures, best in ((6, "formation"), (5, "formation_gusts")):  # p = 2 / 2**6 and 2 / 2**5
+        write_episodes(folder, "formation_gusts", [True] * (1000 - failures) + [False] * failures, np.full(1000, 0.1))
+        assert tables.best_script("gate") == best
     write_episodes(folder, "formation_lead", [True] * 980 + [False] * 20, np.full(1000, 0.01))
     assert tables.best_script("gate") == "formation_gusts"
 

@@ -21,9 +21,10 @@ def test_they_hold_the_payload_at_its_target(action):
     vec, script = make_holding(action)
     seen, _ = vec.reset(seed=1)
     for _ in range(vec.max_steps):
-        seen, _, terminated, _, info = vec.step(script.act(seen))
-        assert not terminated.any()
-    assert info["success"].all()
+        before, seen = seen, vec.step(script.act(seen))[0]
+        assert not vec.task.cause.any()
+    assert vec.task.succeeded().all()
+    assert np.abs(script.act(before) - script.act(seen)).max() < 0.02  # at rest, and in no limit cycle
     assert vec.task.errors.distance.mean() < 0.01
 
 
@@ -49,6 +50,11 @@ def test_a_drone_off_its_slot_begins_to_move_by_the_law(action):
     if action == "velocity":
         expected = -STIFFNESS / DAMPING * 0.05
         assert action_taken[0] * vec.config.control.max_velocity == pytest.approx(expected, rel=1e-5)
+
+
+def test_where_the_script_alone_holds_the_attitude_a_slow_policy_is_refused():
+    slow = make(num_envs=1, **{"control.action": "ctbm", "env.policy_hz": 25.0})
+    assert "env.policy_hz=25 is too slow for that; raise it to 45" in refusal(make_scripted, "hold_ctbm", slow)
 
 
 @pytest.mark.parametrize("action", HOLDING)

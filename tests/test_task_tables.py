@@ -48,6 +48,13 @@ def test_a_term_is_its_weight_without_error_and_half_of_it_at_its_margin(resting
         assert paid(resting, **{error: size})[term] == pytest.approx(share * weight)
 
 
+def test_of_training_alone_too_a_bare_weight_leaves_the_margin():
+    given = {"reward.attitude": {"weight": 1.0, "margin": 40.0}}
+    config = load_config("hover", {"train.overrides": given})
+    changed = build_config(config.model_dump(), {"train.overrides": {"reward.attitude": 2.0}})
+    assert changed.train.overrides["reward.attitude"] == {"weight": 2.0, "margin": 40.0}
+
+
 def test_weight_and_margins_are_configuration():
     bare = make("hover", num_envs=1, **{"reward.position": 0.7})
     long = make("hover", num_envs=1, **{"reward.position.weight": 0.7, "reward.position.margin": 0.5})

@@ -65,8 +65,9 @@ def _train(values: dict[str, Any]) -> int:
         print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
     else:
         config = load_config(options.config, overrides)
-        for key in config.train.overrides.keys() & overrides.keys():
-            value = config.train.overrides[key]
+        for key, value in config.train.overrides.items():
+            if not any(given == key or given.startswith(f"{key}.") for given in overrides):
+                continue
             print(f'note: training has {key}={value}, by train.overrides; "train.overrides={{{key}: ...}}" sets it')
         _ = config.system  # refuse an impossible system before the long wait
         trainer = new_run(config, title(values))

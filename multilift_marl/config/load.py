@@ -329,13 +329,19 @@ def _import_all(stored: Any, more: Any) -> Any:
     return wrong[0] if wrong else import_modules([*asked[1], *asked[0]])
 
 
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, Mapping) and value is not None
+
+
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return `base` with `changes`, section by section; of a reward term a bare number is the weight alone."""
     merged = dict(base)
     for key, value in changes.items():
         if key == "reward" and isinstance(value, Mapping):
-            value = {term: own if isinstance(own, Mapping) else {"weight": own} for term, own in value.items()}
+            value = {term: {"weight": own} if _is_number(own) else own for term, own in value.items()}
         known = merged.get(key)
+        if key.startswith("reward.") and isinstance(known, Mapping) and _is_number(value):  # in train.overrides
+            value = {"weight": value}
         merged[key] = (
             _merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
         )

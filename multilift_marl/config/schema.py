@@ -59,7 +59,7 @@ class EnvConfig(Section):
         "ideal", description="what drones know of themselves and of the payload (docs/sensing.md)"
     )
     communication: Literal["none", "neighbours", "all"] = Field(
-        "none", description="with sensing=onboard: which drones a drone receives the end of their cables from"
+        "none", description="with sensing=onboard: from which drones a drone receives where their cables end"
     )
     communication_delay: Int = Field(1, ge=0, le=100, description="[policy steps] until a message is heard")
     communication_loss: Float = Field(0.0, ge=0, le=1, description="[-] share of the messages that are lost")
@@ -285,7 +285,9 @@ class WindConfig(Section):
     gust: Annotated[Vector, Between(-60, 60, "m/s")] = Field(
         (0.0, 0.0, 0.0), description='[m/s] amplitude of a "1 - cosine" gust in the world frame'
     )
-    gust_start: Annotated[Float, Between(0, 1e6, "s")] = Field(2.0, ge=0, description="[s] when the gust begins")
+    gust_start: Annotated[Float, Between(0, 1e6, "s")] = Field(
+        2.0, ge=0, description="[s] from an episode's start until the gust"
+    )
     gust_rise: Annotated[Float, Between(1e-3, 1e6, "s")] = Field(
         0.5, gt=0, description="[s] in which it rises, and falls"
     )

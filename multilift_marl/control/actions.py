@@ -240,7 +240,8 @@ class CtbrAction(Interface):
 class CtbmAction(CtbrAction):
     """Collective thrust and body moments: as much as the rotors' own thrusts, in the slot body frame.
 
-    Moments are given as the angular accelerations of the drone that they cause. Nothing else holds the attitude.
+    Moments are given as the angular accelerations that they cause in a drone which does not turn, as far as its rotors
+    can exert them: about yaw they saturate far earlier than about the others. Nothing else holds the attitude.
     """
 
     numbers = (CtbrAction.numbers[0], *map(moment_component, ("outward", "sideways", "yaw"), AXES))

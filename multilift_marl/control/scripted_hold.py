@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from multilift_marl.control.scripted_formation import PLANNED, Formation
+from multilift_marl.errors import ConfigError
 from multilift_marl.rig.vehicles import GRAVITY
 
 if TYPE_CHECKING:
@@ -148,13 +149,21 @@ class HoldCtbm(HoldCtbr):
 
     INTERFACE = "ctbm"
     TILT_GAIN = 9.0
-    RATE_GAIN: ClassVar[float] = 45.0  # [1/s] of a body rate from the desired one, at 50 Hz
+    RATE_GAIN: ClassVar[float] = 45.0  # [1/s] of a body rate from the desired one
+    YAW_RATE_GAIN: ClassVar[float] = 15.0  # [1/s] rotors that change speed turn the drone at once: more oscillates
 
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
         control, matrix = self._vec.config.control, super().matrix()
-        for axis, full in enumerate((control.max_tilt_rate, control.max_tilt_rate, control.max_yaw_rate)):
-            matrix[1 + axis] *= full
+        frequency = self._vec.config.env.policy_hz
+        if self.RATE_GAIN > frequency:  # a step would turn the rate back by more than all of it
+            raise ConfigError(
+                f"the script hold_ctbm holds the attitude by itself, and env.policy_hz={frequency:g} is too slow for "
+                f"that; raise it to {self.RATE_GAIN:g} or more"
+            )
+        full = (control.max_tilt_rate, control.max_tilt_rate, control.max_yaw_rate)
+        for axis, gain in enumerate((self.RATE_GAIN, self.RATE_GAIN, self.YAW_RATE_GAIN)):
+            matrix[1 + axis] *= full[axis]
             matrix[1 + axis, self._column("turned_rates", axis)] -= 1.0
-            matrix[1 + axis] *= self.RATE_GAIN / control.max_angular_acceleration
+            matrix[1 + axis] *= gain / control.max_angular_acceleration
         return matrix

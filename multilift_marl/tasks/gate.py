@@ -1,4 +1,4 @@
-"""Gate: the team carries its payload through a gap that is narrower than its formation."""
+"""Gate: the team carries its payload through gaps that are narrower than its formation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import inlined, kernel
-from multilift_marl.config.values import Float, Int, Section
+from multilift_marl.config.values import Float, Int, Section, Span
 from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import add, ease, mat, matrow, mul, put, putmat, rot_z, row, sub, triple, vec
 from multilift_marl.sim.contact import drone_half_size
@@ -30,10 +30,10 @@ from multilift_marl.tasks.rewards import (
     velocity,
 )
 from multilift_marl.tasks.starts import hang_team, in_ball
-from multilift_marl.tasks.view import load_row
 
 THICKNESS = 0.1  # [m] of the walls
-PASSED = 0.8  # [m] that a payload is past a wall when its last drone is, too
+SPACING = 1.5  # [m] between walls
+MARGIN = 1.25  # [m] from the start to the first wall and from the last one to the goal, and no less than 2 m in all
 SPARE = 0.05  # [m] of clearance that the reward asks for
 _WALL = (0.62, 0.52, 0.45, 1.0)  # colour
 
@@ -41,14 +41,14 @@ _WALL = (0.62, 0.52, 0.45, 1.0)  # colour
 class GateOptions(Section):
     """The gates, the way through them, and what counts as success."""
 
-    gates: Int = Field(1, ge=1, le=2, description="walls with a gap: one at x = 0, or two at x = -0.75 and 0.75 m")
-    gap_width: Float = Field(1.0, gt=0, description="[m]")
+    gates: Int = Field(1, ge=1, le=5, description="walls with a gap, 1.5 m apart, their middle at x = 0")
+    gap_width: Span = Field((1.0, 1.0), description="[m] or its range, from which each gap's is drawn")
     gap_height: Float = Field(3.0, gt=0, description="[m] from the ground")
     gap_offset: Float = Field(0.3, ge=0, description="[m] gap's middle within ± this of the line from start to goal")
     height: Float = Field(1.3, gt=0, description="[m] of start and goal")
-    start_radius: Float = Field(0.2, ge=0, description="[m] start within a ball of this radius about x = -2 m")
+    start_radius: Float = Field(0.2, ge=0, description="[m] start within a ball of this radius of the target's")
     set_off: Float = Field(1.0, ge=0, description="[s] when the target sets off ...")
-    arrival: Float = Field(11.0, gt=0, description="[s] ... and when it arrives at x = 2 m")
+    arrival: Float = Field(11.0, gt=0, description="[s] ... and when it arrives at the goal")
     success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of the goal ...")
     success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, heading included ...")
     success_speed: Float = Field(0.1, gt=0, description="[m/s] ... no faster than this ...")
@@ -64,6 +64,8 @@ class GateArrays(NamedTuple):
 
     gap_y: np.ndarray
     """(E, G) of the gaps' middles [m]."""
+    half_width: np.ndarray
+    """(E, G) of the gaps [m]."""
     peak_tension: np.ndarray
     """(E,) largest tension in the episode over that at rest [-]."""
 
@@ -73,10 +75,10 @@ class GateSettings(NamedTuple):
 
     x: np.ndarray
     """(G,) of the walls [m]."""
-    half_width: float
-    """Of the gaps [m]."""
     gap_height: float
     """[m]."""
+    reach: float
+    """The target moves from x = -reach to x = reach [m]."""
     begin: float
     """When the target sets off [s]."""
     duration: float
@@ -86,9 +88,13 @@ class GateSettings(NamedTuple):
     level: float
     """Its height [m]."""
     radius: float
-    """Of the ball about x = -2 m in which the team starts [m]."""
+    """Of the ball in which the team starts [m]."""
     drone: np.ndarray
     """(N, 3) half edges of the drones [m]."""
+    clear: np.ndarray
+    """(N,) how far past a wall's middle nothing of a drone is in the wall [m]."""
+    passed: float
+    """The same of a payload and its formation [m]."""
     payload: np.ndarray
     """(3,) half edges of the payload [m]."""
     center: tuple[float, float, float]
@@ -98,14 +104,14 @@ class GateSettings(NamedTuple):
 
 @inlined
 def target_position(e, t, v):
-    """Return where the target of environment e is at a time: straight through every gap, from x = -2 to 2 m."""
+    """Return where the target of environment e is at a time: straight through every gap."""
     gates, gap_y = v.settings, v.own.gap_y
-    x = -2.0 + 4.0 * ease(t, gates.begin, gates.duration)[0]
-    y, before, last = 0.0, -2.0, 0.0
+    x = gates.reach * (2.0 * ease(t, gates.begin, gates.duration)[0] - 1.0)
+    y, before, last = 0.0, -gates.reach, 0.0
     for g in range(gates.x.shape[0]):
         y += (gap_y[e, g] - last) * ease(x, before, gates.x[g] - 0.25 - before)[0]
         before, last = gates.x[g] + 0.25, gap_y[e, g]
-    y -= last * ease(x, before, 2.0 - before)[0]
+    y -= last * ease(x, before, gates.reach - before)[0]
     return (x, y, gates.level)
 
 
@@ -144,25 +150,18 @@ def advance_target(e, v):
 
 
 @inlined
-def _gate_before(x, v):
-    """Return the first gate that a payload at x [m] has before it, the last one after all."""
-    gates = v.settings
-    for g in range(gates.x.shape[0]):
-        if x < gates.x[g] + PASSED:
+def _next_gap(e, x, clear, v):
+    """Return the first gap of environment e that what is at x has before it: G if it is `clear` [m] past all walls."""
+    for g in range(v.settings.x.shape[0]):
+        if x < v.settings.x[g] + clear:
             return g
-    return gates.x.shape[0] - 1
+    return v.settings.x.shape[0]
 
 
 @inlined
-def next_gate(e, v):
-    """Return the gate that the payload has before it, the last one after all."""
-    return _gate_before(v.state.payload_position[e, 0], v)
-
-
-@inlined
-def known_gate(e, n, v):
-    """Return the same as drone n knows the payload."""
-    return _gate_before(v.load.position[e, load_row(n, v), 0], v)
+def own_gap(e, n, state, v):
+    """Return the gap that a drone has before it, each its own: the first ones are in the next gap before the last."""
+    return _next_gap(e, state.drone_position[e, n, 0], v.settings.clear[n], v)
 
 
 @inlined
@@ -177,7 +176,7 @@ def _room(e, g, center, frame, half, v):
     gates = v.settings
     if abs(center[0] - gates.x[g]) > 0.5 * THICKNESS + _reach(frame, half, 0):
         return 1.0
-    side = gates.half_width - abs(center[1] - v.own.gap_y[e, g]) - _reach(frame, half, 1)
+    side = v.own.half_width[e, g] - abs(center[1] - v.own.gap_y[e, g]) - _reach(frame, half, 1)
     return min(side, gates.gap_height - center[2] - _reach(frame, half, 2))
 
 
@@ -192,7 +191,7 @@ def _cable_room(e, g, low, high, v):
     for side in (begin, end):
         share = 0.0 if abs(span) < 1e-9 else min(max((side - low[0]) / span, 0.0), 1.0)
         y, z = low[1] + share * (high[1] - low[1]), low[2] + share * (high[2] - low[2])
-        room = min(room, gates.half_width - abs(y - v.own.gap_y[e, g]), gates.gap_height - z)
+        room = min(room, v.own.half_width[e, g] - abs(y - v.own.gap_y[e, g]), gates.gap_height - z)
     return room
 
 
@@ -216,17 +215,17 @@ def least_room(e, v):
 def _clearance(e, n, g, state, v):
     """Return the room [m] that a drone would have in gap g if it flew straight on; below 0 it would hit the wall."""
     across = abs(state.drone_position[e, n, 1] - v.own.gap_y[e, g])
-    return v.settings.half_width - across - _reach(mat(state.drone_rotation, e, n), v.settings.drone[n], 1)
+    return v.own.half_width[e, g] - across - _reach(mat(state.drone_rotation, e, n), v.settings.drone[n], 1)
 
 
 @inlined
 def passage(e, v, margin):
-    """Drones with room to pass the next gap; 1 once all are through."""
-    g = next_gate(e, v)
-    before = v.state.payload_position[e, 0] < v.settings.x[g] + PASSED
+    """Drones with room to pass their next gap, or through all."""
     passing, count = 0.0, v.action.shape[1]
     for n in range(count):
-        lacking = max(SPARE - _clearance(e, n, g, v.state, v), 0.0) if before else 0.0
+        g, lacking = own_gap(e, n, v.state, v), 0.0
+        if g < v.settings.x.shape[0]:
+            lacking = max(SPARE - _clearance(e, n, g, v.state, v), 0.0)
         passing += tolerance(lacking, margin) / count
     return passing
 
@@ -235,6 +234,12 @@ def passage(e, v, margin):
 def has_arrived(e, v):
     """Payload at rest at the goal, after the target's arrival."""
     return v.time[e] >= v.settings.arrival and is_at_rest(e, v, v.settings.bounds)
+
+
+@inlined
+def failure(e, v):
+    """1 in the step in which the team fails, or touches a wall."""
+    return 1.0 if v.cause[e] != 0 or least_room(e, v) < 0.0 else 0.0
 
 
 @inlined
@@ -251,27 +256,47 @@ def target_velocity(e, n, v):
 
 
 @inlined
-def gap_middle(e, g, v):
-    """Middle of gap g."""
-    return (v.settings.x[g], v.own.gap_y[e, g], v.settings.level)
+def gap_offset(e, n, v):
+    """Own position from the middle of the own next gap, along the wall; 0 past the last."""
+    g = own_gap(e, n, v.seen, v)
+    if g == v.settings.x.shape[0]:
+        return (0.0, 0.0, 0.0)
+    return (0.0, v.seen.drone_position[e, n, 1] - v.own.gap_y[e, g], 0.0)
 
 
 @inlined
-def gap_offset(e, n, v):
-    """Own position minus the middle of the next gap."""
-    return sub(vec(v.seen.drone_position, e, n), gap_middle(e, known_gate(e, n, v), v))
+def gap_distance(e, n, v):
+    """Own distance past the wall of the own next gap, or past the last."""
+    g = min(own_gap(e, n, v.seen, v), v.settings.x.shape[0] - 1)
+    return v.seen.drone_position[e, n, 0] - v.settings.x[g]
 
 
 @inlined
 def clearance(e, n, v):
-    """Own room to the next wall's edges, within ± 0.5 m."""
-    return min(max(_clearance(e, n, known_gate(e, n, v), v.seen, v), -0.5), 0.5)
+    """Own room to the edges of the own next gap, within ± 0.5 m; past the last 0.5."""
+    g = own_gap(e, n, v.seen, v)
+    if g == v.settings.x.shape[0]:
+        return 0.5
+    return min(max(_clearance(e, n, g, v.seen, v), -0.5), 0.5)
+
+
+@inlined
+def payload_gap(e, v):
+    """Return the gap that the payload has before it, the last one after all."""
+    return min(_next_gap(e, v.state.payload_position[e, 0], v.settings.passed, v), v.settings.x.shape[0] - 1)
 
 
 @inlined
 def payload_gap_offset(e, n, v):
-    """Payload's position minus the middle of the next gap."""
-    return sub(row(v.state.payload_position, e), gap_middle(e, next_gate(e, v), v))
+    """Payload's position minus the middle of its next gap."""
+    g = payload_gap(e, v)
+    return sub(row(v.state.payload_position, e), (v.settings.x[g], v.own.gap_y[e, g], v.settings.level))
+
+
+@inlined
+def payload_gap_width(e, n, v):
+    """Width of the payload's next gap."""
+    return 2.0 * v.own.half_width[e, payload_gap(e, v)]
 
 
 class Gate(Task):
@@ -289,34 +314,43 @@ class Gate(Task):
         "velocity": Term(0.2, velocity, 0.2, "m/s"),
         "attitude": Term(0.2, attitude, 6.0, "deg"),
         "stillness": Term(0.1, body_rate, 0.3, "rad/s"),
+        "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
     KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, update=find_touch)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("target_velocity", 2, "slot", "m/s", "horizontal velocity of the target", target_velocity, True),
-        Component("gap", 2, "slot", "m", "own position minus the middle of the next gap, from above", gap_offset, True),
-        Component("clearance", 1, "-", "m", "own room to the next wall's edges, within ± 0.5", clearance),
+        Component(
+            "gap", 2, "slot", "m", "own position from the middle of the own next gap, along the wall", gap_offset, True
+        ),
+        Component("gap_distance", 1, "-", "m", "own distance past the wall of that gap", gap_distance),
+        Component("clearance", 1, "-", "m", "own room to the edges of that gap, within ± 0.5", clearance),
     )
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = (
         Component("target_velocity", 3, "world", "m/s", "velocity of the target", target_velocity),
-        Component("gap", 3, "world", "m", "payload position minus the middle of the next gap", payload_gap_offset),
+        Component("gap", 3, "world", "m", "payload position minus the middle of its next gap", payload_gap_offset),
+        Component("gap_width", 1, "-", "m", "width of that gap", payload_gap_width),
     )
 
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, system, e = self.options, self.world.system, self.world.num_envs
-        x = np.array([0.0] if option.gates == 1 else [-0.75, 0.75])
-        self.own = GateArrays(np.zeros((e, len(x))), np.zeros(e))
+        x = SPACING * (np.arange(option.gates) - (option.gates - 1) / 2)
+        drone = np.array([drone_half_size(vehicle) for vehicle in system.vehicles])
+        clear = THICKNESS / 2 + np.linalg.norm(drone[:, :2], axis=1) + SPARE
+        self.own = GateArrays(np.zeros((e, len(x))), np.zeros((e, len(x))), np.zeros(e))
         self.settings = GateSettings(
             x=x,
-            half_width=option.gap_width / 2,
             gap_height=option.gap_height,
+            reach=max(x[-1] + MARGIN, 2.0),
             begin=option.set_off,
             duration=option.arrival - option.set_off,
             arrival=option.arrival,
             level=option.height,
             radius=option.start_radius,
-            drone=np.array([drone_half_size(vehicle) for vehicle in system.vehicles]),
+            drone=drone,
+            clear=clear,
+            passed=float((np.abs(self.rig.slots[:, 1]) + clear).max()),
             payload=system.payload_size / 2,
             center=triple(system.payload_center),
             bounds=RestBounds.of(option),
@@ -327,6 +361,8 @@ class Gate(Task):
         option = self.options
         self.own.peak_tension[env] = 0.0
         self.own.gap_y[env] = rng.uniform(-option.gap_offset, option.gap_offset, option.gates)
+        low, high = option.gap_width
+        self.own.half_width[env] = 0.5 * (low if low == high else rng.uniform(low, high, option.gates))
         start_before_gate(env, rng, self.view_for(start_before_gate), self.hanging)
 
     def succeeded(self) -> np.ndarray:
@@ -341,9 +377,9 @@ class Gate(Task):
 
     def scenery(self, env: int) -> list[Box]:
         """Return the walls; see `Task.scenery`."""
-        half, gap, top = 2.5, self.settings.half_width, self.settings.gap_height
+        half, top = 2.5, self.settings.gap_height
         boxes = []
-        for x, y in zip(self.settings.x, self.own.gap_y[env], strict=True):
+        for x, y, gap in zip(self.settings.x, self.own.gap_y[env], self.own.half_width[env], strict=True):
             for side in (-1, 1):
                 boxes.append(Box((THICKNESS / 2, half / 2, top / 2), (x, y + side * (gap + half / 2), top / 2), _WALL))
             boxes.append(Box((THICKNESS / 2, half + gap, 0.25), (x, y, top + 0.25), _WALL))

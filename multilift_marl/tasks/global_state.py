@@ -1,7 +1,8 @@
 """The global state, for a critic: tables of components, what no drone observes among them.
 
-Its values are true, whatever drones know. Vectors are given in the target's heading frame. What a configuration varies
-from episode to episode stands in it where it does, so that a critic can tell chance from what actions do.
+Its values are true, whatever drones know. Vectors are given in the target's heading frame. Hidden parameters that the
+configuration randomises are added (`HIDDEN`, `DRONE_HIDDEN`); drag, stiffness, and bias and delay of observations are
+not, nor are actions that have yet to take effect.
 """
 
 from __future__ import annotations

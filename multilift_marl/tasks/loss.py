@@ -139,7 +139,7 @@ def notice_loss(e, v):
 
 @inlined
 def snatch(e, v):
-    """By how much the largest tension of the episode rose in this step, over the limit; harmless ones do not count."""
+    """Rise of the episode's largest tension in this step above 75 % of the limit, over that limit."""
     counted = max(v.own.counted_tension[e], HARMLESS * v.settings.tension)
     return max(v.own.peak_tension[e] - counted, 0.0) / v.settings.tension
 

@@ -9,6 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl._jit import inlined, kernel
+from multilift_marl.config.config import Config
+from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.cable_forces import WrenchDistribution, make_wrench_distribution
 from multilift_marl.control.formation import Goal
@@ -31,6 +33,7 @@ class PoseOptions(Section):
     target_yaw: Float = Field(180.0, ge=0, le=180, description="[deg] target heading within ± this")
     target_seconds: Float = Field(4.0, gt=0, description="[s] until the next target")
     way_seconds: Float = Field(3.0, gt=0, description="[s] that the planned trajectory to a target takes")
+    plan: bool = Field(True, description="a trajectory to each target is planned and followed; False: the goal leaps")
     success_distance: Float = Field(0.05, gt=0, description="[m] payload within this of each target ...")
     success_angle: Float = Field(5.0, gt=0, description="[deg] ... and within this of its attitude ...")
     success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout its last seconds, or a shorter one's all")
@@ -133,6 +136,14 @@ class Pose(Task):
     EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")
 
+    @classmethod
+    def extra(cls, config: Config) -> tuple[Component, ...]:
+        """See `Task.extra`; without a plan there is none to observe."""
+        parts = super().extra(config)
+        if validate(PoseOptions, config.task_options, "task_options").plan:
+            return parts
+        return tuple(part for part in parts if not part.name.startswith("planned"))
+
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, system, e, n = self.options, self.world.system, self.world.num_envs, self.world.num_drones
@@ -147,7 +158,8 @@ class Pose(Task):
         hold = min(option.target_seconds, length)
         targets = ceil(length / hold - 1e-9)
         self.own = PoseArrays(Plan.zeros(e, targets, n), np.zeros((e, targets), bool))
-        self.planned = Goal.zeros(e, n)._replace(slot_frame=self.goal.slot_frame)  # actions point as observations do
+        if option.plan:  # actions point as observations do
+            self.planned = Goal.zeros(e, n)._replace(slot_frame=self.goal.slot_frame)
         heaviest = 1 + self.config.randomization.payload_mass
         self.settings = PoseSettings(
             holdable=make_bounds(system, self.config.control, self.limits, heaviest),
@@ -169,7 +181,8 @@ class Pose(Task):
                 "this team can hold hardly any of the poses of task pose; lower task_options.target_tilt, raise "
                 "target_height or change the rig"
             )
-        select_candidate(env, self.view_for(select_candidate))
+        if self.options.plan:
+            select_candidate(env, self.view_for(select_candidate))
         start_at_first_pose(env, self.view_for(start_at_first_pose), self.hanging)
         self.own.reached[env] = False
 

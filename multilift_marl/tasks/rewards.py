@@ -93,6 +93,12 @@ def attitude(e, v, margin):
 
 
 @inlined
+def failure(e, v):
+    """1 in the step in which the team fails."""
+    return 1.0 if v.cause[e] != 0 else 0.0
+
+
+@inlined
 def stillness(e, v, speed, body_rate):
     """Payload slow, and turning slowly."""
     velocity, rates = norm(row(v.state.payload_velocity, e)), norm(row(v.state.payload_body_rates, e))

@@ -37,7 +37,7 @@ from multilift_marl.tasks.paths import (
     place,
     set_goal,
 )  # fmt: skip
-from multilift_marl.tasks.rewards import Term, action_rate, attitude, distance, tolerance, velocity
+from multilift_marl.tasks.rewards import Term, action_rate, attitude, distance, failure, tolerance, velocity
 from multilift_marl.tasks.spline import NO_FILE, spline_yaw
 from multilift_marl.tasks.starts import hang_team, in_ball
 
@@ -251,6 +251,7 @@ class Track(Task):
         "attitude": Term(0.1, attitude, 6.0, "deg"),
         "velocity": Term(0.2, velocity, 0.2, "m/s"),
         "heading": Term(0.0, heading, 0.5, "deg"),
+        "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
     KERNELS: ClassVar[Kernels] = Kernels(never, plan=advance_target, update=note_worst, preview=preview_target)

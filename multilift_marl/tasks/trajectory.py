@@ -176,8 +176,9 @@ def advance_plan(e, v):
     if stage != plan.stage[e]:
         plan.stage[e] = stage
         set_goal_from_plan(e, stage + 1, plan, v.goal, v.rig, v.nominal)
-    evaluate_plan(e, v, v.control_dt)
-    if v.rig.is_point:  # its attitude is that of the plan
+    if v.has_plan:
+        evaluate_plan(e, v, v.control_dt)
+    if v.rig.is_point:  # its attitude is that of the plan, or of the goal
         putmat(v.state.payload_rotation[e], matrow(v.planned.rotation, e))
 
 
