@@ -90,7 +90,8 @@ def as_often(own: np.ndarray, other: np.ndarray) -> bool:
 def gain(flight: str) -> str:
     """Return the gain of learned teams over the best script: success and error, paired by episode.
 
-    Of several training seeds each episode counts by its mean. `is_gain` decides whether learning gains.
+    Of several training seeds each episode counts by its mean. Errors are compared in episodes that end alike for all;
+    `is_gain` decides whether learning gains.
     """
     learned = [np.load(HERE / flight / f"{team}.npz") for team in learned_teams(flight)]
     best = best_script(flight)
@@ -103,8 +104,10 @@ def gain(flight: str) -> str:
         mean = np.mean([each[key].astype(float) for each in learned], axis=0)
         difference = 100 * (mean - script[key].astype(float))
         differences.append(difference)
-        low, high = (f"{bound:+.{digits}f}" for bound in bootstrap(difference))
-        parts.append(f"{difference.mean():+.{digits}f} ({low} to {high}) {unit}")
+        shown = difference if key == "success" else difference[differences[0] == 0]
+        if shown.size:
+            low, high = (f"{bound:+.{digits}f}" for bound in bootstrap(shown))
+            parts.append(f"{shown.mean():+.{digits}f} ({low} to {high}) {unit}")
     return f"{', '.join(parts)}, {best}" + ("" if is_gain(*differences) else "; **learning gains nothing**")
 
 

@@ -105,6 +105,15 @@ def test_better_is_in_success_first_and_beyond_noise(success, errors, expected):
     assert is_better(*flown) == expected
 
 
+def test_one_lost_payload_on_each_side_does_not_hide_a_smaller_error():
+    rng, flown = np.random.default_rng(0), []
+    for error, lost in ((0.03, 3), (0.04, 5)):
+        flown.append(flight(error + rng.normal(0, 0.001, 100)))
+        flown[-1]["success_rate"] = np.arange(100) != lost
+        flown[-1]["payload_position_error_m"][lost] = 3.0
+    assert is_better(*flown) and not is_better(*reversed(flown))
+
+
 def test_the_untrained_policy_flies_the_script_and_is_evaluated(tmp_path):
     trainer = make_trainer(tmp_path, **{"train.residual": "formation_feedback", "train.frames": 128})
     trainer.run()
