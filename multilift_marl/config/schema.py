@@ -285,9 +285,7 @@ class WindConfig(Section):
     gust: Annotated[Vector, Between(-60, 60, "m/s")] = Field(
         (0.0, 0.0, 0.0), description='[m/s] amplitude of a "1 - cosine" gust in the world frame'
     )
-    gust_start: Annotated[Float, Between(0, 1e6, "s")] = Field(
-        2.0, ge=0, description="[s] from an episode's start until the gust"
-    )
+    gust_start: Annotated[Float, Between(0, 1e6, "s")] = Field(2.0, ge=0, description="[s] from start to gust")
     gust_rise: Annotated[Float, Between(1e-3, 1e6, "s")] = Field(
         0.5, gt=0, description="[s] in which it rises, and falls"
     )

@@ -100,8 +100,8 @@ def is_better(policy: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bo
 def is_gain(success: np.ndarray, error: np.ndarray) -> bool:
     """Return whether paired differences of success and error (n,) are an improvement beyond the noise.
 
-    That is in success or, succeeding no less often, in error: the 95 % interval of the difference leaves out zero. Errors
-    are compared in episodes that end alike: the others differ by metres, and count as successes already.
+    That is in success or, succeeding no less often, in error: the 95 % interval of the difference leaves out zero.
+    Errors are compared in episodes that end alike: the others differ by metres, and count as successes already.
     """
     alike = error[success == 0]
     return bootstrap(success)[0] > 0 or (success.mean() >= 0 and alike.size > 0 and bootstrap(alike)[1] < 0)
