@@ -153,7 +153,6 @@ def test_pettingzoo_renders():
 
 @needs_gl
 def test_a_machine_without_display_needs_no_settings_and_exits_quietly():
-    ml.make_vec(num_envs=1, num_threads=1).reset(seed=0)  # compiles the kernels, which would be told of otherwise
     code = (
         "import multilift_marl as ml\nfrom multilift_marl.rendering import Renderer\n"
         "vec = ml.make_vec(num_envs=1, num_threads=1)\nvec.reset(seed=0)\nrenderer = Renderer(vec, 64, 36)\n"
@@ -162,7 +161,8 @@ def test_a_machine_without_display_needs_no_settings_and_exits_quietly():
     without_display = {
         key: value for key, value in os.environ.items() if key not in ("DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")
     }
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=without_display)
+    for _ in range(2):  # the first one may have to compile, and says so
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=without_display)
     assert (done.stdout, done.stderr, done.returncode) == ("(36, 64, 3)\n", "", 0)
 
 

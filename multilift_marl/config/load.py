@@ -340,7 +340,7 @@ def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         if key == "reward" and isinstance(value, Mapping):
             value = {term: {"weight": own} if _is_number(own) else own for term, own in value.items()}
         known = merged.get(key)
-        if key.startswith("reward.") and isinstance(known, Mapping) and _is_number(value):  # in train.overrides
+        if str(key).startswith("reward.") and isinstance(known, Mapping) and _is_number(value):  # in train.overrides
             value = {"weight": value}
         merged[key] = (
             _merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
