@@ -105,6 +105,25 @@ def test_better_is_in_success_first_and_beyond_noise(success, errors, expected):
     assert is_better(*flown) == expected
 
 
+def test_by_the_means_alone_any_difference_counts_success_first():
+    rng = np.random.default_rng(1)
+    flown = [flight(error + rng.normal(0, 0.3, 100)) for error in (0.98, 1.0)]
+    assert flown[0]["payload_position_error_m"].mean() < flown[1]["payload_position_error_m"].mean()
+    assert not is_better(*flown) and is_better(*flown, beyond_noise=False)
+    assert not is_better(*reversed(flown), beyond_noise=False) and not is_better(flown[0], flown[0], beyond_noise=False)
+    flown[0]["success_rate"] = np.arange(100) > 0
+    assert not is_better(*flown, beyond_noise=False) and is_better(*reversed(flown), beyond_noise=False)
+
+
+def test_the_first_trained_policy_must_beat_the_script_beyond_noise_later_ones_by_the_means(tmp_path, monkeypatch):
+    trainer, asked = make_trainer(tmp_path), []
+    monkeypatch.setattr(evaluator, "is_better", lambda *flown, beyond_noise: asked.append(beyond_noise) or True)
+    monkeypatch.setattr(evaluator, "fly_episodes", lambda *a, **k: flight(np.full(3, 1.0 - 0.1 * trainer.iteration)))
+    for trainer.iteration in range(4):
+        trainer.evaluator.evaluate(trainer._content())
+    assert asked == [True, False, False]
+
+
 def test_one_lost_payload_on_each_side_does_not_hide_a_smaller_error():
     rng, flown = np.random.default_rng(0), []
     for error, lost in ((0.03, 3), (0.04, 5)):

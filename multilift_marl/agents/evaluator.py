@@ -93,8 +93,14 @@ class Evaluator:
         return LearnedPolicy(self.best, "the run's best")
 
     def _confirm(self, candidate: LearnedPolicy, iteration: int) -> bool:
-        """Return whether a policy beats the best one on fresh episodes, too."""
-        return is_better(self._fly(candidate.bind, iteration), self._fly(self.best_policy().bind, iteration))
+        """Return whether a policy beats the best one on fresh episodes, too.
+
+        The untrained policy, which flies the script, gives way to a gain beyond the noise; among trained ones, whose
+        gains add up in steps smaller than that, the means decide.
+        """
+        untrained = self.best_policy().frames == 0
+        flown, best = self._fly(candidate.bind, iteration), self._fly(self.best_policy().bind, iteration)
+        return is_better(flown, best, beyond_noise=untrained)
 
     def _fly(self, make_policy: Callable[[MultiliftVec], Policy], block: int) -> dict[str, np.ndarray]:
         """Return the metrics of each episode of a block."""

@@ -90,21 +90,35 @@ def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> d
     }
 
 
-def is_better(policy: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
-    """Return whether a policy is better than another one on the same episodes, in the sense of `is_gain`."""
+def is_better(policy: dict[str, np.ndarray], other: dict[str, np.ndarray], beyond_noise: bool = True) -> bool:
+    """Return whether a policy is better than another one on the same episodes: in success first, then in error.
+
+    Args:
+        policy, other: what `fly_episodes` measured of both.
+        beyond_noise: by `is_gain`; else by the means alone.
+    """
     names = ("success_rate", "payload_position_error_m")
     success, error = (policy[name].astype(float) - other[name].astype(float) for name in names)
-    return is_gain(success, error)
+    if beyond_noise:
+        return is_gain(success, error)
+    alike = error[success == 0]
+    return success.sum() > 0 or (success.sum() == 0 and alike.size > 0 and alike.mean() < 0)
 
 
-def is_gain(success: np.ndarray, error: np.ndarray) -> bool:
+def is_gain(success: np.ndarray, error: np.ndarray, strict: bool = True) -> bool:
     """Return whether paired differences of success and error (n,) are an improvement beyond the noise.
 
     That is in success or, succeeding no less often, in error: the 95 % interval of the difference leaves out zero.
     Errors are compared in episodes that end alike: the others differ by metres, and count as successes already.
+
+    Args:
+        success, error: (n,).
+        strict: no less often by the mean; else within the interval of the difference.
     """
+    low, high = bootstrap(success)
     alike = error[success == 0]
-    return bootstrap(success)[0] > 0 or (success.mean() >= 0 and alike.size > 0 and bootstrap(alike)[1] < 0)
+    as_often = success.mean() >= 0 if strict else high >= 0
+    return bool(low > 0 or (as_often and alike.size > 0 and bootstrap(alike)[1] < 0))
 
 
 def _mean(values: np.ndarray) -> dict[str, Any]:
