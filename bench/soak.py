@@ -3,9 +3,9 @@
     python bench/soak.py mode=random|policy|training [minutes=3] [iterations=200] [num_envs=64]
 
 `random` flies every task in turn by random actions, which soon fail, so that episodes start often; `policy` by the
-policy that comes with the package; `training` trains `hover` in small batches. It fails, with exit status 1, by NaN, and
-by threads that were added or memory that grew beyond `BOUND` within a task (of training: within the run), each after
-the first quarter of it.
+policy that comes with the package; `training` trains `hover` in small batches. It fails, with exit status 1, by NaN,
+and by threads that were added or memory that grew beyond `BOUND` within a task (of training: within the run), each
+after the first quarter of it.
 """
 
 from __future__ import annotations
@@ -121,9 +121,8 @@ def main(arguments: list[str]) -> int:
     mode, count = str(options["mode"]), int(options["num_envs"])
     if mode not in ("random", "policy", "training"):
         sys.exit(__doc__)
-    print(
-        "| | env steps | episodes | memory [MB] | growth [MB] | growth [B/step] | threads |\n|---|---|---|---|---|---|---|"
-    )
+    print("| | env steps | episodes | memory [MB] | growth [MB] | growth [B/step] | threads |")
+    print("|---|---|---|---|---|---|---|")
     failed = False
     for name in ["hover"] if mode == "training" else ml.list_tasks():
         if mode == "training":
