@@ -83,7 +83,7 @@ def test_wheel_from_the_sdist_works_in_a_clean_environment(release, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "expected"), [("no git", "0.1.0.dev0"), ("no tags", "0.1.0.dev0"), ("tagged", "0.3.1")]
+    ("kind", "expected"), [("no git", "0.1.0.dev0"), ("no tags", "0.1.0.dev1+g"), ("tagged", "0.3.1")]
 )
 def test_the_version_is_that_of_the_tag(kind, expected, tmp_path):
     clone = tmp_path / "clone"
@@ -93,7 +93,7 @@ def test_the_version_is_that_of_the_tag(kind, expected, tmp_path):
     elif kind == "tagged":
         run("git", "-C", clone, "tag", "v0.3.1")
     run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path, clone)
-    assert next(tmp_path.glob("*.whl")).name.split("-")[1] == expected
+    assert next(tmp_path.glob("*.whl")).name.split("-")[1].startswith(expected)
 
 
 def test_the_version_is_that_of_the_installed_package():
