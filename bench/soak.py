@@ -1,11 +1,11 @@
 """Whether memory and threads stay flat over many steps, and nothing that a learner is given is NaN.
 
-    python bench/soak.py mode=random|policy|training [minutes=3] [iterations=200] [num_envs=64]
+    python bench/soak.py mode=random|policy|training [minutes=3] [iterations=200] [num_envs=64] [task=<name>]
 
 `random` flies every task in turn by random actions, which soon fail, so that episodes start often; `policy` by the
 policy that comes with the package; `training` trains `hover` in small batches. It fails, with exit status 1, by NaN,
 and by threads that were added or memory that grew beyond `BOUND` within a task (of training: within the run), each
-after the first quarter of it.
+after the first quarter of it. `task` is the only one to fly, in place of all.
 """
 
 from __future__ import annotations
@@ -124,11 +124,12 @@ def main(arguments: list[str]) -> int:
     print("| | env steps | episodes | memory [MB] | growth [MB] | growth [B/step] | threads |")
     print("|---|---|---|---|---|---|---|")
     failed = False
-    for name in ["hover"] if mode == "training" else ml.list_tasks():
+    tasks = ["hover"] if mode == "training" else [str(options["task"])] if "task" in options else ml.list_tasks()
+    for name in tasks:
         if mode == "training":
             watch, episodes = train(int(options["iterations"]), count)
         else:
-            watch, episodes = fly(name, mode, 60.0 * float(options["minutes"]) / len(ml.list_tasks()), count)
+            watch, episodes = fly(name, mode, 60.0 * float(options["minutes"]) / len(tasks), count)
         warm = watch.warm()
         rate = MEGABYTE * watch.growth() / max(warm[-1][0] - warm[0][0], 1)
         failed |= watch.growth() > BOUND or watch.new_threads() > 0
