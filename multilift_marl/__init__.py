@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from multilift_marl import _interrupt, sim  # noqa: F401 (_interrupt first: Ctrl-C may come while the rest is imported)
@@ -36,7 +37,10 @@ else:
         raise AttributeError(f"module 'multilift_marl' has no attribute '{name}'")
 
 
-__version__ = "0.1.0"
+try:
+    __version__ = version("multilift_marl")
+except PackageNotFoundError:  # a clone that is not installed
+    __version__ = "0+unknown"
 __all__ = [
     "list_tasks",
     "load_config",

@@ -7,6 +7,8 @@ import signal
 import sys
 from typing import Any
 
+from multilift_marl._platform import handles_signals
+
 _SCRIPTS = [os.path.abspath(f"{__file__}/../../{name}") for name in ("train.py", "evaluate.py")]
 _MODULES = ("multilift_marl.cli.", "multilift_marl.view", "multilift_marl.export")
 
@@ -17,13 +19,13 @@ def _begin_quiet_import() -> None:
     program = os.path.basename(path)
     module = program == "-m" and any(word.startswith(_MODULES) for word in sys.orig_argv)
     ours = module or program.startswith("multilift-") or path in _SCRIPTS
-    if ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if ours and handles_signals() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)
 
 
 def end_quiet_import() -> None:
     """Let Ctrl-C raise KeyboardInterrupt again."""
-    if signal.getsignal(signal.SIGINT) is _stop:
+    if handles_signals() and signal.getsignal(signal.SIGINT) is _stop:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

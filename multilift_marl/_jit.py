@@ -28,6 +28,14 @@ def kernel(function: F) -> F:
     return _compile(function)
 
 
+def drawing(function: F) -> F:
+    """Do as `kernel`, for a function that Python calls with a generator of random numbers: its references are counted.
+
+    Otherwise each call would keep its generator alive, 2.9 kB.
+    """
+    return _compile(function, makes_arrays=True)
+
+
 def inlined(function: F) -> F:
     """Do as `kernel`, and merge the function into those that call it.
 

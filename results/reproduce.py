@@ -18,7 +18,6 @@ import csv
 import io
 import json
 import multiprocessing
-import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -32,6 +31,7 @@ from searched import SEARCHED
 from tables import write_tables
 
 from multilift_marl._files import write_whole
+from multilift_marl._platform import cpu_count
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
@@ -167,7 +167,7 @@ def main(arguments: list[str]) -> None:
     elif what == "evaluate":
         workers = [int(each.partition("=")[2]) for each in rest if each.startswith("workers=")]
         flights = [each for each in rest if not each.startswith("workers=")]
-        evaluate(flights or list(FLIGHTS), workers[-1] if workers else len(os.sched_getaffinity(0)))
+        evaluate(flights or list(FLIGHTS), workers[-1] if workers else cpu_count())
     elif what == "ship" and rest:
         ship(rest)
     elif what == "table":

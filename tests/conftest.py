@@ -33,8 +33,11 @@ from multilift_marl.tasks import find_task
 from multilift_marl.validation.cables import hover_thrust  # noqa: F401 (for the tests)
 
 # A run in the background, or below nohup, begins with these ignored, as do its children; tests send them.
-for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
-    if signal.getsignal(_number) is signal.SIG_IGN:
+for _number, _handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (getattr(signal, "SIGHUP", None), signal.SIG_DFL),
+):
+    if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)
 
 TASKS = ml.list_tasks()

@@ -2,7 +2,6 @@
 
 import copy
 import errno
-import fcntl
 import os
 import random
 import signal
@@ -16,6 +15,7 @@ import pytest
 import torch
 from conftest import make_trainer, same
 
+from multilift_marl._platform import STOPPING, lock_file
 from multilift_marl.agents import checkpoint, policy
 from multilift_marl.agents.checkpoint import find_run, load_checkpoint, save_checkpoint
 from multilift_marl.agents.policy import load_policy, strip_checkpoint
@@ -28,6 +28,7 @@ SHIPPED = Path(policy.__file__).parents[1] / "policies"
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a fork")
 def test_killed_while_saving_it_can_always_be_resumed(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.step()
@@ -219,7 +220,7 @@ def test_a_run_that_another_process_trains_is_not_resumed(tmp_path, capsys):
         (trainer.folder / leftover).touch()
     before = (trainer.folder / "config.yaml").stat().st_mtime_ns
     with open(trainer.folder / "lock", "w+") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        lock_file(lock.fileno())
         assert train([f"resume={trainer.folder}", "train.frames=1e6"]) == 2
         with pytest.raises(CheckpointError, match="trained by another process"):
             trainer.run()
@@ -227,8 +228,8 @@ def test_a_run_that_another_process_trains_is_not_resumed(tmp_path, capsys):
     assert (trainer.folder / "config.yaml").stat().st_mtime_ns == before
     trainer.iteration = trainer.iterations
     assert trainer.run() and not list(trainer.folder.rglob("*.tmp"))
-    with open(trainer.folder / "lock") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # free again
+    with open(trainer.folder / "lock", "r+") as lock:
+        lock_file(lock.fileno())  # free again
 
 
 def test_latest_is_the_newest_by_name_whatever_the_clocks_of_files_say(tmp_path):
@@ -249,7 +250,7 @@ def test_names_that_no_run_has_are_refused(tmp_path, name):
         find_run(name, tmp_path)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", STOPPING)
 def test_signals_save_and_stop(tmp_path, monkeypatch, number):
     trainer = make_trainer(tmp_path, **{"eval.every": 1000})
     step, before = trainer.step, signal.getsignal(number)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -68,6 +67,7 @@ def run(code: str | Path, folder: Path, limit: int | None = None, **variables: s
     """
     kept = {key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
     command = [sys.executable, *(["-c", code] if isinstance(code, str) else [str(code)])]
+    resource = pytest.importorskip("resource") if limit else None
     limited = None if limit is None else lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     environment = kept | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"} | variables
     told = subprocess.run(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 import time
 
 import numpy as np
@@ -17,6 +18,8 @@ from multilift_marl.sim import World
 from multilift_marl.sim.earth import Site, project_local
 
 pytest.importorskip("pymavlink")  # of the px4 extra
+if sys.platform == "win32":
+    pytest.skip("PX4 flies on Linux and macOS alone", allow_module_level=True)
 from fake_px4 import FIRST, FakePX4, are_free
 
 from multilift_marl.px4.flight import Flight, check_config

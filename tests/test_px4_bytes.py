@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import base64
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("pymavlink")  # of the px4 extra
+if sys.platform == "win32":
+    pytest.skip("PX4 flies on Linux and macOS alone", allow_module_level=True)
 from fake_px4 import FIRST
 
 from multilift_marl.px4.mavlink import MAVLink, Splitter, mavlink

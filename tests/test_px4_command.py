@@ -17,6 +17,8 @@ from multilift_marl.control.scripted import make_scripted
 from multilift_marl.errors import ConfigError, FlightError
 
 pytest.importorskip("pymavlink")  # of the px4 extra
+if sys.platform == "win32":
+    pytest.skip("PX4 flies on Linux and macOS alone", allow_module_level=True)
 from fake_px4 import FIRST, WORKER, are_free
 
 from multilift_marl.px4 import __main__ as command

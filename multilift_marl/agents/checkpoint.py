@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import io
 import os
 import re
@@ -13,6 +12,7 @@ from typing import Any
 import torch
 
 from multilift_marl._files import write_whole
+from multilift_marl._platform import lock_file
 from multilift_marl.errors import CheckpointError, reason
 
 FORMAT = "multilift_marl checkpoint 1"
@@ -139,9 +139,9 @@ def lock_run(folder: Path) -> None:
     folder = folder.resolve()
     if folder in _locks:
         return
-    file = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    file = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock_file(file)
     except OSError as error:
         owner = os.read(file, 20).decode(errors="replace")
         os.close(file)

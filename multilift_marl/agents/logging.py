@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import imageio.v3 as iio
 
 from multilift_marl._files import write_whole
+from multilift_marl._platform import cpu_name
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -122,7 +123,7 @@ def write_versions(folder: Path) -> None:
                 "git_commit": _git_commit(),
                 "python": platform.python_version(),
                 "platform": platform.platform(),
-                "cpu": _cpu(),
+                "cpu": cpu_name(),
                 "packages": package_versions(),
             },
             indent=2,
@@ -154,12 +155,3 @@ def _git_commit() -> str | None:
     except OSError:  # no git on this machine
         return None
     return done.stdout.strip() if done.returncode == 0 and tracked.returncode == 0 else None
-
-
-def _cpu() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor()

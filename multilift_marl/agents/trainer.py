@@ -17,6 +17,7 @@ import torch
 from torchrl.collectors import Collector
 from tqdm import tqdm
 
+from multilift_marl._platform import STOPPING, handles_signals
 from multilift_marl.agents.checkpoint import (
     check_like,
     clear_leftovers,
@@ -36,7 +37,6 @@ from multilift_marl.errors import CheckpointError, ConfigError, reason
 from multilift_marl.evaluation.rollout import trace_episode
 
 _NEEDED = ("critic", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best_policy")
-_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Trainer:
@@ -94,7 +94,8 @@ class Trainer:
     def run(self) -> bool:
         """Train to the end; return False if the user stopped it.
 
-        Ctrl-C, SIGTERM and SIGHUP save and stop, a second one stops at once. A disk that is full is no reason to stop:
+        Ctrl-C, SIGTERM and SIGHUP save and stop, a second one stops at once; in other threads than the main
+        one signals are left alone. A disk that is full is no reason to stop:
         what could not be written is written again after the next iteration.
 
         Raises:
@@ -104,7 +105,7 @@ class Trainer:
         with ExitStack() as stack:
             stack.callback(unlock_run, self.folder)
             clear_leftovers(self.folder)
-            for number in _STOPPING:
+            for number in STOPPING if handles_signals() else ():
                 if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup's stays
                     stack.callback(signal.signal, number, signal.signal(number, self._interrupt))
             log = RunLog(self.folder, self.iteration, self.frames)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
+from multilift_marl._platform import STOPPING
 from multilift_marl.agents.policy import NamedPolicy, find_policy
 from multilift_marl.cli.common import limit_torch_threads, make_folder, run_command, split_options, title
 from multilift_marl.config.config import Config
@@ -156,7 +157,7 @@ def interrupted_by_signals() -> Iterator[None]:
     def interrupt(number: int, frame: Any) -> None:
         raise KeyboardInterrupt
 
-    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
+    numbers = [n for n in STOPPING if n != signal.SIGINT and signal.getsignal(n) is not signal.SIG_IGN]
     before = {number: signal.signal(number, interrupt) for number in numbers}
     try:
         yield

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from multilift_marl._platform import STOPPING
 from multilift_marl.errors import ConfigError, FlightError
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 
 BUILD = "build/px4_sitl_default"
-_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PR_SET_PDEATHSIG = 1  # of Linux's prctl
 _GRACE = 5.0  # [s] for PX4s to end by themselves
 _RATE_CROSSOVER = 18.5  # [rad/s] of the rate loop: PX4's gain of 0.15 by its iris' 123 rad/s² at a set-point of 1
@@ -30,8 +30,10 @@ def find_px4(folder: str | Path) -> Path:
     """Return the folder of a build of PX4 for software in the loop.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is none, or PX4's simulation does not run on this system.
     """
+    if not hasattr(os, "killpg"):
+        raise ConfigError("PX4's simulation runs on Linux and macOS alone; use one of them, or WSL on Windows")
     for path in (Path(folder).expanduser(), Path(folder).expanduser() / BUILD):
         if (path / "bin" / "px4").is_file() and (path / "etc" / "init.d-posix" / "rcS").is_file():
             return path.resolve()
@@ -145,7 +147,7 @@ class Autopilots:
         if not self._processes:
             self._temporary.cleanup()
             return
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPING)  # Ctrl-C once more waits until all have ended
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # Ctrl-C once more waits until all have ended
         running = [process for process in self._processes.values() if process.poll() is None]
         try:
             for process in running:

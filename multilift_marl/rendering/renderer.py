@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes.util
 import importlib
 import os
+import sys
 import weakref
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in the order of preference: EGL can use a graphics card
+_OTHERS = {"darwin": "cgl", "win32": "glfw"}  # MuJoCo's context on systems that bring OpenGL with them
 _INSTALL = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libosmesa6"
 
 
@@ -91,7 +93,9 @@ def make_contexts(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
     if asked in ("disable", "disabled", "off", "false", "0"):
         raise RenderingError(f"MUJOCO_GL={asked} forbids drawing; unset it")
     installed = [kind for kind, library in _LIBRARIES.items() if ctypes.util.find_library(library)]
-    kind = asked if asked in (*_LIBRARIES, "glfw") else next(iter(installed), None)
+    if sys.platform in _OTHERS:
+        installed = [_OTHERS[sys.platform]]
+    kind = asked if asked in (*_LIBRARIES, *_OTHERS.values()) else next(iter(installed), None)
     if kind is None:
         raise RenderingError(f"drawing needs OpenGL libraries that are not installed; run '{_INSTALL}'")
     size = model.vis.global_

@@ -14,6 +14,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind
+from multilift_marl._platform import cpu_count
 from multilift_marl.rig.constants import make_drones
 from multilift_marl.rig.system import System
 from multilift_marl.sim.air import make_air
@@ -118,7 +119,7 @@ class World:
         self.cables = self.cable_model.make_cables(system, self.parameters, self._inertias)
         self.nodes: Nodes | None = self.cables.nodes
         self._data = SimData(self.state, self.stats, self.diverged)
-        self.shards = self._make_shards(num_threads or len(os.sched_getaffinity(0)))
+        self.shards = self._make_shards(num_threads or cpu_count())
         self._pool: tuple[int, ThreadPoolExecutor] | None = None  # with its process
         self.reset()
 

@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import inlined, kernel
+from multilift_marl._jit import drawing, inlined, kernel
 from multilift_marl.config.values import Float, Int, Section, Span
 from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import add, ease, mat, matrow, mul, put, putmat, rot_z, row, sub, triple, vec
@@ -131,7 +131,7 @@ def trace(e, seconds, v, points):
         put(points[i], target_position(e, seconds * i / (points.shape[0] - 1), v))
 
 
-@kernel
+@drawing
 def start_before_gate(e, rng, v, hanging):
     """Write goal and team at the start, the long side of the formation across the path."""
     goal = v.goal

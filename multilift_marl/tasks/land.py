@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import inlined, kernel
+from multilift_marl._jit import drawing, inlined
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import add, ease, matrow, norm, put, putmat, rot_z, row, scale, sub, tmul, vec
@@ -84,7 +84,7 @@ class LandSettings(NamedTuple):
     """Largest extent of the largest drone from its centre [m]."""
 
 
-@kernel
+@drawing
 def start_above_origin(e, rng, v, hanging, ranges):
     """Draw the pad; write a team at rest above the origin. Ranges are x and y [m], heading [rad], height [m]."""
     goal, (xy, yaw, height) = v.goal, ranges

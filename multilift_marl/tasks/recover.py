@@ -8,7 +8,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import inlined, kernel
+from multilift_marl._jit import drawing, inlined, kernel
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import (
@@ -67,7 +67,7 @@ def _tilted(rng, angle, yaw):
     return matmul(axis_angle((cos(azimuth), sin(azimuth), 0.0), rng.uniform(0.0, angle)), rot_z(yaw))
 
 
-@kernel
+@drawing
 def _throw(e, rng, state, goal, rig, hanging, throw):
     """Write a team whose cables hang slack, each drone somewhere near its slot's direction."""
     payload = add(row(goal.position, e), in_ball(rng, throw.radius))
@@ -87,7 +87,7 @@ def _throw(e, rng, state, goal, rig, hanging, throw):
         state.drone_body_rates[e, n] = 0.0
 
 
-@kernel
+@drawing
 def _throw_as_crazymarl(e, rng, state, goal, drones, hanging):
     """Write a team as CrazyMARL's sampler draws it (viktorlorentz/crazyMARL, crazymarl/utils/multi_quad_sampling.py,
     commit 8723b9a, and the reset of crazymarl/envs/multi_quad_env.py, commit 02d5761).

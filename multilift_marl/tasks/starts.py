@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import drawing, kernel
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.errors import ConfigError
@@ -154,7 +154,7 @@ def make_ranges(option: StartOptions) -> StartRanges:
     )  # fmt: skip
 
 
-@kernel
+@drawing
 def start_near_target(e, rng, v, ranges, hanging):
     """Draw a target, and a team in hanging equilibrium there, then moved, tilted and set in motion as one.
 

@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import inlined, kernel
+from multilift_marl._jit import drawing, inlined
 from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import place_formation
 from multilift_marl.math3d import add, clip, ease, matrow, put, putmat, rot_z, row, scale, sub, vec
@@ -82,7 +82,7 @@ class TakeoffSettings(NamedTuple):
     """Of the target [m]."""
 
 
-@kernel
+@drawing
 def start_on_ground(e, rng, v, ranges, distance):
     """Write goal and team at rest on the ground; ranges are x and y [m], heading [rad] and spread of drones [m]."""
     goal, (xy, yaw, spread), ground = v.goal, ranges, v.settings.ground

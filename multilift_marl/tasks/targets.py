@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl._jit import drawing, kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.cable_forces import is_stable, place_balanced
 from multilift_marl.control.formation import goal_hook
@@ -59,7 +59,7 @@ def make_bounds(system: System, control: ControlConfig, limits: Limits, load: fl
     )
 
 
-@kernel
+@drawing
 def draw_plan(e, rng, v, ranges):
     """Draw the poses of environment e, each anew until the team can hold it; return how many were drawn in vain, or -1.
 

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import inlined, kernel
+from multilift_marl._jit import drawing, inlined, kernel
 from multilift_marl.config.config import Config
 from multilift_marl.config.validate import validate
 from multilift_marl.config.values import Choice, Float, Section, Span, Vector
@@ -129,7 +129,7 @@ def aim(e, t, v):
         goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
 
 
-@kernel
+@drawing
 def start_on_path(e, rng, v, hanging):
     """Write goal and team at the start of the path, with the target's velocity."""
     goal, path = v.goal, v.own.path

@@ -1,0 +1,123 @@
+"""The release: from source distribution to a clean environment; versions, licences, forms."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import venv
+import zipfile
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+import yaml
+
+import multilift_marl as ml
+from multilift_marl._kernel_cache import cache_folder
+
+ROOT = Path(__file__).parents[1]
+USE = """
+import pathlib, sys
+import multilift_marl as ml
+folder = pathlib.Path(ml.__file__).parent
+assert folder.is_relative_to(sys.prefix), folder
+vec = ml.make_vec("hover", num_envs=2)
+observation, _ = vec.reset(seed=1)
+vec.step(ml.load_policy("hover").act(observation))
+for name in sys.argv[1:]:
+    assert (folder / name).is_file(), name
+print(ml.__version__)
+"""
+
+
+def run(*command: str | Path, **more):
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, **more)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory):
+    """Return an sdist, and the wheel that is built from it."""
+    out = tmp_path_factory.mktemp("release")
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", out]
+    run(*build, "--sdist", ROOT)
+    sdist = next(out.glob("*.tar.gz"))
+    with tarfile.open(sdist) as archive:
+        archive.extractall(out, filter="data")
+    run(*build, "--wheel", out / sdist.name.removesuffix(".tar.gz"))
+    return sdist, next(out.glob("*.whl"))
+
+
+@pytest.mark.slow
+def test_sdist_and_wheel_have_one_version_and_the_licence(release):
+    sdist, wheel = release
+    number = sdist.name.removeprefix("multilift_marl-").removesuffix(".tar.gz")
+    assert wheel.name == f"multilift_marl-{number}-py3-none-any.whl"
+    names = zipfile.ZipFile(wheel).namelist()
+    for name in ("LICENSE", "NOTICE"):
+        assert f"multilift_marl-{number}.dist-info/licenses/{name}" in names
+        with tarfile.open(sdist) as archive:
+            assert f"multilift_marl-{number}/{name}" in archive.getnames()
+
+
+@pytest.mark.slow
+def test_wheel_from_the_sdist_works_in_a_clean_environment(release, tmp_path):
+    """The environment has what this one has, apart from this package: a full installation takes minutes."""
+    venv.create(tmp_path / "clean", with_pip=True, system_site_packages=False)
+    python = tmp_path / "clean" / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+    run(python, "-m", "pip", "install", "-q", "--no-deps", "--no-index", release[1])
+    site = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])").strip())
+    (site / "outer.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")  # behind what is installed here
+    shipped = [f"policies/{path.name}" for path in (ROOT / "multilift_marl" / "policies").glob("*.pt")]
+    shipped += [f"configs/{path.relative_to(ROOT / 'configs')}" for path in (ROOT / "configs").rglob("*.yaml")]
+    assert len(shipped) > 40
+    kernels = cache_folder("multilift_marl.math3d").parents[1]
+    own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    found = run(python, "-c", USE, *shipped, cwd=tmp_path, env=own | {"NUMBA_CACHE_DIR": str(kernels)})
+    assert f"multilift_marl-{found.strip()}-" in release[1].name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("no git", "0.1.0.dev0"), ("no tags", "0.1.0.dev1+g"), ("tagged", "0.3.1")]
+)
+def test_the_version_is_that_of_the_tag(kind, expected, tmp_path):
+    clone = tmp_path / "clone"
+    run("git", "clone", "-q", "--depth", "1", "--no-tags", ROOT.as_uri(), clone)
+    if kind == "no git":
+        (clone / ".git").rename(tmp_path / "elsewhere")
+    elif kind == "tagged":
+        run("git", "-C", clone, "tag", "v0.3.1")
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path, clone)
+    assert next(tmp_path.glob("*.whl")).name.split("-")[1].startswith(expected)
+
+
+def test_the_version_is_that_of_the_installed_package():
+    try:
+        assert ml.__version__ == version("multilift_marl")
+    except ModuleNotFoundError:
+        assert ml.__version__ == "0+unknown"
+
+
+def test_forms_and_citation_are_yaml():
+    for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"):
+        form = yaml.safe_load(path.read_text(encoding="utf-8"))
+        assert form["name"] and form["description"]
+        assert all(part["type"] == "textarea" and part["attributes"]["label"] for part in form["body"])
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert {"cff-version", "message", "title", "authors", "license"} <= set(citation)
+
+
+def test_changelog_has_a_place_for_what_is_not_released():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert text.index("## [Unreleased]") < text.index("## [0.1.0]")
+
+
+def test_nothing_of_others_is_shipped():
+    """The NOTICE says that there are no meshes, and whose the policies are."""
+    kinds = {path.suffix for folder in ("multilift_marl", "configs") for path in (ROOT / folder).rglob("*.*")}
+    assert kinds - {".pyc", ".kernel", ".tmp"} <= {".py", ".pt", ".typed", ".yaml"}
