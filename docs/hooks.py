@@ -1,7 +1,7 @@
 """What `mkdocs build` changes in the pages, so that they are right on the site and when read in the repository.
 
-Links to files outside docs/, such as ../configs/hover.yaml, lead to the repository: to `repo_url` of mkdocs.yml, or, where
-that is not set, to the files of the clone in which the site was built.
+Links to files outside docs/, such as ../configs/hover.yaml, lead to the repository: to `repo_url` of mkdocs.yml, or,
+where that is not set, to the files of the clone in which the site was built.
 """
 
 from __future__ import annotations
