@@ -6,7 +6,7 @@
                                                         -> results/<flight>/<team>.json, .npz; also <flight>/<team>
                                                         for one team, workers=<processes> (as many as there are CPUs)
   python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
-  python results/reproduce.py table                     the tables of README.md and docs/
+  python results/reproduce.py table                     the tables of docs/
 
 Every number in those tables comes from these files. `evaluate` skips teams whose files exist, so it can be stopped
 and started again; delete the files of what has changed.

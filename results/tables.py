@@ -165,8 +165,8 @@ def _interval(metric: dict[str, Any] | None, factor: float, digits: int) -> str:
 def write_tables() -> None:
     """Replace the text between the markers in the documents."""
     marked = re.compile(r"(<!-- (results|shifts)(?: of ([\w ]+))? -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
-    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
-        whole = summary if path.name == "README.md" else table
+    for path in sorted((ROOT / "docs").glob("*.md")):
+        whole = summary if path.name == "results.md" else table
 
         def fill(found: re.Match[str], whole: Callable[[], str] = whole) -> str:
             kind = shifts if found[2] == "shifts" else details

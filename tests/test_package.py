@@ -25,6 +25,7 @@ from multilift_marl.tasks.observations import OBSERVATION
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))  # each from top to bottom, in one folder
 
 
 def python(code, cwd, **environment):
@@ -131,7 +132,7 @@ def test_the_table_of_hidden_parameters_is_complete():
     assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(RandomizationConfig.model_fields)
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("document", DOCUMENTS + TUTORIALS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_and_files_of_documents_exist(document):
     for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
         if not target.startswith("http"):
@@ -152,11 +153,15 @@ def test_python_of_documents_runs(code, tmp_path):
 def commands():
     for document in DOCUMENTS:
         for block in blocks("bash", document):
-            for line in block.replace("\\\n", " ").splitlines():
-                for part in line.split("&&"):
-                    part = part.split("#")[0].strip()
-                    if part.startswith("python ") and "-m venv" not in part:
-                        yield part
+            yield from commands_of(block)
+
+
+def commands_of(block):
+    for line in block.replace("\\\n", " ").splitlines():
+        for part in line.split("&&"):
+            part = part.split("#")[0].strip()
+            if part.startswith("python ") and "-m venv" not in part:
+                yield part
 
 
 SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 eval.episodes=2"  # a training of one iteration
@@ -225,6 +230,28 @@ def test_commands_of_documents_run(command, tmp_path, monkeypatch, registries):
     (tmp_path / "results").symlink_to(ROOT / "results")
     monkeypatch.setattr(plots, "_save", lambda figure, path: None)  # most of the time; see test_evaluation.py
     run(command, tmp_path, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("document", TUTORIALS, ids=lambda path: path.stem)
+def test_tutorials_run_from_top_to_bottom(document, tmp_path, monkeypatch, registries):
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.setattr(plots, "_save", lambda figure, path: None)
+    done = 0
+    for language, title, text in re.findall(
+        r'```(\w+)(?: title="([^"]+)")?\n(.*?)```', document.read_text(), re.DOTALL
+    ):
+        if title:
+            (tmp_path / title).write_text(text, encoding="utf-8")
+        elif language == "python":
+            ran = python(text, tmp_path, PYTHONPATH=f"{tmp_path}:{ROOT}")
+            assert ran.returncode == 0, ran.stderr
+            done += 1
+        elif language == "bash":
+            for command in commands_of(text):
+                run(command, tmp_path, monkeypatch)
+                done += 1
+    assert done >= 2
 
 
 def test_configs_only_override_what_exists():

@@ -1,0 +1,1 @@
+"""Learning: networks, PPO, runs and their checkpoints, policies and their export."""
