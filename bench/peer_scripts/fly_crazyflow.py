@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from crazyflow.control import Control
 from crazyflow.sim import Sim
-
 from flight import arguments, grid, measure
 
 TEAM = 4

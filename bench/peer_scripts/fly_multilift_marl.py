@@ -7,9 +7,9 @@ here, drawn anew with every episode. Episodes end after their time or with a fai
 from __future__ import annotations
 
 import numpy as np
+from flight import arguments, measure
 
 import multilift_marl as ml
-from flight import arguments, measure
 
 TEAM = 4
 

@@ -6,9 +6,8 @@ The aviary is reset, which loads all its bodies anew, when a drone collides.
 from __future__ import annotations
 
 import numpy as np
-from PyFlyt.core import Aviary
-
 from flight import arguments, grid, measure
+from PyFlyt.core import Aviary
 
 POSITION_MODE = 7  # x, y, yaw, z
 POLICY_HZ = 40

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from flight import arguments, grid, measure
 from rotorpy.controllers.quadrotor_control import BatchedSE3Control
 from rotorpy.vehicles.hummingbird_params import quad_params
 from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams
-
-from flight import arguments, grid, measure
 
 RATE = 100  # [Hz] `sim_rate` of its vectorised environment, one physics step each
 LOST = 5.0  # [m]

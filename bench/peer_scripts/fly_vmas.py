@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import torch
 import vmas
+from flight import arguments, grid, measure
 from vmas.scenarios.debug import drone
 from vmas.simulator.core import Agent
 from vmas.simulator.dynamics.drone import Drone
-
-from flight import arguments, grid, measure
 
 TEAM = 4
 U_RANGE = [5.0, 0.05, 0.05, 0.05]  # thrust beyond the weight [N], torques [N m]
@@ -28,6 +27,7 @@ class Scenario(drone.Scenario):
     """VMAS's scenario `drone` with thrust as an action, and set-points."""
 
     def make_world(self, batch_dim: int, device: torch.device, **kwargs):
+        """Return worlds of `TEAM` drones that take thrust and torques."""
         world = super().make_world(batch_dim, device, n_agents=0)
         for i in range(TEAM):
             dynamics = Drone(world, integration="rk4")
@@ -37,6 +37,7 @@ class Scenario(drone.Scenario):
         return world
 
     def reset_world_at(self, env_index: int | None = None):
+        """Put the drones of one world, or of all, to their places, at rest."""
         for agent, place in zip(self.world.agents, self.home, strict=True):
             agent.set_pos(place[:2].expand(1 if env_index is not None else self.world.batch_dim, 2), env_index)
             agent.dynamics.reset(env_index)
