@@ -243,8 +243,8 @@ def write_tables(page: Path = PAGE) -> None:
     results = json.loads(RESULTS.read_text(encoding="utf-8"))
     text = page.read_text(encoding="utf-8")
     for name, content in (("peers", table(results)), ("features", features(results))):
-        marked = re.compile(rf"(<!-- {name} -->\n).*?(\n<!-- end of {name} -->)", re.DOTALL)
-        text = marked.sub(lambda found, content=content: f"{found[1]}{content}{found[2]}", text)
+        marked = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end of {name} -->)", re.DOTALL)
+        text = marked.sub(lambda found, content=content: f"{found[1]}{content}\n{found[2]}", text)
     page.write_text(text, encoding="utf-8")
 
 
