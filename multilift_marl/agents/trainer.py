@@ -94,9 +94,9 @@ class Trainer:
     def run(self) -> bool:
         """Train to the end; return False if the user stopped it.
 
-        Ctrl-C, SIGTERM and SIGHUP save and stop, a second one stops at once; in other threads than the main
-        one signals are left alone. A disk that is full is no reason to stop:
-        what could not be written is written again after the next iteration.
+        Ctrl-C, SIGTERM and SIGHUP save and stop, a second one stops at once; threads other than the main one leave
+        signals alone. A disk that is full is no reason to stop: what could not be written is written again after the
+        next iteration.
 
         Raises:
             CheckpointError: another process trains this run, or its end could not be saved.
