@@ -13,7 +13,7 @@ from __future__ import annotations
 import gc
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,7 @@ def train(iterations: int, num_envs: int) -> tuple[Watch, int]:
     horizon = 32
     values = {"env.num_envs": num_envs, "train.horizon": horizon, "train.frames": iterations * num_envs * horizon}
     trainer = Trainer(ml.load_config("hover", values | {"train.minibatches": 2}), Path("runs"))  # which stays unwritten
-    trainer._batches = checked(trainer._batches)
+    trainer.rollouts.collect = checked(trainer.rollouts.collect)
     watch = Watch()
     every = max(1, iterations // SAMPLES)
     while not trainer.finished:
@@ -106,13 +106,17 @@ def train(iterations: int, num_envs: int) -> tuple[Watch, int]:
     return watch, trainer.iteration
 
 
-def checked(batches: Iterator[Any]) -> Iterator[Any]:
-    """Yield the batches, all of whose numbers must be finite."""
-    for batch in batches:
+def checked(collect: Callable[[int], Any]) -> Callable[[int], Any]:
+    """Return `collect` of rollouts, all of whose numbers must be finite."""
+
+    def collect_checked(iteration: int) -> Any:
+        batch = collect(iteration)
         for key, value in batch.items(include_nested=True, leaves_only=True):
             if value.is_floating_point():
                 check_finite(f"batch, {key}", value.numpy())
-        yield batch
+        return batch
+
+    return collect_checked
 
 
 def main(arguments: list[str]) -> int:

@@ -56,11 +56,11 @@ def main(arguments: list[str]) -> dict:
     vec.reset = timed(vec.reset, "starts", spent)
     network.forward = timed(network.forward, "actor", spent)
     learn = timed(update, "learning", spent)
-    batches, iterations = iter(trainer.collector), []
+    iterations = []
     for i in range(repeats + 2):
         spent.clear()
         start = time.perf_counter()
-        batch = next(batches)
+        batch = trainer.rollouts.collect(i)
         torch.set_num_threads(trainer.config.train.threads)
         learn(trainer.learner, batch)
         spent["total"] = time.perf_counter() - start

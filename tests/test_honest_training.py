@@ -32,7 +32,7 @@ def test_only_whole_episodes_stand_in_the_curves(tmp_path):
     trainer = make_trainer(tmp_path, **{"env.episode_seconds": 0.5})
     steps, logged = trainer.env.vec.max_steps, []
     for _ in range(6):
-        batch = next(trainer._batches)
+        batch = trainer.rollouts.collect(trainer.iteration)
         batch["next", "agents", "reward"].fill_(1.0)
         values = trainer._episodes(batch)
         trainer.iteration += 1

@@ -80,10 +80,10 @@ def test_learning_sees_the_memory_that_the_rollouts_had(tmp_path, overrides):
     with torch.no_grad():
         nn.init.orthogonal_(trainer.learner.actor.team.net[-1].weight)
     ended = 0
-    batches = trainer._batches
-    for _ in range(4):
-        batch = next(batches)
-        trainer._batches = iter([batch])
+    collect = trainer.rollouts.collect
+    for i in range(4):
+        batch = collect(i)
+        trainer.rollouts.collect = lambda iteration, batch=batch: batch
         ended += int(mark_starts(batch).sum())
         memory = batch["agents", "memory"]
         after = batch["next", "agents", "memory"].masked_fill(batch["next", "done"][..., None], 0.0)

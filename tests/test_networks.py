@@ -73,7 +73,7 @@ def test_weights_of_such_critics_fit_any_team(kind):
 def test_actions_are_drawn_from_the_gaussian_that_their_probability_says():
     torch.manual_seed(0)
     mean, deviation = torch.full((20000, 2, 3), 2.0), torch.tensor([0.5, 1.0, 0.1])
-    action, log_prob = draw_action(mean, deviation)
+    action, log_prob = draw_action(mean, deviation, torch.randn_like(mean))
     torch.testing.assert_close(log_prob, torch.distributions.Normal(mean, deviation).log_prob(action).sum(-1))
     torch.testing.assert_close(action.std((0, 1)), deviation, rtol=0.02, atol=0)
     torch.testing.assert_close(action.mean((0, 1)), mean[0, 0], rtol=0.01, atol=0)

@@ -158,7 +158,7 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
     stored = flat(load_checkpoint(weights)["config"])
     recipe = flat(ml.load_config(weights.parts[-3]).model_dump(mode="json"))
     assert stored["seed"] == int(weights.parts[-2].removeprefix("seed"))
-    own = {"seed", "env.num_threads", "train.threads"}
+    own = {"seed", "env.num_threads", "train.threads", "train.workers", "train.ray"}
     later = recipe.keys() - stored.keys() - own  # keys that were added since
     assert later <= {
         "train.critic_learning_rate",

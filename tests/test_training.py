@@ -1,6 +1,7 @@
 """Training: it learns, resumes bit for bit, and logs what a reader needs."""
 
 import copy
+import itertools
 import json
 
 import numpy as np
@@ -123,9 +124,10 @@ def test_a_resumed_run_has_the_best_policy_of_its_checkpoint(tmp_path):
 
 def test_time_outs_are_bootstrapped_and_failures_are_not(tmp_path):
     trainer = make_trainer(tmp_path)
-    batch = next(iter(trainer.collector))
+    iterations = itertools.count()
+    batch = trainer.rollouts.collect(next(iterations))
     while not batch["next", "truncated"].any():
-        batch = next(iter(trainer.collector))
+        batch = trainer.rollouts.collect(next(iterations))
     gamma = trainer.config.train.gamma
     advantage, value = estimate_advantage(trainer.learner, batch)
     with torch.no_grad():
@@ -148,7 +150,7 @@ def test_advantages_losses_and_gradients_are_those_of_torchrl(tmp_path, algorith
     ours = trainer.learner
     ours.optimizer.zero_grad(set_to_none=True)
     theirs = copy.deepcopy(ours)
-    batch = next(iter(trainer.collector)).clone()
+    batch = trainer.rollouts.collect(2).clone()
     batch["next", "terminated"][0, 3] = batch["next", "done"][0, 3] = True
     assert batch["next", "truncated"].any()
 

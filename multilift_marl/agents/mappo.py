@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,8 @@ from torch.distributions import Independent, Normal
 from torchrl.modules import PopArtValueNorm
 
 from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, TeamNet, draw_action
-from multilift_marl.config.schema import EnvConfig, TrainConfig
+from multilift_marl.config.schema import EnvConfig
+from multilift_marl.config.train_schema import TrainConfig
 from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
@@ -30,11 +32,16 @@ class StochasticPolicy(TensorDictModuleBase):
 
     Reads the observation, writes ("agents", "action") and ("agents", "action_log_prob"). With a GRU it also reads the
     memory, ("agents", "memory"), and writes the next one, which the environment carries to the next step.
+
+    Attributes:
+        actor: the Gaussian.
+        noise: of the steps to come, (E, N, A) each, standard normal; see `agents/rollouts.py`.
     """
 
     def __init__(self, actor: Actor):
         super().__init__()
         self.actor = actor
+        self.noise: Iterator[torch.Tensor] = iter(())
         self.in_keys: list[NestedKey] = [_OBSERVATION]
         self.out_keys: list[NestedKey] = [_ACTION, _LOG_PROB]
         if actor.memory is not None:
@@ -49,7 +56,7 @@ class StochasticPolicy(TensorDictModuleBase):
             memory = self.actor.remember(observation, tensordict[_MEMORY])
             tensordict["next", *_MEMORY] = memory
         mean = self.actor(observation, memory)[0]
-        tensordict[_ACTION], tensordict[_LOG_PROB] = draw_action(mean, self.actor.log_std.exp())
+        tensordict[_ACTION], tensordict[_LOG_PROB] = draw_action(mean, self.actor.log_std.exp(), next(self.noise))
         return tensordict
 
 
@@ -69,6 +76,13 @@ class Learner:
         return source
 
 
+def make_actor(config: TrainConfig, vec: MultiliftVec) -> Actor:
+    """Return an untrained policy for `vec`, which acts as its script."""
+    base = torch.from_numpy(residual_matrix(config.residual, vec))
+    sizes = (vec.observation_size, vec.action_size)
+    return Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru)
+
+
 def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     """Return an untrained learner for `env`.
 
@@ -81,9 +95,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
         raise ConfigError(f"the last of train.hidden must be a multiple of {TeamNet.HEADS}, the heads of attention")
     # 1. The policy: own observation to a Gaussian over the own action.
     vec = env.vec
-    base = torch.from_numpy(residual_matrix(config.residual, vec))
-    sizes = (vec.observation_size, vec.action_size)
-    actor = Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru)
+    actor = make_actor(config, vec)
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
@@ -109,9 +121,9 @@ def check_communication(train: TrainConfig, env: EnvConfig) -> None:
         )
 
 
-def check_batch(train: TrainConfig, vec: MultiliftVec) -> None:
+def check_batch(train: TrainConfig, vec: MultiliftVec, num_envs: int) -> None:
     """Refuse, by a ConfigError, batches that cannot be divided as asked, or are larger than this machine's memory."""
-    steps = vec.num_envs * train.horizon
+    steps = num_envs * train.horizon
     rows, what = steps, "steps"
     if train.gru:
         length = sequence_length(train)

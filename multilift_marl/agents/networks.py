@@ -209,14 +209,14 @@ class Actor(nn.Module):
 
 
 @torch.no_grad()
-def draw_action(mean: torch.Tensor, deviation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def draw_action(mean: torch.Tensor, deviation: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return actions drawn from a Gaussian and their log-probabilities (..., N).
 
     Args:
         mean: (..., N, A).
         deviation: (A,), the same for all.
+        noise: (..., N, A), standard normal.
     """
-    noise = torch.randn_like(mean)
     constant = deviation.log().sum() + 0.5 * math.log(2 * math.pi) * len(deviation)
     return torch.addcmul(mean, noise, deviation), noise.square().sum(-1).mul_(-0.5) - constant
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torchrl.collectors import Collector
 from tqdm import tqdm
 
 from multilift_marl._platform import STOPPING, handles_signals
@@ -30,6 +29,8 @@ from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import RunLog, write_versions
 from multilift_marl.agents.mappo import adapted_rate, check_batch, check_communication, make_learner, update
 from multilift_marl.agents.policy import check_policy
+from multilift_marl.agents.rollouts import Rollouts
+from multilift_marl.agents.workers import Workers
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.envs.torchrl_env import MultiliftEnv
@@ -63,32 +64,25 @@ class Trainer:
         environment = build_config(config.model_dump(), config.train.overrides)
         for env in (config.env, environment.env):
             check_communication(config.train, env)
-        self.env = MultiliftEnv(environment, memory=config.train.gru)
-        self.frames_per_batch = self.env.vec.num_envs * config.train.horizon
-        check_batch(config.train, self.env.vec)
-        self.learner = make_learner(config.train, self.env)
+        train, num_envs = config.train, environment.env.num_envs
+        here = environment if train.workers == 0 else build_config(environment.model_dump(), {"env.num_envs": 1})
+        self.env = MultiliftEnv(here, memory=train.gru)
+        self.frames_per_batch = num_envs * train.horizon
+        check_batch(train, self.env.vec, num_envs)
+        self.learner = make_learner(train, self.env)
+        self.rollouts: Rollouts | Workers
+        if train.workers == 0:
+            self.rollouts = Rollouts(self.env, self.learner.policy, train.horizon, num_envs)
+        else:
+            self.rollouts = Workers(environment, self.learner.actor)
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
         self.evaluator = Evaluator(config)
         self.gain: Gain | None = None
-        self._returns = np.zeros(self.env.vec.num_envs)  # of the episodes in flight
+        self._returns = np.zeros(num_envs)  # of the episodes in flight
         self._stop, self._warned, self._best_saved, self.status = False, False, True, 128 + signal.SIGINT
         if checkpoint is not None:
             self._restore(checkpoint)
-        self.collector = Collector(
-            self.env,
-            self.learner.policy,
-            frames_per_batch=self.frames_per_batch,
-            total_frames=-1,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-            return_same_td=True,  # a batch is used up before the next one
-            device="cpu",
-        )
-        self._batches = iter(self.collector)
-        if checkpoint is None:
-            self.env.vec.stagger()
-        else:
             torch.set_rng_state(checkpoint["rng"])
 
     def run(self) -> bool:
@@ -104,6 +98,7 @@ class Trainer:
         lock_run(self.folder)
         with ExitStack() as stack:
             stack.callback(unlock_run, self.folder)
+            stack.callback(self.rollouts.close)
             clear_leftovers(self.folder)
             for number in STOPPING if handles_signals() else ():
                 if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup's stays
@@ -183,7 +178,7 @@ class Trainer:
         rate = actor["lr"]
         if self.iteration < train.warmup:
             actor["lr"] = 0.0
-        batch = next(self._batches)
+        batch = self.rollouts.collect(self.iteration)
         sampling = time.perf_counter() - start
         torch.set_num_threads(train.threads)
         values = update(self.learner, batch)
@@ -232,11 +227,14 @@ class Trainer:
 
     def _training_state(self) -> dict[str, Any]:
         """Return what else training depends on."""
+        return self._learning_state() | {"env": self.rollouts.get_state()}
+
+    def _learning_state(self) -> dict[str, Any]:
+        """Return what learning depends on."""
         return {
             "critic": self.learner.critic.state_dict(),  # with its normaliser and that of the values
             "optimizer": self.learner.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
-            "env": self.env.get_state(),
             "returns": torch.from_numpy(self._returns.copy()),
             "seconds": self.seconds,
             "best_policy": self.evaluator.best,
@@ -255,8 +253,8 @@ class Trainer:
             ) from error
 
     def _load(self, content: dict[str, Any]) -> None:
-        environments, optimizer = content["env"], self.learner.optimizer
-        own = self._content() | self._training_state()
+        optimizer = self.learner.optimizer
+        own = self._content() | self._learning_state()
         for key in ("critic", "rng", "returns", "iteration", "seconds"):
             check_like(content[key], own[key], key)
         if content["best_policy"] is not None:
@@ -266,9 +264,7 @@ class Trainer:
         torch.Generator().set_state(content["rng"])  # refuses what is no state
         if content["iteration"] < 0:
             raise ValueError("'iteration' is negative")
-        for key in ("world.system", "task_name"):  # which the first checkpoints do not hold
-            environments.setdefault(key, own["env"][key])
-        self.env.set_state(environments)
+        self.rollouts.set_state(content["env"])
         self.learner.actor.load_state_dict(content["actor"])
         self.learner.critic.load_state_dict(content["critic"])
         optimizer.load_state_dict(content["optimizer"])

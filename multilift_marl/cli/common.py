@@ -41,6 +41,7 @@ _EXTRAS = {
     "pymavlink": "px4",
     "rosbags": "ros",
     "cyclonedds": "ros",
+    "ray": "ray",
 }  # of all other packages: train
 
 

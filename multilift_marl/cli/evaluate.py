@@ -20,6 +20,7 @@ from multilift_marl.config.values import Between, Float, Int, Section
 from multilift_marl.control.scripted import fitting_scripts
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError
+from multilift_marl.evaluation.apart import cluster, fly_apart
 from multilift_marl.evaluation.metrics import format_table, make_report, write_report
 from multilift_marl.evaluation.rollout import Trace, fly_episodes, trace_episode
 
@@ -60,6 +61,8 @@ class Options(Section):
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the first episode, see docs/ros.md")
     ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of that bag")
     names: Literal["multilift", "report"] = Field("multilift", description="of its topics: ours or the report's")
+    workers: Annotated[Int, Between(0, 1024)] = Field(0, description="processes of Ray that fly the episodes; 0: none")
+    ray: str = Field("auto", description="cluster of these workers, as train.ray (docs/ray.md)")
     out: str | None = Field(
         None, description="folder for metrics.json, plots and video; None: <run>/eval/<time>, of a script runs/..."
     )
@@ -97,7 +100,10 @@ def _evaluate(values: dict[str, Any]) -> int:
     out = make_folder(Path(options.out) if options.out else team.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
 
     order = sorted(makers, key=lambda name: ":" not in name)  # one's own first: should they fail, nothing is lost
-    episodes = {name: _fly(config, makers[name], name, options) for name in order}
+    with ExitStack() as stack:
+        if options.workers:
+            stack.enter_context(cluster(options.ray, options.workers))
+        episodes = {name: _fly(config, makers[name], name, options) for name in order}
     report = make_report(config, options.seed, episodes.pop(team.name), episodes)
     print(f"\n{team.source}: {options.episodes} episodes, seed {options.seed}; mean (95 % interval)\n")
     print(format_table(report, team.name))
@@ -150,7 +156,13 @@ def _fly(config: Config, maker: Any, name: str, options: Options) -> dict[str, n
     from tqdm import tqdm
 
     with tqdm(total=options.episodes, desc=name, unit="episode", leave=False) as bar:
-        return fly_episodes(config, maker, options.episodes, options.seed, progress=lambda n: bar.update(n - bar.n))
+
+        def progress(done: int) -> None:
+            bar.update(done - bar.n)
+
+        if options.workers:
+            return fly_apart(config, maker, options.episodes, options.seed, options.workers, progress)
+        return fly_episodes(config, maker, options.episodes, options.seed, progress=progress)
 
 
 def _draw(config: Config, makers: dict[str, Any], team: _Team, options: Options, out: Path) -> None:

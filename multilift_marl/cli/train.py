@@ -26,7 +26,10 @@ task=<other> takes another task than the configuration's: config=rigs/auto6 task
 them env.num_drones, sim, vehicle, payload, cable, control and wind of rigs/auto6, over them the keys given here.
 With --help, config=<name> and other keys show the values that they stand for."""
 
-_RESUMABLE = ("train.frames", "train.checkpoint_every", "eval.every", "eval.episodes", "env.num_threads", "import")
+_RESUMABLE = (
+    "train.frames", "train.checkpoint_every", "train.workers", "train.ray", "eval.every", "eval.episodes",
+    "env.num_threads", "import",
+)  # fmt: skip
 
 
 class Options(Section):

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from multilift_marl.config.files import pin_files
-from multilift_marl.config.schema import EvalConfig, RewardTerm, SystemConfig, TrainConfig
+from multilift_marl.config.schema import RewardTerm, SystemConfig
+from multilift_marl.config.train_schema import EvalConfig, TrainConfig
 from multilift_marl.rig.resolve import resolve_system
 from multilift_marl.rig.system import System
 

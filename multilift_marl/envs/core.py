@@ -172,12 +172,16 @@ class MultiliftVec:
         """Environments (E,) bool that must be reset before the next step."""
         return self._ended.copy()
 
-    def stagger(self) -> None:
+    def stagger(self, total: int | None = None) -> None:
         """Shorten the episodes in progress to evenly spread lengths, so that time limits no longer coincide.
 
         A learner then sees all phases of an episode in every batch.
+
+        Args:
+            total: environments among which these are those from `first_env` on; None: these are all.
         """
-        self.steps[:] = np.arange(self.num_envs) * self.max_steps // self.num_envs
+        first, total = (0, self.num_envs) if total is None else (self.first_env, total)
+        self.steps[:] = (first + np.arange(self.num_envs)) * self.max_steps // total
 
     def state(self) -> np.ndarray:
         """Return the global state (E, S) float32, which holds what is hidden from the drones."""
