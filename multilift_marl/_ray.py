@@ -36,6 +36,7 @@ def connect(address: str, workers: int, key: str) -> bool:
     except ModuleNotFoundError as error:
         raise ConfigError(f"workers need Ray; {pip_install('ray')}") from error
     if ray.is_initialized():
+        _check_size(ray, workers, key, "connected")
         return False
     if address == "auto":
         address = os.environ.get("RAY_ADDRESS") or "local"
@@ -48,11 +49,19 @@ def connect(address: str, workers: int, key: str) -> bool:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # Ray raises many kinds
         raise ConfigError(f"{key}={address} cannot be joined ({reason(error)}); set {key}=local") from error
+    try:
+        _check_size(ray, workers, key, address)
+    except ConfigError:
+        ray.shutdown()
+        raise
+    return True
+
+
+def _check_size(ray: Any, workers: int, key: str, address: str) -> None:
+    """Refuse more workers than a cluster has CPUs: they would wait for ever."""
     there = int(ray.cluster_resources().get("CPU", 0))
     if there < workers:
-        ray.shutdown()
         raise ConfigError(f"the cluster {key}={address} has {there} CPUs for {workers} workers; ask for fewer workers")
-    return True
 
 
 def disconnect() -> None:

@@ -5,6 +5,8 @@
   python results/reproduce.py evaluate [flight ...]     the same 1000 episodes of every learned team and every script
                                                         -> results/<flight>/<team>.json, .npz; also <flight>/<team>
                                                         for one team, workers=<processes> (as many as there are CPUs)
+  ... ray=local|<address>                               train or evaluate in processes of Ray, also of a cluster whose
+                                                        nodes share this folder (docs/ray.md)
   python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
   python results/reproduce.py table                     the tables of docs/
 
@@ -18,8 +20,9 @@ import csv
 import io
 import json
 import multiprocessing
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
@@ -32,6 +35,7 @@ from tables import write_tables
 
 from multilift_marl._files import write_whole
 from multilift_marl._platform import cpu_count
+from multilift_marl._ray import connect, disconnect
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
@@ -39,18 +43,28 @@ from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
 
-def train(recipe: str, seeds: list[int]) -> None:
-    """Train a recipe on some seeds and keep the result of each."""
+def train(recipe: str, seeds: list[int], workers: int, address: str) -> None:
+    """Train a recipe on some seeds and keep the result of each; with Ray, several at a time."""
+    if address:
+        for line in spread_by_ray(partial(train_seed, recipe), seeds, workers, address):
+            print(line, flush=True)
+    else:
+        for seed in seeds:
+            train_seed(recipe, seed)
+
+
+def train_seed(recipe: str, seed: int) -> str:
+    """Train a recipe on one seed and keep the result."""
     from multilift_marl.agents.trainer import new_run
 
-    for seed in seeds:
-        trainer = new_run(load_config(recipe, {"seed": seed}), recipe)
-        if not trainer.run():
-            sys.exit(
-                f"stopped; continue with: python train.py resume={trainer.folder}, then keep it with: "
-                f"python results/reproduce.py keep {recipe} {trainer.folder}"
-            )
-        keep(recipe, trainer.folder)
+    trainer = new_run(load_config(recipe, {"seed": seed}), recipe)
+    if not trainer.run():
+        sys.exit(
+            f"stopped; continue with: python train.py resume={trainer.folder}, then keep it with: "
+            f"python results/reproduce.py keep {recipe} {trainer.folder}"
+        )
+    keep(recipe, trainer.folder)
+    return f"{recipe}, seed {seed}: {trainer.seconds / 60:.1f} min"
 
 
 def keep(recipe: str, run: Path) -> None:
@@ -96,13 +110,50 @@ class Job(NamedTuple):
         return episodes.is_file() and metrics.is_file() and json.loads(metrics.read_text())["episodes"] == EPISODES
 
 
-def evaluate(flights: list[str], workers: int) -> None:
+def evaluate(flights: list[str], workers: int, address: str) -> None:
     """Evaluate the teams without results, one in each process at a time."""
     jobs = [job for each in flights for job in list_jobs(*each.split("/", 1)) if not job.done]
     jobs = list(dict.fromkeys(jobs))
+    if address:
+        for line in spread_by_ray(fly, jobs, workers, address):
+            print(line, flush=True)
+        return
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         for done in as_completed([pool.submit(fly, job) for job in jobs]):
             print(done.result(), flush=True)
+
+
+def spread_by_ray(function: Callable[[Any], str], jobs: list[Any], workers: int, address: str) -> Iterator[str]:
+    """Call `function` with each job in a process of Ray, at most `workers` at a time; yield results as they come."""
+    import ray
+    from ray import cloudpickle
+
+    owns = connect(address, workers, "ray")
+    waiting, running = [cloudpickle.dumps((function, job)) for job in jobs], list[Any]()
+    task = ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_call_here)
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                running.append(task.remote(waiting.pop(0), str(ROOT), str(HERE)))
+            done, running = ray.wait(running)
+            yield ray.get(done[0])
+    finally:
+        for each in running:  # an interrupted training saves its checkpoint
+            ray.cancel(each)
+        if running:
+            ray.wait(running, num_returns=len(running), timeout=60)
+        if owns:
+            disconnect()
+
+
+def _call_here(content: bytes, root: str, scripts: str) -> str:
+    """Call a pickled function with its job, in a process of Ray, as if it were one of this script."""
+    from ray import cloudpickle
+
+    os.chdir(root)
+    sys.path.insert(0, scripts)
+    function, job = cloudpickle.loads(content)
+    return str(function(job))
 
 
 def list_jobs(flight: str, only: str = "") -> list[Job]:
@@ -159,15 +210,17 @@ def ship(recipes: list[str]) -> None:
 
 def main(arguments: list[str]) -> None:
     """Run the named command."""
-    what, *rest = arguments or ["help"]
+    what, *rest = [each for each in arguments if "=" not in each] or ["help"]
+    options = dict(each.split("=", 1) for each in arguments if "=" in each)
+    workers, address = int(options.pop("workers", cpu_count())), options.pop("ray", "")
+    if options:
+        sys.exit(__doc__)
     if what == "train" and rest:
-        train(rest[0], [int(seed) for seed in rest[1:]] or [0])
+        train(rest[0], [int(seed) for seed in rest[1:]] or [0], workers, address)
     elif what == "keep" and len(rest) == 2:
         keep(rest[0], Path(rest[1]))
     elif what == "evaluate":
-        workers = [int(each.partition("=")[2]) for each in rest if each.startswith("workers=")]
-        flights = [each for each in rest if not each.startswith("workers=")]
-        evaluate(flights or list(FLIGHTS), workers[-1] if workers else cpu_count())
+        evaluate(rest or list(FLIGHTS), workers, address)
     elif what == "ship" and rest:
         ship(rest)
     elif what == "table":
@@ -177,4 +230,7 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except KeyboardInterrupt:
+        sys.exit(130)
