@@ -171,7 +171,6 @@ class MultiliftVec:
             np.logical_and(truncated, self.task.succeeded(), out=self.outcome.flags[2])
         if begin is not None:  # these were simulated on, unseen
             self.reset(mask=begin)
-            self.outcome.clear(begin)
         return self.outcome
 
     def current(self) -> tuple[np.ndarray, dict[str, Any]]:
@@ -194,6 +193,11 @@ class MultiliftVec:
         """
         first, total = (0, self.num_envs) if total is None else (self.first_env, total)
         self.steps[:] = (first + np.arange(self.num_envs)) * self.max_steps // total
+
+    @property
+    def drawn(self) -> dict[str, np.ndarray]:
+        """What `info["randomization"]` holds, read-only; another dict whenever an episode has started."""
+        return self._starts.drawn
 
     def state(self) -> np.ndarray:
         """Return the global state (E, S) float32, which holds what is hidden from the drones."""
@@ -263,6 +267,7 @@ class MultiliftVec:
         self._starts.load(mask)
         self.task.action[mask] = self.task.previous[mask] = 0.0
         self.steps[mask], self._ended[mask] = 0, False
+        self.outcome.clear(mask)
         for e in chosen:
             self._sensing.start_sensors(e)
             self.controller.start(e)
@@ -328,7 +333,7 @@ class MultiliftVec:
             "diverged": diverged,
             "failure_cause": self.outcome.cause * failure,
             "reward_terms": dict(zip(self.reward_terms, self.task.terms.T.copy(), strict=True)),
-            "randomization": self._starts.drawn.copy(),
+            "randomization": self.drawn.copy(),
         }
 
 

@@ -14,7 +14,7 @@ TAKEN, ENDED, NOT_FINITE = range(3)  # what becomes of actions
 
 
 class Outcome(NamedTuple):
-    """What the last step of E environments led to; live arrays."""
+    """What the last step of E environments led to, nothing where it was a reset; live arrays."""
 
     observation: np.ndarray
     """(E, N, D) float32."""
