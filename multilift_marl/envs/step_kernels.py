@@ -31,9 +31,7 @@ class Outcome(NamedTuple):
     def of(observation: np.ndarray, terms: np.ndarray) -> Outcome:
         """Return that of environments that were never stepped, from the live arrays of their task."""
         e, n = observation.shape[:2]
-        return Outcome(
-            observation, terms, np.zeros((e, n), np.float32), np.zeros((5, e), bool), np.zeros(e, np.int64)
-        )
+        return Outcome(observation, terms, np.zeros((e, n), np.float32), np.zeros((5, e), bool), np.zeros(e, np.int64))
 
     def clear(self, mask: np.ndarray) -> None:
         """Forget the last step of the environments in `mask` (E,)."""
