@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from typing import Any, ClassVar
 
 import numpy as np
 
+from multilift_marl._jit import bind
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
 from multilift_marl.control.controller import Controller
@@ -14,12 +16,13 @@ from multilift_marl.control.estimator import StateEstimator
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.envs.pipeline import Pipeline, Teams, describe_stages
+from multilift_marl.envs.step_kernels import ENDED, TAKEN, Outcome, end_step, take_actions
 from multilift_marl.errors import ConfigError
 from multilift_marl.rig.resolve import whole_ratio
 from multilift_marl.sim.saved import check_saved, fingerprint
-from multilift_marl.sim.world import World
+from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks import find_task
-from multilift_marl.tasks.failures import CAUSES, DIVERGED
+from multilift_marl.tasks.failures import CAUSES
 from multilift_marl.tasks.observations import observation_names
 from multilift_marl.tasks.sensing import Sensing
 
@@ -49,6 +52,7 @@ class MultiliftVec:
         seeds, episodes, steps: of the episodes in progress: seed, number, policy steps so far (E,) int64.
         world: the physics; `world.state` is the true state.
         controller: of the drones; `reference` is its reference.
+        outcome: what the last step led to; live arrays.
         task: the task; `task.goal` and `task.errors` say where the payload should be.
 
     Raises:
@@ -87,6 +91,12 @@ class MultiliftVec:
         self._starts = Episodes(config, self.world, self.task, self._sensing)
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
+        self.outcome = outcome = Outcome.of(self._stacked, self.task.terms)
+        self._given, self._halted = np.zeros_like(self.task.action), np.zeros(e, bool)
+        actions = self.task.action, self.task.previous
+        self._take_actions: Callable[[], Any] = bind(take_actions, self._given, self._halted, *actions)
+        counted = self.steps, self.max_steps, self._ended
+        self._end_step: Callable[[], Any] = bind(end_step, self.world.diverged, self.task.cause, *counted, outcome)
         self._checked = False  # whether all components were seen to be written
         self._bind()
         self._first_sense = self._sensing.bind_sense(self.task.view, first=True) if self._sensing.measures else None
@@ -145,27 +155,28 @@ class MultiliftVec:
             ValueError: wrong shape or dtype, or an action that is not finite.
             RuntimeError: an environment has ended and was not reset.
         """
-        begin = self._ended & restart & (self.episodes >= 0)
-        self._set_action(action, self._ended & ~begin)
-        self.world.run(lambda shard: self._pipelines[shard.lo].run())
+        outcome = self.step_live(action, restart)
+        terminated, truncated, *flags = outcome.flags.copy()
+        return outcome.observation.copy(), outcome.reward.copy(), terminated, truncated, self._info(*flags)
+
+    def step_live(self, action: np.ndarray, restart: bool = False) -> Outcome:
+        """Do as `step`, and return the live arrays of `outcome`, which the next step overwrites."""
+        begin = self._ended & (self.episodes >= 0) if restart and self._ended.any() else None
+        self._set_action(action, self._ended if begin is None else self._ended & ~begin)
+        self.world.run(self._run_shard)
         self.world.check_warnings()
-        self.steps += 1
-        if begin.any():  # these were simulated on, unseen
+        out_of_time = self._end_step()
+        if out_of_time:
+            truncated = self.outcome.flags[1]
+            np.logical_and(truncated, self.task.succeeded(), out=self.outcome.flags[2])
+        if begin is not None:  # these were simulated on, unseen
             self.reset(mask=begin)
-        diverged = self.world.diverged
-        if diverged.any():
-            self.task.cause[diverged], self.task.terms[diverged] = DIVERGED, 0.0
-        terminated = self.task.cause > 0
-        truncated = ~terminated & ~begin & (self.steps >= self.max_steps)
-        self._ended = terminated | truncated
-        reward = np.repeat(self.task.terms.sum(axis=1, dtype=np.float64)[:, None], self.num_drones, axis=1)
-        info = self._info(terminated, truncated)
-        return self._stacked.copy(), reward.astype(np.float32), terminated, truncated, info
+        return self.outcome
 
     def current(self) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observation (E, N, D) and info of the episodes in progress, as `reset` does, and change nothing."""
-        none = np.zeros(self.num_envs, bool)
-        return self._stacked.copy(), self._info(none, none)
+        success, failure = np.zeros((2, self.num_envs), bool)
+        return self._stacked.copy(), self._info(success, failure, self.world.diverged.copy())
 
     @property
     def ended(self) -> np.ndarray:
@@ -182,6 +193,11 @@ class MultiliftVec:
         """
         first, total = (0, self.num_envs) if total is None else (self.first_env, total)
         self.steps[:] = (first + np.arange(self.num_envs)) * self.max_steps // total
+
+    @property
+    def drawn(self) -> dict[str, np.ndarray]:
+        """What `info["randomization"]` holds, read-only; another dict whenever an episode has started."""
+        return self._starts.drawn
 
     def state(self) -> np.ndarray:
         """Return the global state (E, S) float32, which holds what is hidden from the drones."""
@@ -251,6 +267,7 @@ class MultiliftVec:
         self._starts.load(mask)
         self.task.action[mask] = self.task.previous[mask] = 0.0
         self.steps[mask], self._ended[mask] = 0, False
+        self.outcome.clear(mask)
         for e in chosen:
             self._sensing.start_sensors(e)
             self.controller.start(e)
@@ -281,7 +298,11 @@ class MultiliftVec:
         if self._first_delay is not None:
             self._first_delay(e, e + 1)
 
+    def _run_shard(self, shard: Shard) -> None:
+        self._pipelines[shard.lo].run()
+
     def _set_action(self, action: np.ndarray, ended: np.ndarray) -> None:
+        """Take actions (E, N, A) unless an environment in `ended` (E,) cannot go on, or one of them cannot be."""
         action = np.asarray(action)
         if action.shape != self.task.action.shape:
             raise ValueError(
@@ -289,27 +310,30 @@ class MultiliftVec:
             )
         if action.dtype.kind != "f":
             raise ValueError(f"action has dtype {action.dtype}, expected floating point numbers in [-1, 1]")
-        if ended.any():
+        np.copyto(self._given, action)
+        self._halted[:] = ended
+        taken = self._take_actions()
+        if taken == TAKEN:
+            return
+        if taken == ENDED:
             raise RuntimeError(
                 f"environment {int(np.argmax(ended))} has ended or was never reset: call reset(mask=...) first"
             )
-        if not np.isfinite(action).all():
-            e, n, k = np.argwhere(~np.isfinite(action))[0]
-            raise ValueError(
-                f"action of drone_{n} in environment {e} is not finite ({self.action_names[k]}={action[e, n, k]}); "
-                "look for NaN in the policy"
-            )
-        self.task.previous[:] = self.task.action
-        np.clip(action, -1.0, 1.0, out=self.task.action, casting="same_kind")
+        e, n, k = np.argwhere(~np.isfinite(action))[0]
+        raise ValueError(
+            f"action of drone_{n} in environment {e} is not finite ({self.action_names[k]}={action[e, n, k]}); "
+            "look for NaN in the policy"
+        )
 
-    def _info(self, terminated: np.ndarray, truncated: np.ndarray) -> dict[str, Any]:
+    def _info(self, success: np.ndarray, failure: np.ndarray, diverged: np.ndarray) -> dict[str, Any]:
+        """Return info of the last step with these flags (E,), of which those of failures are of that step or none."""
         return {
-            "success": truncated & self.task.succeeded(),
-            "failure": terminated.copy(),
-            "diverged": self.world.diverged.copy(),
-            "failure_cause": np.where(terminated, self.task.cause, 0),
-            "reward_terms": {name: self.task.terms[:, i].copy() for i, name in enumerate(self.reward_terms)},
-            "randomization": self._starts.drawn.copy(),
+            "success": success,
+            "failure": failure,
+            "diverged": diverged,
+            "failure_cause": self.outcome.cause * failure,
+            "reward_terms": dict(zip(self.reward_terms, self.task.terms.T.copy(), strict=True)),
+            "randomization": self.drawn.copy(),
         }
 
 

@@ -80,10 +80,10 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             ValueError: a negative seed, an unknown option or one that cannot be.
         """
         seed_afresh(self.vec)
-        observation, info = self.vec.reset(seed, options=options)
+        observation, _ = self.vec.reset(seed, options=options)
         self._pictures.show()
         super().reset(seed=seed)  # for wrappers that draw from np_random; nothing here does
-        return observation.reshape(-1), solo_info(self.vec, info)
+        return observation.reshape(-1), solo_info(self.vec)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance the episode by one policy step.
@@ -101,10 +101,11 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.vec.ended[0]:
             raise RuntimeError("the episode has ended or none was started: call reset() before step()")
         joint = _split(self.vec, action, self.action_space)
-        observation, reward, terminated, truncated, info = self.vec.step(joint)
+        outcome = self.vec.step_live(joint)
         self._pictures.show()
-        mean = float(mean_reward(reward)[0])
-        return observation.reshape(-1), mean, bool(terminated[0]), bool(truncated[0]), solo_info(self.vec, info)
+        mean = float(mean_reward(outcome.reward)[0])
+        terminated, truncated = outcome.flags[:2, 0].tolist()
+        return outcome.observation.flatten(), mean, terminated, truncated, solo_info(self.vec)
 
     def render(self) -> np.ndarray | None:
         """Return a picture (H, W, 3) uint8 of the team and its target; None with "human", which shows every step.

@@ -60,7 +60,9 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         self.action_spaces = {name: Box(-1.0, 1.0, (vec.action_size,), np.float32) for name in names}
         self.state_space = Box(*unbounded, (vec.state_size,), np.float32)
         self._joint = np.zeros((1, vec.num_drones, vec.action_size))
-        self._term_names = [f"reward_terms.{name}" for name in vec.reward_terms]
+        flags = ("success", "failure", "diverged", "failure_cause")
+        self._info_names = (*flags, *(f"reward_terms.{name}" for name in vec.reward_terms))
+        self._drawn: dict[str, np.ndarray] | None = None  # of the episode of which `_draw` is the draw
         self._pictures = FrameRenderer(vec, render_mode)
 
     def reset(
@@ -80,10 +82,10 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         """
         options = {name: value for name, value in (options or {}).items() if name != "options"}  # of PettingZoo's test
         seed_afresh(self.vec)
-        observation, info = self.vec.reset(seed, options=options)
+        observation, _ = self.vec.reset(seed, options=options)
         self.agents = self.possible_agents.copy()
         self._pictures.show()
-        return dict(zip(self.agents, observation[0], strict=True)), self._infos(info)
+        return dict(zip(self.agents, observation[0], strict=True)), self._infos()
 
     def step(
         self, actions: dict[str, np.ndarray]
@@ -106,7 +108,8 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
             raise RuntimeError("the episode has ended or none was started: call reset() before step()")
         if len(actions) != len(agents):
             raise self._mismatch(actions)
-        shape = self._joint.shape[2:]
+        joint = self._joint[0]
+        shape = joint.shape[1:]
         for n, name in enumerate(self.possible_agents):
             if name not in actions:
                 raise self._mismatch(actions)
@@ -116,18 +119,18 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
                     f"action of {name} has shape {action.shape} and dtype {action.dtype}, expected {shape} "
                     "floating point numbers in [-1, 1]"
                 )
-            self._joint[0, n] = action
-        observation, reward, terminated, truncated, info = self.vec.step(self._joint)
-        over, out_of_time = bool(terminated[0]), bool(truncated[0])
+            joint[n] = action
+        outcome = self.vec.step_live(self._joint)
+        over, out_of_time = outcome.flags[:2, 0].tolist()
         if over or out_of_time:
             self.agents = []
         self._pictures.show()
         return (
-            dict(zip(agents, observation[0], strict=True)),
-            dict(zip(agents, reward[0].tolist(), strict=True)),
+            dict(zip(agents, outcome.observation[0].copy(), strict=True)),
+            dict(zip(agents, outcome.reward[0].tolist(), strict=True)),
             dict.fromkeys(agents, over),
             dict.fromkeys(agents, out_of_time),
-            self._infos(info),
+            self._infos(),
         )
 
     def state(self) -> np.ndarray:
@@ -155,15 +158,26 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         """Free renderer and window; the environment itself holds nothing that must be closed."""
         self._pictures.close()
 
-    def _infos(self, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    def _infos(self) -> dict[str, dict[str, Any]]:
         """Return a dict for each agent; nothing in it is shared, so that wrappers may write into theirs."""
-        values: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
-        values["failure_cause"] = int(info["failure_cause"][0])
-        terms = info["reward_terms"].values()
-        values |= {name: float(array[0]) for name, array in zip(self._term_names, terms, strict=True)}
-        values |= {f"randomization.{name}": array[0] for name, array in info["randomization"].items()}
-        arrays = {key: value for key, value in values.items() if isinstance(value, np.ndarray)}  # can be written into
-        return {name: values | {key: array.copy() for key, array in arrays.items()} for name in self.possible_agents}
+        vec = self.vec
+        if self._drawn is not vec.drawn:
+            self._drawn, self._draw = vec.drawn, self._name_draw(vec.drawn)
+        draw, arrays = self._draw
+        outcome = vec.outcome
+        values = [*outcome.flags[2:, 0].tolist(), int(outcome.cause[0]), *outcome.terms[0].tolist()]
+        common = dict(zip(self._info_names, values, strict=True)) | draw
+        own = zip(*(array.copy() for array in arrays.values()), strict=True)  # can be written into
+        return {
+            name: common | dict(zip(arrays, rows, strict=True))
+            for name, rows in zip(self.possible_agents, own, strict=True)
+        }
+
+    def _name_draw(self, drawn: dict[str, np.ndarray]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Return an episode's draw as infos name it, and those of it that are arrays, with a row for each agent."""
+        draw = {f"randomization.{name}": array[0] for name, array in drawn.items()}
+        arrays = {name: value for name, value in draw.items() if isinstance(value, np.ndarray)}
+        return draw, {name: np.stack([value] * len(self.possible_agents)) for name, value in arrays.items()}
 
     def _mismatch(self, actions: dict[str, Any]) -> ValueError:
         for name in self.possible_agents:

@@ -104,9 +104,11 @@ class MultiliftSB3VecEnv(VecEnv):
         if self._actions.shape != self._shape:
             raise ValueError(f"actions have shape {self._actions.shape}, expected {self._shape} (rows, numbers)")
         joint = self._actions.reshape(vec.num_envs, vec.num_drones, vec.action_size)
-        observation, reward, terminated, truncated, info = vec.step(joint)
+        outcome = vec.step_live(joint)
+        observation, reward = outcome.observation.copy(), outcome.reward.copy()
         reward = reward.reshape(-1) if self.shared else mean_reward(reward).astype(np.float32)
-        over = terminated | truncated
+        _, truncated, success, *_ = outcome.flags
+        over = vec.ended
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if over.any():
             last = self._by_row(observation)
@@ -115,8 +117,8 @@ class MultiliftSB3VecEnv(VecEnv):
                 infos[row] = {
                     "terminal_observation": last[row],
                     "TimeLimit.truncated": bool(truncated[e]),
-                    "is_success": bool(info["success"][e]),
-                    "failure_cause": vec.failure_causes[info["failure_cause"][e]],
+                    "is_success": bool(success[e]),
+                    "failure_cause": vec.failure_causes[outcome.cause[e]],
                 }
             observation, _ = vec.reset(mask=over)
         return self._by_row(observation), reward, over.repeat(self._rows), infos

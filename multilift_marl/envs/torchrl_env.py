@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -77,17 +78,19 @@ class MultiliftEnv(EnvBase):
             seed, self._seed, self._resumed = self._seed, None, False
             observation, info = self.vec.reset(seed, None if mask is None else mask.reshape(-1).numpy())
         ended = torch.from_numpy(self.vec.ended).unsqueeze(-1)  # of environments that this reset leaves alone
-        package = self._package(observation, info, ended & self._terminated, ended & ~self._terminated)
+        flags = [torch.from_numpy(info[key]).unsqueeze(-1) for key in ("success", "failure", "diverged")]
+        package = self._package(observation, [ended & self._terminated, ended & ~self._terminated, *flags])
         if mask is None and self._memory is not None:
             package["agents", "memory"] = self._memory
         return package
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["agents", "action"].detach().numpy()
-        observation, reward, terminated, truncated, info = self.vec.step(action)
+        outcome = self.vec.step_live(action)
         self._resumed = False
-        self._terminated = torch.from_numpy(terminated).unsqueeze(-1)
-        return self._package(observation, info, self._terminated, torch.from_numpy(truncated).unsqueeze(-1), reward)
+        flags = torch.from_numpy(outcome.flags.copy()).unsqueeze(-1).unbind()
+        self._terminated = flags[0]
+        return self._package(outcome.observation.copy(), flags, outcome.reward.copy())
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Skip what EnvBase completes and reshapes after a step: `_package` gives all of it."""
@@ -115,20 +118,21 @@ class MultiliftEnv(EnvBase):
         return fresh
 
     def _package(
-        self, observation: np.ndarray, info: dict[str, Any], terminated: torch.Tensor, truncated: torch.Tensor,
-        reward: np.ndarray | None = None,
-    ) -> TensorDict:  # fmt: skip
+        self, observation: np.ndarray, flags: Sequence[torch.Tensor], reward: np.ndarray | None = None
+    ) -> TensorDict:
+        """Return what the core tells, of which nothing changes later; `flags` (E, 1) as `Outcome` lists them."""
         e, n = self.vec.num_envs, self.vec.num_drones
+        terminated, truncated, success, failure, diverged = flags
         agents = {"observation": torch.from_numpy(observation)}
         if reward is not None:
             agents["reward"] = torch.from_numpy(reward).unsqueeze(-1)
-        flags = {key: torch.from_numpy(info[key]).unsqueeze(-1) for key in ("success", "failure", "diverged")}
-        terms = torch.from_numpy(self.vec.task.terms.astype(np.float32))
+        terms = torch.from_numpy(self.vec.outcome.terms.astype(np.float32))
+        info = {"success": success, "failure": failure, "diverged": diverged, "reward_terms": terms}
         return _unchecked(
             {
                 "agents": _unchecked(agents, e, n),
                 "state": torch.from_numpy(self.vec.state()),
-                "info": _unchecked({**flags, "reward_terms": terms}, e),
+                "info": _unchecked(info, e),
                 "done": terminated | truncated,
                 "terminated": terminated,
                 "truncated": truncated,

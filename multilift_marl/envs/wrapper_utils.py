@@ -15,6 +15,7 @@ from multilift_marl.errors import nearest
 from multilift_marl.rendering import Renderer, Window
 
 BATCH_RENDER_MODES = ("rgb_array",)  # of many environments
+_FLAGS = ("success", "failure", "diverged")
 RENDER_MODES = (*BATCH_RENDER_MODES, "human")
 
 
@@ -102,15 +103,16 @@ def mean_reward(reward: np.ndarray) -> np.ndarray:
     return reward.mean(axis=1, dtype=np.float64)
 
 
-def solo_info(vec: MultiliftVec, info: dict[str, Any]) -> dict[str, Any]:
-    """Return the info of the only environment of `vec` in plain values.
+def solo_info(vec: MultiliftVec) -> dict[str, Any]:
+    """Return the info of the last step or reset of the only environment of `vec` in plain values.
 
     Returns:
         `success`, `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms`
         {name: float} and `randomization` {name: array}.
     """
-    values: dict[str, Any] = {key: bool(info[key][0]) for key in ("success", "failure", "diverged")}
-    values["failure_cause"] = vec.failure_causes[info["failure_cause"][0]]
-    values["reward_terms"] = dict(zip(vec.reward_terms, vec.task.terms[0].tolist(), strict=True))
-    values["randomization"] = {name: array[0].copy() for name, array in info["randomization"].items()}
+    outcome = vec.outcome
+    values: dict[str, Any] = dict(zip(_FLAGS, outcome.flags[2:, 0].tolist(), strict=True))
+    values["failure_cause"] = vec.failure_causes[outcome.cause[0]]
+    values["reward_terms"] = dict(zip(vec.reward_terms, outcome.terms[0].tolist(), strict=True))
+    values["randomization"] = {name: array[0].copy() for name, array in vec.drawn.items()}
     return values

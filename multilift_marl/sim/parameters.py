@@ -126,24 +126,26 @@ def make_inertias(system: System, parameters: Parameters) -> Inertias:
     e, n = parameters.vehicle_mass.shape
     b = 1 + n
     inertias = Inertias(np.zeros((e, b)), np.zeros((e, b, 3, 3)), np.zeros((e, b, 3, 3)), np.zeros((e, b, 3)))
-    update_inertias(inertias, system, parameters)
+    update_inertias(inertias, system, parameters, np.ones(e, bool))
     return inertias
 
 
-def update_inertias(inertias: Inertias, system: System, parameters: Parameters) -> None:
-    """Bring inertias into line with parameters."""
-    inertias.mass[:, 0] = parameters.payload_mass
-    inertias.mass[:, 1:] = parameters.vehicle_mass
-    inertias.center[:, 0] = parameters.payload_center_of_mass
+def update_inertias(inertias: Inertias, system: System, parameters: Parameters, mask: np.ndarray) -> None:
+    """Bring the inertias of the environments in `mask` (E,) into line with their parameters."""
+    payload_mass, vehicle_mass = parameters.payload_mass[mask], parameters.vehicle_mass[mask]
+    inertias.mass[mask, 0] = payload_mass
+    inertias.mass[mask, 1:] = vehicle_mass
+    inertias.center[mask, 0] = parameters.payload_center_of_mass[mask]
     axes = np.reshape(quat_to_mat(*system.payload_axes.tolist()), (3, 3))
-    scale = parameters.payload_mass / system.payload_mass * parameters.payload_inertia
-    inertias.inertia[:, 0] = scale[:, None, None] * (axes * system.payload_inertia @ axes.T)
-    for i, vehicle in enumerate(system.vehicles):
-        own = parameters.vehicle_mass[:, i] / vehicle.mass
-        inertias.inertia[:, 1 + i] = own[:, None, None] * np.diag(vehicle.inertia)
-    inertias.inverse[:, 1:] = np.linalg.inv(inertias.inertia[:, 1:])
+    scale = payload_mass / system.payload_mass * parameters.payload_inertia[mask]
+    payload = scale[:, None, None] * (axes * system.payload_inertia @ axes.T)
+    own = vehicle_mass / np.array([vehicle.mass for vehicle in system.vehicles])
+    drones = own[:, :, None, None] * np.array([np.diag(vehicle.inertia) for vehicle in system.vehicles])
+    inertias.inertia[mask, 0] = payload
+    inertias.inertia[mask, 1:] = drones
+    inertias.inverse[mask, 1:] = np.linalg.inv(drones)
     if system.payload_shape != "point":
-        inertias.inverse[:, 0] = np.linalg.inv(inertias.inertia[:, 0])
+        inertias.inverse[mask, 0] = np.linalg.inv(payload)
 
 
 def check_parameters(system: System, old: Parameters, mask: np.ndarray, values: dict[str, np.ndarray]) -> None:

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from multilift_marl._jit import bind
+from multilift_marl._jit import bind, kernel
 from multilift_marl._platform import cpu_count
 from multilift_marl.rig.constants import make_drones
 from multilift_marl.rig.system import System
@@ -62,6 +62,8 @@ class Shard:
     """`contact.find_fast` of these environments."""
     fast: np.ndarray
     """(hi - lo,) bool, environments in which bodies approach each other fast."""
+    find_warnings: Callable[[], None]
+    """`find_warnings` of these environments."""
 
 
 class World:
@@ -212,7 +214,7 @@ class World:
             return
         if self._varied is not None and "vehicle_rotor_time_constant" in names:
             write_lags(self._varied, self.system, self.parameters, changed)
-        update_inertias(self._inertias, self.system, self.parameters)
+        update_inertias(self._inertias, self.system, self.parameters, changed)
         self.cable_model.update_cables(self.cables, self.system, self.parameters)
         for shard in self.shards:
             mask = changed[shard.lo : shard.hi]
@@ -250,8 +252,7 @@ class World:
     def check_warnings(self) -> None:
         """Mark environments for which MuJoCo has counted a warning as diverged."""
         for shard in self.shards:
-            if shard.batch.warning.any():
-                self.diverged[shard.lo : shard.hi] |= shard.batch.warning[:, :, 1].any(axis=1)
+            shard.find_warnings()
 
     def qpos(self, env: int) -> np.ndarray:
         """Return MuJoCo's generalised coordinates (nq,) of one environment; ValueError if there is none such."""
@@ -333,8 +334,24 @@ class World:
             fast = np.zeros(hi - lo, bool)
             find = bind(find_fast, lo, self.state, fast, radii, self.system.timestep)
             broken = np.zeros((hi - lo, self.num_drones), bool)
-            shards.append(Shard(lo, hi, batch, rows, apply, advance, read, broken, find, fast))
+            warnings = bind(find_warnings, lo, batch.warning, self.diverged)
+            shards.append(Shard(lo, hi, batch, rows, apply, advance, read, broken, find, fast, warnings))
         return shards
+
+
+@kernel
+def find_warnings(lo, warning, diverged):
+    """Mark environments from `lo` on for which MuJoCo has counted a warning as diverged.
+
+    Args:
+        lo: the first of the environments.
+        warning: of each, what MuJoCo warned of last and how often it has (environments, kinds, 2).
+        diverged: (E,) bool, written.
+    """
+    for i in range(warning.shape[0]):
+        for kind in range(warning.shape[1]):
+            if warning[i, kind, 1] != 0:
+                diverged[lo + i] = True
 
 
 def _quiet_mujoco() -> None:
