@@ -33,14 +33,20 @@ def is_inner() -> bool:
 
 
 class Library(JITCodeLibrary):
-    """The machine code of a kernel that Python calls."""
+    """The machine code of a kernel that Python calls.
+
+    Attributes:
+        quick: whether to optimise less.
+    """
+
+    quick = False
 
     def _optimize_functions(self, ll_module: Any) -> None:
         """Leave this to the optimisation of the whole."""
         ll_module.data_layout = self._codegen._data_layout
 
     def _optimize_final_module(self) -> None:
-        manager, builder = self._codegen._module_pass_manager()
+        manager, builder = self._codegen._module_pass_manager(**({"opt": 1} if self.quick else {}))
         manager.run(self._final_module, builder)
 
 
@@ -63,14 +69,24 @@ class InnerLibrary(Library):
         return self.name, "inner", self._get_module_for_linking().as_bitcode()
 
 
+class _QuickLibrary(Library):
+    quick = True
+
+
 class _Pipeline(Compiler):
     """Numba's compiler, with libraries of ours."""
 
+    library_type: type[Library] = Library
+
     def compile_extra(self, func: Any) -> Any:
-        kind = InnerLibrary if self.state.flags.no_compile else Library
+        kind = InnerLibrary if self.state.flags.no_compile else self.library_type
         self.state.library = kind(self.state.targetctx.codegen(), func.__qualname__)
         self.state.library.enable_object_caching()
         return super().compile_extra(func)
+
+
+class _QuickPipeline(_Pipeline):
+    library_type = _QuickLibrary
 
 
 class _KernelCompiler(_FunctionCompiler):
@@ -126,11 +142,17 @@ def as_inner(compiled: Any) -> Any:
 
 
 class Kernel(CPUDispatcher):
-    """A compiled function."""
+    """A compiled function.
 
-    def __init__(self, py_func: Any, locals: Any = None, targetoptions: Any = None):
-        super().__init__(py_func, locals, targetoptions, _Pipeline)
-        self._compiler: Any = _KernelCompiler(py_func, self.targetdescr, self.targetoptions, self.locals, _Pipeline)
+    Args:
+        py_func, locals, targetoptions: as Numba takes them.
+        quick: optimise less, where the kernel is about as fast then (within 2 % for observations, rewards, errors).
+    """
+
+    def __init__(self, py_func: Any, locals: Any = None, targetoptions: Any = None, quick: bool = False):
+        pipeline = _QuickPipeline if quick else _Pipeline
+        super().__init__(py_func, locals, targetoptions, pipeline)
+        self._compiler: Any = _KernelCompiler(py_func, self.targetdescr, self.targetoptions, self.locals, pipeline)
 
     def add_overload(self, cres: Any) -> None:
         """Keep what was compiled; Python finds what has machine code alone."""

@@ -34,7 +34,7 @@ def drawing(function: F) -> F:
 
     Otherwise each call would keep its generator alive, 2.9 kB.
     """
-    return _compile(function, makes_arrays=True)
+    return _compile(function, makes_arrays=True, quick=True)
 
 
 def inlined(function: F) -> F:
@@ -49,14 +49,14 @@ def _is_ours(module: str) -> bool:
     return module.startswith("multilift_marl.")
 
 
-def _compile(function: F, makes_arrays: bool | None = None, **options: Any) -> F:
+def _compile(function: F, makes_arrays: bool | None = None, quick: bool = False, **options: Any) -> F:
     """Compile a function; only those of other packages may make arrays."""
     if makes_arrays is None:
         makes_arrays = not _is_ours(function.__module__)
     if _UNCOMPILED:
         return function
     flags: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    dispatcher: Any = Kernel(function, targetoptions={**flags, "_nrt": makes_arrays, **options})
+    dispatcher: Any = Kernel(function, targetoptions={**flags, "_nrt": makes_arrays, **options}, quick=quick)
     dispatcher._cache = make_cache(function)
     return cast(F, dispatcher)
 
@@ -88,7 +88,7 @@ def _compose(name: str, source: str, functions: tuple[tuple[str, Callable[..., A
     digests = [sources_digest(module) for module in ours]
     named = [f"{key} {each.__module__}.{each.__qualname__}" for key, each in functions]
     function._sources = "\0".join([source, *digests, *named])  # read by the cache
-    return _compile(function, makes_arrays=len(ours) < len(modules))
+    return _compile(function, makes_arrays=len(ours) < len(modules), quick=True)
 
 
 def _compiled(kernel: Any, types: tuple[Any, ...]) -> Callable[..., Any]:
