@@ -185,9 +185,11 @@ def compile_backwards() -> None:
 
 def _hear(theirs: set[str]) -> None:
     """Note the kernels that the other process compiles; end with it."""
-    for line in sys.stdin:
-        theirs.add(line.rstrip("\n"))
-    os._exit(0)
+    try:
+        for line in sys.stdin:
+            theirs.add(line.rstrip("\n"))
+    finally:
+        os._exit(0)
 
 
 def _list_kernels(config: Any) -> list[Any]:
