@@ -9,8 +9,9 @@ from functools import cache, partial
 from operator import itemgetter
 from typing import Any, TypeVar, TypeVarTuple, cast
 
-from numba import config, int64, njit, typeof
+from numba import config, int64, typeof
 
+from multilift_marl._compiler import Kernel, record
 from multilift_marl._kernel_cache import make_cache, sources_digest
 
 _UNCOMPILED: bool = config.DISABLE_JIT  # type: ignore[attr-defined]
@@ -33,7 +34,7 @@ def drawing(function: F) -> F:
 
     Otherwise each call would keep its generator alive, 2.9 kB.
     """
-    return _compile(function, makes_arrays=True)
+    return _compile(function, makes_arrays=True, quick=True)
 
 
 def inlined(function: F) -> F:
@@ -48,14 +49,15 @@ def _is_ours(module: str) -> bool:
     return module.startswith("multilift_marl.")
 
 
-def _compile(function: F, makes_arrays: bool | None = None, **options: Any) -> F:
+def _compile(function: F, makes_arrays: bool | None = None, quick: bool = False, **options: Any) -> F:
     """Compile a function; only those of other packages may make arrays."""
     if makes_arrays is None:
         makes_arrays = not _is_ours(function.__module__)
-    flags: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": makes_arrays}
-    dispatcher: Any = njit(**flags, **options)(function)
-    if not _UNCOMPILED:  # else it is the function itself
-        dispatcher._cache = make_cache(function)
+    if _UNCOMPILED:
+        return function
+    flags: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    dispatcher: Any = Kernel(function, targetoptions={**flags, "_nrt": makes_arrays, **options}, quick=quick)
+    dispatcher._cache = make_cache(function)
     return cast(F, dispatcher)
 
 
@@ -86,7 +88,15 @@ def _compose(name: str, source: str, functions: tuple[tuple[str, Callable[..., A
     digests = [sources_digest(module) for module in ours]
     named = [f"{key} {each.__module__}.{each.__qualname__}" for key, each in functions]
     function._sources = "\0".join([source, *digests, *named])  # read by the cache
-    return _compile(function, makes_arrays=len(ours) < len(modules))
+    return _compile(function, makes_arrays=len(ours) < len(modules), quick=True)
+
+
+def _compiled(kernel: Any, types: tuple[Any, ...]) -> Callable[..., Any]:
+    """Return what a kernel is for these types; while calls are recorded, the kernel itself."""
+    if record(kernel, types):
+        return kernel
+    kernel.compile(types)
+    return kernel.overloads[types].entry_point
 
 
 def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Callable[[], None]:
@@ -98,9 +108,7 @@ def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Ca
     call = partial(function, *arguments)
     if not _UNCOMPILED:
         types = tuple(typeof(argument) for argument in arguments)
-        compiled: Any = function  # Numba's dispatcher
-        compiled.compile(types)
-        call = partial(compiled.overloads[types].entry_point, *arguments)
+        call = partial(_compiled(function, types), *arguments)
     call.__name__ = function.__name__  # type: ignore[attr-defined]
     return call  # type: ignore[return-value]
 
@@ -114,9 +122,7 @@ def prebind(function: Callable[..., object], *arguments: Any) -> Callable[[int, 
     """Do as `bind` for a kernel whose first two arguments, the environments `lo` to `hi`, are still to be given."""
     if not _UNCOMPILED:
         types = (int64, int64, *(typeof(argument) for argument in arguments))
-        compiled: Any = function
-        compiled.compile(types)
-        function = compiled.overloads[types].entry_point
+        function = _compiled(function, types)
 
     def call(lo: int, hi: int) -> None:
         function(lo, hi, *arguments)

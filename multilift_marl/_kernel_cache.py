@@ -30,7 +30,9 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.core.types import BaseNamedTuple
 
+from multilift_marl._compiler import is_inner, rebuild_inner
 from multilift_marl._files import write_whole
+from multilift_marl._precompile import end, wait_for
 from multilift_marl.errors import warn_once
 
 PACKAGE = Path(__file__).parent
@@ -185,11 +187,16 @@ class KernelCache(NumbaCache):
         self._folder, self._function = folder, function
         self._cache_path = str(folder)
 
+    def path(self, sig: Any, target_context: Any) -> Path:
+        """Return the file of what Python calls with these types."""
+        return self._path(self._index_key(sig, target_context.codegen()))
+
     def _path(self, key: Any) -> Path:
         """Return the file of a signature: kernel, types, processor and Python in its name."""
         code = self._function.__code__
         written = getattr(self._function, "_sources", "")  # see `_jit.compose`
-        parts = (repr(key), repr(_fields(key[0])), sys.version, foreign_digest(self._function), written)
+        kind = "inner" if is_inner() else ""
+        parts = (repr(key), repr(_fields(key[0])), sys.version, foreign_digest(self._function), written, kind)
         digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
         name = "".join(c if c.isalnum() else "_" for c in self._function.__qualname__)[-40:]
         return self._folder / f"{name}-{code.co_firstlineno}-{digest}.kernel"
@@ -198,7 +205,12 @@ class KernelCache(NumbaCache):
         """Return what was compiled for these types; None, and a line that says so, if it must be compiled now."""
         if not self._enabled:
             return None
-        found = self._read(self._index_key(sig, target_context.codegen()), target_context)
+        key = self._index_key(sig, target_context.codegen())
+        found = self._read(key, target_context)
+        if is_inner():
+            return found
+        if found is None and wait_for(self._path(key), self._function.__name__):
+            found = self._read(key, target_context)
         if found is None:
             warn_once("kernels", "compiling kernels of the simulation for the first time, which takes up to a minute")
         return found
@@ -210,12 +222,15 @@ class KernelCache(NumbaCache):
             if hashlib.sha256(content).digest() != checksum:
                 return None
             stored, data = pickle.loads(content)
-            return self._impl.rebuild(target_context, data) if stored == key else None
+            rebuild = rebuild_inner if is_inner() else self._impl.rebuild
+            return rebuild(target_context, data) if stored == key else None
         except Exception:  # missing, unreadable, or from another version of Numba: compile again
             return None
 
     def _save_overload(self, sig: Any, data: Any) -> None:
         """Keep what was compiled; what cannot be written is not kept."""
+        if not is_inner():
+            end()
         if not self._impl.check_cachable(data):
             return
         key = self._index_key(sig, data.codegen)

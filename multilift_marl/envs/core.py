@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from multilift_marl import _precompile
 from multilift_marl._jit import bind
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
@@ -65,6 +66,7 @@ class MultiliftVec:
         if first_env < 0:
             raise ConfigError(f"first_env must not be negative, but is {first_env}")
         kind = find_task(config.task)
+        _precompile.offer(config)
         self.config, self.purpose, self.first_env = config, purpose, first_env
         self.num_envs, self.num_drones = config.env.num_envs, config.system.num_drones
         e = self.num_envs
@@ -102,6 +104,7 @@ class MultiliftVec:
         self._first_sense = self._sensing.bind_sense(self.task.view, first=True) if self._sensing.measures else None
         delays = self._sensing.delays_observation
         self._first_delay = self._sensing.bind_delay(observation) if delays else None
+        _precompile.offer(None)
 
     def reset(
         self, seed: int | None = None, mask: np.ndarray | None = None, options: dict[str, Any] | None = None
