@@ -117,12 +117,13 @@ _FALCON = Vehicle(
 # Mass, inertia, arm, torque ratio, no drag: IMRCLab/col-trans, sim/config/initialize.yaml. Its inertia is that of
 # Förster, "System identification of the Crazyflie 2.0", ETH Zurich 2015, which is also where the thrust coefficient
 # comes from (as quoted by gsilano/CrazyS, rotors_description/urdf/crazyflie2.xacro). Thrust limit: CrazyMARL (arXiv
-# 2509.14126), whose episodes draw 0.105 to 0.15 N. Motor lag: assumed. 0.15/4 s is a value that
-# viktorlorentz/crazyMARL keeps as a comment (crazymarl/configs/multi_quad_config.py); it lies between CrazyS, 0.0125 s
-# up and 0.025 s down, the numbers of RotorS' hummingbird, and those for which this controller is too slow: 0.15 s, with
-# which CrazyMARL and arplaboratory/learning-to-fly train, and 0.145 s of `crazyflie_id`, identified. docs/vehicles.md
-# says what the choice does. Idle speed: stated by none of them, assumed zero. Rotor radius: utiasDSL/gym-pybullet-
-# drones, gym_pybullet_drones/assets/cf2x.urdf, here and below. Rotor inertia: drone-models (see below), cf2x_P250.
+# 2509.14126), whose episodes draw 0.119 to 0.14 N (commit 4bcf7e6; 0.105 to 0.15 N at 02d5761). Motor lag: assumed.
+# 0.15/4 s is a value that viktorlorentz/crazyMARL keeps as a comment (crazymarl/configs/multi_quad_config.py, commit
+# 1b10731); it lies between CrazyS, 0.0125 s up and 0.025 s down, the numbers of RotorS' hummingbird, and those for
+# which this controller is too slow: 0.15 s of CrazyMARL at 02d5761 and of arplaboratory/learning-to-fly, and 0.145 s of
+# `crazyflie_id`, identified. docs/vehicles.md says what the choice does. Idle speed: stated by none of them, assumed
+# zero. Rotor radius: utiasDSL/gym-pybullet-drones, gym_pybullet_drones/assets/cf2x.urdf, here and below. Rotor inertia:
+# drone-models (see below), cf2x_P250.
 _CRAZYFLIE = Vehicle(
     name="crazyflie",
     mass=0.034,
