@@ -79,7 +79,8 @@ def train(iterations: int = 100, horizon: int = 64, trials: int = 8, arguments: 
     finally:
         if owns:
             disconnect()
-    for result in sorted(results, key=lambda each: -each.metrics.get("score", -1e9)):
+    finished = [result for result in results if "score" in (result.metrics or {})]  # others broke
+    for result in sorted(finished, key=lambda each: -each.metrics["score"]):
         searched = {key: result.config[key] for key in space if key not in sizes}
         print(f"success {result.metrics['success']:.1%}, {100 * result.metrics['error']:.2f} cm: {searched}")
     best = Path(results.get_best_result().metrics["run"])
