@@ -46,8 +46,13 @@ class Library(JITCodeLibrary):
         ll_module.data_layout = self._codegen._data_layout
 
     def _optimize_final_module(self) -> None:
-        manager, builder = self._codegen._module_pass_manager(**({"opt": 1} if self.quick else {}))
-        manager.run(self._final_module, builder)
+        self._optimize(**({"opt": 1} if self.quick else {}))
+
+    def _optimize(self, **options: Any) -> None:
+        """Run the passes of the module, with options of Numba's choice of them."""
+        passes = self._codegen._module_pass_manager(**options)
+        manager, *builder = passes if isinstance(passes, tuple) else (passes,)  # a manager alone before Numba 0.62
+        manager.run(self._final_module, *builder)
 
 
 class InnerLibrary(Library):
@@ -55,8 +60,7 @@ class InnerLibrary(Library):
 
     def _optimize_final_module(self) -> None:
         """Make it smaller before callers, each of which optimises it again, take it in."""
-        manager, builder = self._codegen._module_pass_manager(loop_vectorize=False, slp_vectorize=False, cost="cheap")
-        manager.run(self._final_module, builder)
+        self._optimize(loop_vectorize=False, slp_vectorize=False, cost="cheap")
 
     def _finalize_final_module(self) -> None:
         """Make no machine code."""
@@ -151,7 +155,7 @@ class Kernel(CPUDispatcher):
 
     def __init__(self, py_func: Any, locals: Any = None, targetoptions: Any = None, quick: bool = False):
         pipeline = _QuickPipeline if quick else _Pipeline
-        super().__init__(py_func, locals, targetoptions, pipeline)
+        super().__init__(py_func, locals or {}, targetoptions, pipeline)
         self._compiler: Any = _KernelCompiler(py_func, self.targetdescr, self.targetoptions, self.locals, pipeline)
 
     def add_overload(self, cres: Any) -> None:

@@ -15,7 +15,7 @@ FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
 
 ESTIMATED = "load without sensor"  # the largest difference from the published figures; docs/track.md, docs/recover.md
 AUTO = "41 cm: path of 2.8 m/s², start included; MPC, no motor lag, no drag"
-CRAZYMARL = "79.7 %: motor commands, noise, pushes"
+CRAZYMARL = "79.7 %: motor commands, no motor lag"
 
 
 FOLLOWING = ("formation_feedback", "searched")

@@ -43,7 +43,7 @@ from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import fly_episodes
 
 
-def train(recipe: str, seeds: list[int], workers: int, address: str) -> None:
+def train(recipe: str, seeds: list[int], workers: int, address: str = "") -> None:
     """Train a recipe on some seeds and keep the result of each; with Ray, several at a time."""
     if address:
         for line in spread_by_ray(partial(train_seed, recipe), seeds, workers, address):
@@ -110,7 +110,7 @@ class Job(NamedTuple):
         return episodes.is_file() and metrics.is_file() and json.loads(metrics.read_text())["episodes"] == EPISODES
 
 
-def evaluate(flights: list[str], workers: int, address: str) -> None:
+def evaluate(flights: list[str], workers: int, address: str = "") -> None:
     """Evaluate the teams without results, one in each process at a time."""
     jobs = [job for each in flights for job in list_jobs(*each.split("/", 1)) if not job.done]
     jobs = list(dict.fromkeys(jobs))
