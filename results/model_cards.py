@@ -76,6 +76,9 @@ def _training(name: str, policy: LearnedPolicy) -> str:
     minutes = f", {json.loads(recorded.read_text(encoding='utf-8'))['minutes']:g} minutes" if recorded.is_file() else ""
     frames = json.loads(recorded.read_text(encoding="utf-8"))["frames"] if recorded.is_file() else policy.frames
     seeds = sorted(path.name.removeprefix("seed") for path in (HERE / name).glob("seed?") if path.is_dir())
+    start = f"`{train.residual}`" if train.residual else "nothing"
+    if train.residual == "formation" and config.control.action != "reference":
+        start = "zero actions"  # what `formation` is with these
     gru = f", GRU of {train.gru}" if train.gru else ""
     overrides = ", ".join(f"`{key}={value}`" for key, value in sorted(train.overrides.items()))
     rows = {
@@ -85,7 +88,7 @@ def _training(name: str, policy: LearnedPolicy) -> str:
         "trained by": f"{train.algorithm}, {frames:,} environment steps{minutes}",
         "best policy": f"after {policy.frames:,} environment steps" if policy.frames else "the untrained one",
         "training seeds recorded": f"{len(seeds)} ({', '.join(seeds)})" if seeds else "-",
-        "starts from": f"`{train.residual}`" if train.residual else "nothing",
+        "starts from": start,
         "network": f"`{train.actor}`, {' × '.join(map(str, train.hidden))}{gru}",
         "environment of training alone": overrides or "as evaluated",
         "command": f"`python train.py config={name}`",
