@@ -1,7 +1,8 @@
 """What `mkdocs build` changes in the pages, so that they are right on the site and when read in the repository.
 
-Links to files outside docs/, such as ../configs/hover.yaml, lead to the repository: to `repo_url` of mkdocs.yml, or,
-where that is not set, to the files of the clone in which the site was built.
+Links to pages, whose texts are the names of files in the repository, have the pages' titles. Links to files outside
+docs/, such as ../configs/hover.yaml, lead to the repository: to `repo_url` of mkdocs.yml, or, where that is not set, to
+the files of the clone in which the site was built.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ if TYPE_CHECKING:
     from mkdocs.structure.pages import Page
 
 _LINK = re.compile(r"(\]\()([^)\s#:]+)((?:#[^)]*)?\))")
+_PAGE = re.compile(r"\[[\w./]+\.md\]\(([\w./]+\.md)(#[^)]*)?\)")
 _COMMENT = re.compile(r"^(<!--.*?-->)\n", re.MULTILINE)
 _MARK = "repository:"
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Mark links that leave docs/, and put markers such as <!-- results --> apart from the tables that they hold."""
+    """Name pages, mark links that leave docs/, put markers such as <!-- results --> apart from their tables."""
     docs = Path(config.docs_dir)
     folder = (docs / page.file.src_uri).parent
 
@@ -32,7 +34,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             return link[0]
         return f"{link[1]}{_MARK}{target.relative_to(docs.parent).as_posix()}{link[3]}"
 
-    return _COMMENT.sub(r"\1\n\n", _LINK.sub(mark, markdown))
+    def name(link: re.Match[str]) -> str:
+        target = folder / link[1]
+        if not target.is_file():
+            return link[0]
+        title = target.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
+        return f"[{title}]({link[1]}{link[2] or ''})"
+
+    return _COMMENT.sub(r"\1\n\n", _LINK.sub(mark, _PAGE.sub(name, markdown)))
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -107,6 +107,12 @@ def test_tables_and_lists_are_rendered(page, site):
     assert not re.findall(r"^(?:- |\d+\. )", re.sub(r"<pre.*?</pre>", "", html, flags=re.DOTALL), re.MULTILINE)
 
 
+def test_links_have_titles_as_their_texts(site):
+    found = {name: re.findall(r">[\w./]+\.md</a>", (site[1] / name).read_text(encoding="utf-8")) for name in site[0]}
+    assert {name: texts for name, texts in found.items() if texts} == {}
+    assert '<a href="tasks.html">Tasks</a>' in (site[1] / "index.html").read_text(encoding="utf-8")
+
+
 def test_the_readme_is_one_page_with_an_animation():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 120
