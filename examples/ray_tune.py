@@ -63,7 +63,7 @@ def train(iterations: int = 100, horizon: int = 64, trials: int = 8, arguments: 
     """Search; return the weights of the best trial before and after its training."""
     given = list(arguments or [f"{key}={text}" for key, text in DEFAULTS.items()])
     recipe = next((each.removeprefix("config=") for each in given if each.startswith("config=")), "hover")
-    sizes = {"train.horizon": horizon, "env.num_threads": 1}
+    sizes = {"train.horizon": horizon, "train.warmup": min(12, iterations // 10), "env.num_threads": 1}
     space = sizes | parse_space([each for each in given if not each.startswith("config=")])
     here, owns = Path.cwd(), connect("auto", 1, "ray")
     try:
