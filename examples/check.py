@@ -19,7 +19,7 @@ NAMES = sorted(path.stem for path in (HERE / "requirements").glob("*.txt"))
 SIZES = {"iterations": 2, "horizon": 32}
 PACKAGES = (
     "stable_baselines3", "supersuit", "ray", "skrl", "tianshou", "benchmarl", "torchrl", "tensordict", "torch",
-    "gymnasium", "pettingzoo", "numpy",
+    "gymnasium", "pettingzoo", "numpy", "tensorboard", "tqdm", "matplotlib", "imageio", "av",
 )  # fmt: skip
 INSIDE = """
 import importlib, importlib.metadata as metadata, json, sys
