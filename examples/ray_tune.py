@@ -29,9 +29,10 @@ def fly_trial(values: dict[str, Any], recipe: str, iterations: int, folder: str)
     """Train one candidate and report its evaluations."""
     trainer = new_run(load_config(recipe, values), f"tune_{recipe}", Path(folder) / "runs")
     start = weights(trainer)
-    while trainer.iteration < min(iterations, trainer.iterations):
+    last = min(iterations, trainer.iterations)  # train.frames may end it earlier
+    while trainer.iteration < last:
         trainer.step()
-        if trainer.iteration % EVERY == 0 or trainer.iteration == iterations:
+        if trainer.iteration % EVERY == 0 or trainer.iteration == last:
             found = trainer.evaluate()
             trainer.save("last")
             success, error = found["eval/success_rate"], found["eval/payload_position_error_m"]
@@ -89,5 +90,5 @@ def train(iterations: int = 100, horizon: int = 64, trials: int = 8, arguments: 
 
 
 if __name__ == "__main__":
-    first = sys.argv[1] if sys.argv[1:] and sys.argv[1].isdecimal() else None
-    train(trials=int(first or 8), arguments=sys.argv[2 if first else 1 :])
+    count = [each for each in sys.argv[1:] if each.isdecimal()]
+    train(trials=int((count or ["8"])[0]), arguments=[each for each in sys.argv[1:] if "=" in each])
