@@ -36,7 +36,7 @@ def connect(address: str, workers: int, key: str) -> bool:
     except ModuleNotFoundError as error:
         raise ConfigError(f"workers need Ray; {pip_install('ray')}") from error
     if ray.is_initialized():
-        _check_size(ray, workers, key, "connected")
+        _check_size(ray, workers, "that is connected")
         return False
     if address == "auto":
         address = os.environ.get("RAY_ADDRESS") or "local"
@@ -50,18 +50,18 @@ def connect(address: str, workers: int, key: str) -> bool:
     except Exception as error:  # Ray raises many kinds
         raise ConfigError(f"{key}={address} cannot be joined ({reason(error)}); set {key}=local") from error
     try:
-        _check_size(ray, workers, key, address)
+        _check_size(ray, workers, f"{key}={address}")
     except ConfigError:
         ray.shutdown()
         raise
     return True
 
 
-def _check_size(ray: Any, workers: int, key: str, address: str) -> None:
+def _check_size(ray: Any, workers: int, cluster: str) -> None:
     """Refuse more workers than a cluster has CPUs: they would wait for ever."""
     there = int(ray.cluster_resources().get("CPU", 0))
     if there < workers:
-        raise ConfigError(f"the cluster {key}={address} has {there} CPUs for {workers} workers; ask for fewer workers")
+        raise ConfigError(f"the cluster {cluster} has {there} CPUs for {workers} workers; ask for fewer workers")
 
 
 def disconnect() -> None:

@@ -1,7 +1,7 @@
 """Rollouts by several processes: actors of Ray, each with its share of the environments, in step with the learner.
 
 Each actor gets the weights, returns its rows of the batch and the state of its environments after it. An actor that
-dies is replaced; the new one goes on from the last state and flies its rows of the batch again, bit for bit.
+dies is replaced; the new one goes on from the last state and simulates its rows of the batch again, bit for bit.
 """
 
 from __future__ import annotations

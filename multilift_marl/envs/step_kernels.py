@@ -109,7 +109,7 @@ def end_step(diverged, cause, steps, max_steps, ended, outcome):
 
 @kernel
 def _sum(terms):
-    """Return the sum of terms (T,), in NumPy's order."""
+    """Return the sum of terms (T,), in NumPy's order, which is this one for up to 128 terms."""
     total = 0.0
     first = 0
     if terms.shape[0] >= 8:
