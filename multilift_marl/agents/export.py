@@ -252,6 +252,7 @@ def _describe_formation(config: Config) -> list[dict[str, Any]]:
         {
             "slot": system.slots[n].tolist(),
             "slot_azimuth": float(system.slot_azimuth[n]),
+            "heading": float(system.heading[n]),
             "anchor": system.anchors[n].tolist(),
             "hook": system.hooks[n].tolist(),
             "cable_length": float(system.cable_length[n]),

@@ -180,6 +180,9 @@ class ControlConfig(Section):
     action: Literal["reference", "velocity", "acceleration", "acc_rates", "ctbr", "ctbm", "rotor"] = Field(
         "reference", description="what an action means (docs/control.md)"
     )
+    heading: Literal["target", "outward"] = Field(
+        "target", description="drones face where the target does, or away from the payload, each through its slot"
+    )
     max_offset: Annotated[Float, Between(0, 100, "m")] = Field(
         0.5, gt=0, description="[m] slot offset of a full action, along each axis"
     )

@@ -3,8 +3,7 @@
 An interface turns actions into set-points once for each policy step (`set_action`), and set-points into rotor thrusts
 at the control rate (`control_step`). Vectors are given in the drone's slot frame (x outward from the payload, y to the
 left of it, z up), body rates in the slot body frame: the body's, turned about its z axis so that x points outward. So a
-number means the same to all drones of a team, whose networks are one. An action of zero hovers as well as the interface
-can, under the nominal payload.
+number means the same to all drones, which share a network. Zero hovers as well as the interface can.
 """
 
 from __future__ import annotations
@@ -126,7 +125,7 @@ class ReferenceAction(Interface):
 
     numbers = (
         *vector_components("m", "max_offset", "offset of the own slot"),
-        ActionComponent("yaw", "target", "rad", "max_yaw", "own heading relative to the target's"),
+        ActionComponent("yaw", "target", "rad", "max_yaw", "own heading relative to the one at rest"),
     )
     supports = ("integral", "indi")
 
@@ -136,8 +135,7 @@ class ReferenceAction(Interface):
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
         """See `Interface.set_action`."""
-        ranges = (self.settings.max_offset, self.settings.max_yaw)
-        return bind(_command_offset, lo, hi, action, team.goal, team.reference, *ranges)
+        return bind(_command_offset, lo, hi, action, team, self.settings.max_offset, self.settings.max_yaw)
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
@@ -204,7 +202,7 @@ class AccRatesAction(Interface):
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
         """See `Interface.set_action`."""
         ranges = (self.settings.max_acceleration, self.settings.max_tilt_rate)
-        return bind(_command_acc_rates, lo, hi, action, team.goal, team.reference, team.setpoint.rates, *ranges)
+        return bind(_command_acc_rates, lo, hi, action, team, *ranges)
 
     def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
@@ -258,7 +256,7 @@ class CtbmAction(CtbrAction):
 class RotorAction(Interface):
     """Thrust of each rotor, zero: its own at hover, ± 1: its limits. Nothing else holds the attitude.
 
-    Which rotor is on the outside differs from drone to drone: `ctbm` means the same to all of them.
+    Which rotor is on the outside differs from drone to drone, unless they face outward (`control.heading`).
     """
 
     numbers = tuple(ActionComponent(f"rotor_{k}", "body", "N", THRUST, f"thrust of rotor {k}") for k in range(4))
@@ -300,11 +298,12 @@ def to_slot_body(vector, yaw, slot_frame):
 
 
 @kernel
-def _command_offset(lo, hi, action, goal, reference, max_offset, max_yaw):
+def _command_offset(lo, hi, action, team, max_offset, max_yaw):
+    goal, g = team.goal, team.gains
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            put(reference.command[e, n], add(vec(goal.slots, e, n), _in_world(e, n, action, goal, max_offset)))
-            reference.command_yaw[e, n] = goal.drone_yaw[e] + max_yaw * action[e, n, 3]
+            put(team.reference.command[e, n], add(vec(goal.slots, e, n), _in_world(e, n, action, goal, max_offset)))
+            team.reference.command_yaw[e, n] = goal.drone_yaw[e] + g.heading[n] + max_yaw * action[e, n, 3]
 
 
 @kernel
@@ -316,13 +315,14 @@ def _command_vector(lo, hi, action, goal, reference, vector, largest, max_yaw_ra
 
 
 @kernel
-def _command_acc_rates(lo, hi, action, goal, reference, rates, max_acceleration, max_tilt_rate):
+def _command_acc_rates(lo, hi, action, team, max_acceleration, max_tilt_rate):
+    reference, goal = team.reference, team.goal
     for e in range(lo, hi):
         for n in range(action.shape[1]):
             put(reference.acceleration[e, n], _in_world(e, n, action, goal, max_acceleration))
             asked = (max_tilt_rate * action[e, n, 3], max_tilt_rate * action[e, n, 4], 0.0)
-            put(rates[e, n], from_slot_body(asked, reference.yaw[e, n], goal.slot_frame[e, n]))
-            reference.command_yaw[e, n] = goal.drone_yaw[e]
+            put(team.setpoint.rates[e, n], from_slot_body(asked, reference.yaw[e, n], goal.slot_frame[e, n]))
+            reference.command_yaw[e, n] = goal.drone_yaw[e] + team.gains.heading[n]
 
 
 @kernel

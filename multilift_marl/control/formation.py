@@ -48,7 +48,8 @@ class Goal(NamedTuple):
     cable_force: np.ndarray
     """(E, N, 3) nominal force of each drone on its cable there [N]."""
     drone_yaw: np.ndarray
-    """(E,) heading that the drones are to have, the target's where a task does not say otherwise [rad]."""
+    """(E,) heading of the team, the target's where a task does not say otherwise; a drone's own is `Rig.heading`
+    from there [rad]."""
     velocity: np.ndarray
     """(E, 3) of a target that moves, and of its slots [m/s]; zero otherwise, like the next ones."""
     acceleration: np.ndarray
@@ -84,6 +85,8 @@ class Rig(NamedTuple):
     """(N, 3) [m]."""
     azimuth: np.ndarray
     """(N,) [rad]."""
+    heading: np.ndarray
+    """(N,) of each drone, from the team's [rad]."""
     force: np.ndarray
     """(N, 3) [N]."""
     drones: Drones
@@ -94,7 +97,9 @@ class Rig(NamedTuple):
 def make_rig(system: System) -> Rig:
     """Return the formation of `system`."""
     point = not system.anchors.any()
-    return Rig(system.anchors, system.slots, system.slot_azimuth, system.hook_force, make_drones(system), point)
+    return Rig(
+        system.anchors, system.slots, system.slot_azimuth, system.heading, system.hook_force, make_drones(system), point
+    )
 
 
 class Reference(NamedTuple):
@@ -144,17 +149,17 @@ def place_formation(e: int, goal: Goal, rig: Rig) -> None:
 
 @kernel
 def goal_arm(e, n, goal, rig, yaw):
-    """Return the hook of drone n from its centre, at rest at the target with heading `yaw`, world frame [m]."""
+    """Return the hook of drone n from its centre, at rest in a team of heading `yaw` at the target, world frame [m]."""
     return hook_arm(n, vec(goal.cable_force, e, n), yaw, rig)
 
 
 @kernel
 def hook_arm(n, cable_force, yaw, rig):
-    """Return the hook of drone n from its centre, at rest with a cable force [N] and heading `yaw`, world frame [m]."""
+    """Return the hook of drone n from its centre, at rest with a cable force [N] in a team of heading `yaw` [m]."""
     if not rig.drones.hooked:
         return (0.0, 0.0, 0.0)
     force = add(cable_force, (0.0, 0.0, rig.drones.mass[n] * GRAVITY))
-    return mul(thrust_frame(force, yaw), row(rig.drones.hooks, n))
+    return mul(thrust_frame(force, yaw + rig.heading[n]), row(rig.drones.hooks, n))
 
 
 @kernel
@@ -165,7 +170,7 @@ def goal_hook(e, n, goal, rig):
 
 @kernel
 def set_heading(e, yaw, goal, rig):
-    """Give the drones of environment e another heading than the target's; their hooks stay where they are."""
+    """Give the team of environment e another heading than the target's; its hooks stay where they are."""
     if rig.drones.hooked:
         for n in range(rig.slots.shape[0]):
             turned = sub(goal_arm(e, n, goal, rig, goal.drone_yaw[e]), goal_arm(e, n, goal, rig, yaw))

@@ -42,6 +42,8 @@ class Gains(NamedTuple):
     """(N,) mass of payload and cable that each drone carries [kg]."""
     drag: np.ndarray
     """(N, 3) linear drag along the body axes that is fed forward [kg/s]."""
+    heading: np.ndarray
+    """(N,) of a drone at rest, from the team's [rad]."""
     hooks: np.ndarray
     """(N, 3) where the cable is tied, from the centre of mass, body frame [m]."""
     hooked: bool
@@ -98,6 +100,7 @@ def make_gains(control: ControlConfig, system: System) -> Gains:
         thrust_max=np.array([vehicle.rotor_thrust_max for vehicle in vehicles], float),
         load_share=system.hook_force[:, 2] / GRAVITY,
         drag=np.array([vehicle.drag for vehicle in vehicles], float) * control.drag_feedforward,
+        heading=system.heading,
         hooks=drones.hooks,
         hooked=drones.hooked,
     )

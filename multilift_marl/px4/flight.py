@@ -54,7 +54,7 @@ class Goal(NamedTuple):
     cable_force: np.ndarray
     """(N, 3) [N]."""
     yaw: float
-    """Of the drones [rad]."""
+    """Of the team [rad]."""
     height: float
     """Of the payload [m]."""
 
@@ -182,7 +182,7 @@ class Flight:
             world.step(world.thrust, world.system.control_interval)
 
     def _send(self, motion: np.ndarray, cable_force: np.ndarray, yaw: float, drone: int) -> None:
-        self.team.send(drone, motion[drone], cable_force[drone], yaw)
+        self.team.send(drone, motion[drone], cable_force[drone], yaw + self.team.heading[drone])
 
     def _take_over(self, vec: MultiliftVec, world: World) -> np.ndarray:
         """Begin an episode in the state of another world, and return its first observation."""

@@ -65,6 +65,7 @@ class AutopilotTeam:
 
     Attributes:
         links, offboard: of each autopilot.
+        heading: of each drone, from the team's (N,) [rad].
         autopilots: their processes; None where others started them.
         clock: that holds the simulation back.
 
@@ -80,7 +81,7 @@ class AutopilotTeam:
         self._dt, self.clock = dt, RealTime(settings.speed)
         self._time_us, self._ticks = 1_000_000, 0
         self._thrust_max = np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])
-        self._feedforward = LoadFeedforward(system)
+        self._feedforward, self.heading = LoadFeedforward(system), system.heading
         self._sensors: Sensors | None = None
         self._places: deque[tuple[int, np.ndarray]] = deque(maxlen=_PAST)
         self._stack = ExitStack()

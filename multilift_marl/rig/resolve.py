@@ -73,9 +73,9 @@ def resolve_system(config: SystemConfig) -> System:
     if cable.bending_damping is not None:
         bending_damping = np.full(n, cable.bending_damping)
     hooks = vector_per_drone(cable.hook, n, "cable.hook")
-    resting = resting_rotations(vehicles, force + GRAVITY * cable_mass[:, None] * [0, 0, 1])
+    heading = _azimuth(ends) if config.control.heading == "outward" else np.zeros(n)
+    resting = resting_rotations(vehicles, force + GRAVITY * cable_mass[:, None] * [0, 0, 1], heading)
     slots = ends - (resting * hooks[:, None, :]).sum(axis=-1)
-    centred = np.hypot(slots[:, 0], slots[:, 1]) < 1e-9
     system = System(
         vehicles=vehicles,
         payload_shape=payload.shape,
@@ -102,7 +102,8 @@ def resolve_system(config: SystemConfig) -> System:
         hooks=hooks,
         cable_ends=ends,
         slots=slots,
-        slot_azimuth=np.where(centred, 0.0, np.arctan2(slots[:, 1], slots[:, 0])),
+        slot_azimuth=_azimuth(slots),
+        heading=heading,
         min_separation=MIN_SEPARATION * ((spans[:, None] + spans) / 2 / _FALCON.span),
         wind=np.asarray(config.wind.velocity, float),
         air=config.wind,
@@ -116,6 +117,12 @@ def resolve_system(config: SystemConfig) -> System:
     check_possible(system, config.randomization)
     check_resolved(config, system)
     return system
+
+
+def _azimuth(places: np.ndarray) -> np.ndarray:
+    """Return the directions (N,) [rad] of level places (N, 3) [m] from the origin; 0 of one in its middle."""
+    centred = np.hypot(places[:, 0], places[:, 1]) < 1e-9
+    return np.where(centred, 0.0, np.arctan2(places[:, 1], places[:, 0]))
 
 
 def _segment_forces(force: np.ndarray, mass: float, segments: int) -> np.ndarray:

@@ -38,6 +38,7 @@ class System:
         cable_ends: the hooks of resting drones in the payload frame, cables stretched and sagging (N, 3) [m].
         slots: resting drones in the payload frame (N, 3) [m].
         slot_azimuth: direction of each slot from the payload, in its horizontal plane (N,) [rad].
+        heading: of each resting drone, from the payload's (N,) [rad].
         min_separation: distance between two drones that counts as a collision (N, N) [m].
         wind: mean wind (3,) [m/s].
         air: what else the air does.
@@ -70,6 +71,7 @@ class System:
     cable_ends: np.ndarray
     slots: np.ndarray
     slot_azimuth: np.ndarray
+    heading: np.ndarray
     min_separation: np.ndarray
     wind: np.ndarray
     air: WindConfig
@@ -130,7 +132,7 @@ class System:
     @property
     def resting_rotation(self) -> np.ndarray:
         """Attitude of each resting drone in the payload's frame (N, 3, 3)."""
-        return resting_rotations(self.vehicles, self.hook_force)
+        return resting_rotations(self.vehicles, self.hook_force, self.heading)
 
     @property
     def inertia_matrix(self) -> tuple[float, ...]:
@@ -139,7 +141,8 @@ class System:
         return tuple(float(moment) for moment in ((axes * self.payload_inertia) @ axes.T).ravel())
 
 
-def resting_rotations(vehicles: tuple[Vehicle, ...], cable_forces: np.ndarray) -> np.ndarray:
+def resting_rotations(vehicles: tuple[Vehicle, ...], cable_forces: np.ndarray, heading: np.ndarray) -> np.ndarray:
     """Return the attitudes (N, 3, 3) of drones that hold `cable_forces` (N, 3) [N] and their own weight at rest."""
     forces = cable_forces + GRAVITY * np.array([[0, 0, vehicle.mass] for vehicle in vehicles])
-    return np.array([thrust_frame(tuple(force), 0.0) for force in forces]).reshape(-1, 3, 3)
+    frames = (thrust_frame(tuple(force), yaw) for force, yaw in zip(forces, heading, strict=True))
+    return np.array(list(frames)).reshape(-1, 3, 3)

@@ -46,7 +46,7 @@ class SetPoints:
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Hold where the drones are."""
         self._place[:] = self._vec.world.state.drone_position[0]
-        self._yaw[:] = self._vec.task.goal.drone_yaw[0]
+        self._yaw[:] = self._vec.task.goal.drone_yaw[0] + self._vec.world.system.heading
         self.age[:] = np.inf
 
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -67,7 +67,8 @@ class SetPoints:
         goal, control = self._vec.task.planned, self._vec.config.control
         offset = self._place - goal.slots[0]
         c, s = goal.slot_frame[0].T
-        turned = np.remainder(self._yaw - goal.drone_yaw[0] + np.pi, 2 * np.pi) - np.pi
+        turned = self._yaw - goal.drone_yaw[0] - self._vec.world.system.heading
+        turned = np.remainder(turned + np.pi, 2 * np.pi) - np.pi
         numbers = [c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]]
         action = np.stack([*(number / control.max_offset for number in numbers), turned / control.max_yaw], axis=-1)
         return np.clip(action, -1, 1)[None].astype(np.float32)

@@ -137,7 +137,7 @@ class World:
         state.drone_velocity[mask] = state.drone_body_rates[mask] = 0
         for e in np.flatnonzero(mask).tolist():
             for n, force in enumerate(system.hook_force):
-                hover_drone(e, n, state, tuple(force), 0.0, self.drones)
+                hover_drone(e, n, state, tuple(force), float(self.system.heading[n]), self.drones)
         self.set_parameters(mask, **nominal_parameters(system, self.num_envs)._asdict())
         self.hidden_loads.payload_force[mask] = 0
         self.hidden_loads.wind[mask] = system.wind

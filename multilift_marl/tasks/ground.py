@@ -95,7 +95,7 @@ def place_on_ground(e, rng, v, ground, distance, spread):
         moved = spread * sqrt(rng.uniform(0.0, 1.0))
         x = goal.position[e, 0] + distance[n] * cos(azimuth) + moved * cos(where)
         y = goal.position[e, 1] + distance[n] * sin(azimuth) + moved * sin(where)
-        putmat(state.drone_rotation[e, n], rot_z(goal.yaw[e]))
+        putmat(state.drone_rotation[e, n], rot_z(goal.yaw[e] + rig.heading[n]))
         put(state.drone_position[e, n], (x, y, ground.drone[n]))
         state.rotor_speed[e, n] = ground.idle[n]
 

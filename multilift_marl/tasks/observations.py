@@ -76,8 +76,8 @@ def thrust_axis(e, n, v):
 
 @inlined
 def relative_heading(e, n, v):
-    """Cosine and sine of the own heading relative to the target's."""
-    yaw = heading(mat(v.seen.drone_rotation, e, n)) - v.goal.yaw[e]
+    """Cosine and sine of the own heading relative to the one at rest."""
+    yaw = heading(mat(v.seen.drone_rotation, e, n)) - v.goal.yaw[e] - v.rig.heading[n]
     return cos(yaw), sin(yaw)
 
 
@@ -187,7 +187,7 @@ OBSERVATION = (
     Component("velocity", 3, "slot", "m/s", "own velocity", own_velocity),
     Component("thrust_axis", 3, "slot", "-", "own body z axis", thrust_axis),
     Component(
-        "heading", 2, "target", "-", "cosine and sine of own heading relative to the target's", relative_heading
+        "heading", 2, "target", "-", "cosine and sine of own heading relative to the one at rest", relative_heading
     ),
     Component("body_rates", 3, "body", "rad/s", "own angular velocity", body_rates),
     Component("tracking_error", 3, "slot", "m", "own position minus own smoothed reference", tracking_error),

@@ -82,7 +82,7 @@ def _throw(e, rng, state, goal, rig, hanging, throw):
         towards = unit(add(towards, in_ball(rng, 0.5)))  # within 30° of the slot's
         span = hanging.length[n] * rng.uniform(throw.slack, throw.taut)
         put(state.drone_velocity[e, n], in_ball(rng, throw.speed))
-        putmat(state.drone_rotation[e, n], _tilted(rng, throw.tilt, goal.drone_yaw[e]))
+        putmat(state.drone_rotation[e, n], _tilted(rng, throw.tilt, goal.drone_yaw[e] + rig.heading[n]))
         place_at_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.drones.hooks)
         state.drone_body_rates[e, n] = 0.0
 

@@ -107,7 +107,7 @@ def hang_team(e, v, goal, hanging, pose, velocity, moved):
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
         cable_force = add(scale(tension, direction), half)
-        hover_drone(e, n, state, cable_force, goal.drone_yaw[e], hanging.drones)
+        hover_drone(e, n, state, cable_force, goal.drone_yaw[e] + rig.heading[n], hanging.drones)
         place_at_hook(e, n, state, add(anchor, end), hanging.drones.hooks)
 
 
