@@ -60,9 +60,9 @@ def main(arguments: list[str]) -> dict:
     for i in range(repeats + 2):
         spent.clear()
         start = time.perf_counter()
-        batch = trainer.rollouts.collect(i)
+        batches = trainer.rollouts.collect(i)
         torch.set_num_threads(trainer.config.train.threads)
-        learn(trainer.learner, batch)
+        learn(trainer.learner, batches)
         spent["total"] = time.perf_counter() - start
         torch.set_num_threads(1)
         if i >= 2:

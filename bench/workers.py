@@ -45,11 +45,11 @@ def main(arguments: list[str]) -> dict[str, Any]:
     for i in range(repeats + 2):
         for k, trainer in (*trainers.items(), (-1, alone)):
             start = time.perf_counter()
-            batch = trainer.rollouts.collect(i)
+            batches = trainer.rollouts.collect(i)
             sampling[k].append(time.perf_counter() - start)
             if k == counts[0]:
                 start = time.perf_counter()
-                update(trainer.learner, batch)
+                update(trainer.learner, batches)
                 learning.append(time.perf_counter() - start)
     medians = {k: statistics.median(seconds[2:]) for k, seconds in sampling.items()}  # the first two warm up
     learn = statistics.median(learning[2:])

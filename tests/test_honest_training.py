@@ -32,9 +32,9 @@ def test_only_whole_episodes_stand_in_the_curves(tmp_path):
     trainer = make_trainer(tmp_path, **{"env.episode_seconds": 0.5})
     steps, logged = trainer.env.vec.max_steps, []
     for _ in range(6):
-        batch = trainer.rollouts.collect(trainer.iteration)
+        [batch] = trainer.rollouts.collect(trainer.iteration)
         batch["next", "agents", "reward"].fill_(1.0)
-        values = trainer._episodes(batch)
+        values = trainer.episodes.read([batch], trainer.iteration)
         trainer.iteration += 1
         if "return" in values:
             logged.append((trainer.iteration * 16, values["return"]))

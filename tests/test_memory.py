@@ -82,8 +82,8 @@ def test_learning_sees_the_memory_that_the_rollouts_had(tmp_path, overrides):
     ended = 0
     collect = trainer.rollouts.collect
     for i in range(4):
-        batch = collect(i)
-        trainer.rollouts.collect = lambda iteration, batch=batch: batch
+        [batch] = collect(i)
+        trainer.rollouts.collect = lambda iteration, batch=batch: [batch]
         ended += int(mark_starts(batch).sum())
         memory = batch["agents", "memory"]
         after = batch["next", "agents", "memory"].masked_fill(batch["next", "done"][..., None], 0.0)

@@ -125,9 +125,9 @@ def test_a_resumed_run_has_the_best_policy_of_its_checkpoint(tmp_path):
 def test_time_outs_are_bootstrapped_and_failures_are_not(tmp_path):
     trainer = make_trainer(tmp_path)
     iterations = itertools.count()
-    batch = trainer.rollouts.collect(next(iterations))
+    [batch] = trainer.rollouts.collect(next(iterations))
     while not batch["next", "truncated"].any():
-        batch = trainer.rollouts.collect(next(iterations))
+        [batch] = trainer.rollouts.collect(next(iterations))
     gamma = trainer.config.train.gamma
     advantage, value = estimate_advantage(trainer.learner, batch)
     with torch.no_grad():
@@ -150,7 +150,7 @@ def test_advantages_losses_and_gradients_are_those_of_torchrl(tmp_path, algorith
     ours = trainer.learner
     ours.optimizer.zero_grad(set_to_none=True)
     theirs = copy.deepcopy(ours)
-    batch = trainer.rollouts.collect(2).clone()
+    batch = trainer.rollouts.collect(2)[0].clone()
     batch["next", "terminated"][0, 3] = batch["next", "done"][0, 3] = True
     assert batch["next", "truncated"].any()
 

@@ -66,7 +66,7 @@ def test_workers_replay_bit_for_bit_also_where_one_dies(tmp_path, local_ray, wor
 
 def test_the_first_batch_of_workers_is_that_of_one_process(tmp_path, local_ray):
     alone, three = (make_trainer(tmp_path, **{"train.workers": k}) for k in (0, 3))
-    batches = [trainer.rollouts.collect(0) for trainer in (alone, three)]
+    batches = [trainer.rollouts.collect(0)[0] for trainer in (alone, three)]
     for key in (("agents", "observation"), ("agents", "action"), ("next", "agents", "reward"), "state"):
         torch.testing.assert_close(batches[0][key], batches[1][key], rtol=0, atol=1e-5)
     assert batches[1].batch_size == batches[0].batch_size

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.config.config import Config
 from multilift_marl.control.policy import Policy
 from multilift_marl.control.scripted import make_residual
@@ -104,6 +105,7 @@ class Evaluator:
 
     def _fly(self, make_policy: Callable[[MultiliftVec], Policy], block: int) -> dict[str, np.ndarray]:
         """Return the metrics of each episode of a block."""
-        config = self.config
-        episodes, first = config.eval.episodes, block * _BLOCK
-        return fly_episodes(config, make_policy, episodes, config.seed, TRAINING_EVALUATION, first=first)
+        rigs, seed = evaluated_rigs(self.config), self.config.seed
+        each, first = -(-self.config.eval.episodes // len(rigs)), block * _BLOCK
+        flown = [fly_episodes(rig, make_policy, each, seed, TRAINING_EVALUATION, first=first) for rig in rigs]
+        return {name: np.concatenate([metrics[name] for metrics in flown]) for name in flown[0]}

@@ -218,7 +218,7 @@ def _describe_action(policy: LearnedPolicy) -> dict[str, Any]:
     thrusts = iter(np.moveaxis(_measure_thrusts(policy.config), -1, 0).tolist())
     numbers = []
     for name, frame, unit, limit, meaning in ACTIONS[control.action].numbers:
-        full = None if limit == THRUST else getattr(control, limit)
+        full = None if limit == THRUST else getattr(policy.config.acting, limit)
         low, zero, high = next(thrusts) if full is None else (-full, 0.0, full)
         scale = {"at_minus_one": low, "at_zero": zero, "at_one": high}
         numbers.append({"name": name, "frame": frame, "unit": unit, "meaning": meaning, **scale})
@@ -234,7 +234,7 @@ def _describe_action(policy: LearnedPolicy) -> dict[str, Any]:
 def _measure_thrusts(config: Config) -> np.ndarray:
     """Return the thrusts (3, N, K) [N] that actions of -1, 0 and 1 set in a team at rest, by its interface."""
     system = config.system
-    interface = ACTIONS[config.control.action](config.control, 1.0 / config.sim.control_hz)
+    interface = ACTIONS[config.control.action](config.acting, 1.0 / config.sim.control_hz)
     e, n = 3, system.num_drones
     action = np.broadcast_to(np.array([-1.0, 0.0, 1.0])[:, None, None], (e, n, len(interface.numbers))).copy()
     team = Team(

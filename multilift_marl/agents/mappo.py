@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -121,10 +121,10 @@ def check_communication(train: TrainConfig, env: EnvConfig) -> None:
         )
 
 
-def check_batch(train: TrainConfig, vec: MultiliftVec, num_envs: int) -> None:
+def check_batch(train: TrainConfig, vec: MultiliftVec, num_envs: int, rigs: int = 1) -> None:
     """Refuse, by a ConfigError, batches that cannot be divided as asked, or are larger than this machine's memory."""
     steps = num_envs * train.horizon
-    rows, what = steps, "steps"
+    rows, what = steps // rigs, "steps" if rigs == 1 else "steps of each rig"
     if train.gru:
         length = sequence_length(train)
         if train.horizon % length:
@@ -132,7 +132,7 @@ def check_batch(train: TrainConfig, vec: MultiliftVec, num_envs: int) -> None:
                 f"train.horizon={train.horizon} is no multiple of train.sequence={train.sequence}, the steps that "
                 "gradients of a GRU go back; change one of them"
             )
-        rows, what = steps // length, "sequences"
+        rows, what = rows // length, what.replace("steps", "sequences")
     if train.minibatches > rows:
         raise ConfigError(
             f"train.minibatches={train.minibatches} exceeds the {rows} {what} of a batch; lower it or raise "
@@ -169,58 +169,53 @@ def estimate_advantage(learner: Learner, batch: TensorDictBase) -> tuple[torch.T
     return advantage, value
 
 
-def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
-    """Improve policy and critic on one batch of rollouts [E, T]; return diagnostics.
+def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, float]:
+    """Improve policy and critic on batches of rollouts [E, T]; return diagnostics.
 
     Args:
         learner: changed in place.
-        batch: what the collector returned; not changed.
+        batches: what the collectors returned, one for each rig and as many steps of each; not changed.
     """
     config, start = learner.config, time.perf_counter()
-    observation, critic_input = batch[_OBSERVATION], learner.critic_input(batch)
 
-    # 1. Advantages, from values of the critic before the update, normalised over the batch.
-    advantage, value = estimate_advantage(learner, batch)
-    target = advantage + value
-    explained = 1 - (target - value).var() / target.var().clamp(min=1e-8)
-    advantage = (advantage - advantage.mean()) / advantage.std().clamp(min=1e-6)
-    columns = [observation, batch[_ACTION], batch[_LOG_PROB], advantage, critic_input, target]
-    columns += [] if learner.actor.memory is None else [mark_starts(batch)]
-    columns = [split_batch(column, sequence_length(config)) for column in columns]
-    if learner.actor.memory is not None:
-        columns.append(batch[_MEMORY][:, :: sequence_length(config)].flatten(0, 1))
+    # 1. Advantages, from values of the critic before the update, normalised over all batches.
+    estimates = [estimate_advantage(learner, batch) for batch in batches]
+    advantages = torch.cat([advantage.flatten() for advantage, _ in estimates])
+    mean, deviation = advantages.mean(), advantages.std().clamp(min=1e-6)
+    targets = torch.cat([(advantage + value).flatten() for advantage, value in estimates])
+    explained = 1 - advantages.var() / targets.var().clamp(min=1e-8)
+    tables = [
+        _list_columns(learner, batch, (advantage - mean) / deviation, advantage + value)
+        for batch, (advantage, value) in zip(batches, estimates, strict=True)
+    ]
 
-    # 2. Some epochs of minibatches, fewer if the policy moves too far.
+    # 2. Some epochs of minibatches, fewer if the policy moves too far. A minibatch has as many rows of each batch.
     actor_parameters, critic_parameters = (group["params"] for group in learner.optimizer.param_groups)
     diagnostics: list[torch.Tensor] = []
     stop = False
     for _ in range(config.epochs):
-        order = torch.randperm(len(columns[0]))
-        for chunk in order.chunk(config.minibatches):
-            rows = [column.index_select(0, chunk) for column in columns]
-            policy_loss, entropy, kl, clipped = surrogate_loss(learner, *rows[:4], *rows[6:])
-            critic_loss = config.value_weight * value_loss(learner, *rows[4:6])
-            total = policy_loss + critic_loss
-            if config.entropy > 0:
-                total = total - config.entropy * entropy
+        orders = [torch.randperm(len(columns[0])).chunk(config.minibatches) for columns in tables]
+        for chunks in zip(*orders, strict=True):
             learner.optimizer.zero_grad(set_to_none=True)
-            total.backward()
+            losses = [
+                _add_gradients(learner, [column.index_select(0, chunk) for column in columns], 1 / len(tables))
+                for columns, chunk in zip(tables, chunks, strict=True)
+            ]
             norm = nn.utils.clip_grad_norm_(actor_parameters, config.max_grad_norm)
             nn.utils.clip_grad_norm_(critic_parameters, config.max_grad_norm)
             learner.optimizer.step()
-            values = [kl, clipped, policy_loss, critic_loss, norm]
-            diagnostics.append(torch.stack([value.detach() for value in values]))
+            diagnostics.append(torch.cat([torch.stack(losses).mean(0), norm.detach()[None]]))
         if torch.stack(diagnostics[-config.minibatches :])[:, 0].mean() > config.target_kl:
             stop = True
             break
 
     # 3. Statistics of the observations, for the next rollouts.
-    learner.actor.normalizer.update(observation)
-    learner.critic.normalizer.update(critic_input)
+    for batch in batches:
+        learner.actor.normalizer.update(batch[_OBSERVATION])
+        learner.critic.normalizer.update(learner.critic_input(batch))
 
-    mean = torch.stack(diagnostics).mean(0)
     names = ("approx_kl", "clip_fraction", "loss_policy", "loss_critic", "gradient_norm")
-    result = dict(zip(names, mean.tolist(), strict=True))
+    result = dict(zip(names, torch.stack(diagnostics).mean(0).tolist(), strict=True))
     entropy = 0.5 * torch.log(2 * torch.pi * torch.e * learner.actor.log_std.detach().exp() ** 2).sum()
     return result | {
         "explained_variance": explained.item(),
@@ -228,6 +223,29 @@ def update(learner: Learner, batch: TensorDictBase) -> dict[str, float]:
         "stopped_early": float(stop),
         "learning_seconds": time.perf_counter() - start,
     }
+
+
+def _list_columns(
+    learner: Learner, batch: TensorDictBase, advantage: torch.Tensor, target: torch.Tensor
+) -> list[torch.Tensor]:
+    """Return what minibatches of rollouts [E, T] are drawn from, one row for each step or sequence."""
+    columns = [batch[_OBSERVATION], batch[_ACTION], batch[_LOG_PROB], advantage, learner.critic_input(batch), target]
+    columns += [] if learner.actor.memory is None else [mark_starts(batch)]
+    length = sequence_length(learner.config)
+    columns = [split_batch(column, length) for column in columns]
+    return columns if learner.actor.memory is None else [*columns, batch[_MEMORY][:, ::length].flatten(0, 1)]
+
+
+def _add_gradients(learner: Learner, rows: list[torch.Tensor], weight: float) -> torch.Tensor:
+    """Add the gradients of the losses on rows of `_list_columns`, times `weight`; return KL, clipped share, losses."""
+    config = learner.config
+    policy_loss, entropy, kl, clipped = surrogate_loss(learner, *rows[:4], *rows[6:])
+    critic_loss = config.value_weight * value_loss(learner, *rows[4:6])
+    total = policy_loss + critic_loss
+    if config.entropy > 0:
+        total = total - config.entropy * entropy
+    (weight * total).backward()
+    return torch.stack([value.detach() for value in (kl, clipped, policy_loss, critic_loss)])
 
 
 def sequence_length(train: TrainConfig) -> int:

@@ -13,6 +13,8 @@ from torchrl.collectors import Collector
 from multilift_marl.agents.mappo import StochasticPolicy
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 
+Batches = list[TensorDictBase]
+"""Of each rig that is trained, E environments for T steps."""
 NOISE = 3  # purpose of seeds, beside those of `envs/core.py`
 
 
@@ -53,15 +55,15 @@ class Rollouts:
         self._batches: Iterator[TensorDictBase] | None = None  # of the collector, once it has started
         self._restored = False
 
-    def collect(self, iteration: int) -> TensorDictBase:
-        """Return the next T steps of all environments, batch size [E, T]; valid until the next call."""
+    def collect(self, iteration: int) -> Batches:
+        """Return the next T steps of all environments, one batch of size [E, T]; valid until the next call."""
         self._start()
         assert self._batches is not None
         vec = self.env.vec
         envs = range(vec.first_env, vec.first_env + vec.num_envs)
         shape = (self._horizon, vec.num_drones, vec.action_size)
         self._policy.noise = iter(exploration_noise(vec.config.seed, envs, iteration, shape))
-        return next(self._batches)
+        return [next(self._batches)]
 
     def get_state(self) -> dict[str, torch.Tensor]:
         """Return all that later batches depend on beside the weights, environment first."""
@@ -103,3 +105,36 @@ class Rollouts:
         self._batches = iter(collector)
         if not self._restored:
             vec.stagger(self._total)
+
+
+class RigRollouts:
+    """The rollouts of teams with different rigs, one after the other, with the interface of `Rollouts`.
+
+    Args:
+        parts: of each rig.
+    """
+
+    def __init__(self, parts: list[Rollouts]):
+        self._parts = parts
+
+    def collect(self, iteration: int) -> Batches:
+        """Return the next T steps of all environments, a batch for each rig; valid until the next call."""
+        return [batch for part in self._parts for batch in part.collect(iteration)]
+
+    def get_state(self) -> dict[str, torch.Tensor]:
+        """Return all that later batches depend on beside the weights, the keys of each rig after its number."""
+        states = enumerate(part.get_state() for part in self._parts)
+        return {f"{k}/{key}": tensor for k, state in states for key, tensor in state.items()}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Go on, before the first batch, from what `get_state` returned of the same rigs.
+
+        Raises:
+            ValueError: see `MultiliftEnv.set_state`.
+        """
+        for k, part in enumerate(self._parts):
+            own = {key.partition("/")[2]: tensor for key, tensor in saved.items() if key.startswith(f"{k}/")}
+            part.set_state(own)
+
+    def close(self) -> None:
+        """Do nothing: there is no other process."""

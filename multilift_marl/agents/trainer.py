@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -25,11 +24,20 @@ from multilift_marl.agents.checkpoint import (
     save_checkpoint,
     unlock_run,
 )
+from multilift_marl.agents.episodes import EpisodeStatistics
 from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import RunLog, write_versions
-from multilift_marl.agents.mappo import adapted_rate, check_batch, check_communication, make_learner, update
+from multilift_marl.agents.mappo import (
+    StochasticPolicy,
+    adapted_rate,
+    check_batch,
+    check_communication,
+    make_learner,
+    update,
+)
 from multilift_marl.agents.policy import check_policy
-from multilift_marl.agents.rollouts import Rollouts
+from multilift_marl.agents.rigs import check_rigs, divide_rigs
+from multilift_marl.agents.rollouts import RigRollouts, Rollouts
 from multilift_marl.agents.workers import Workers
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, dump_config
@@ -65,21 +73,28 @@ class Trainer:
         for env in (config.env, environment.env):
             check_communication(config.train, env)
         train, num_envs = config.train, environment.env.num_envs
-        here = environment if train.workers == 0 else build_config(environment.model_dump(), {"env.num_envs": 1})
-        self.env = MultiliftEnv(here, memory=train.gru)
+        rigs = [environment] if train.workers == 0 else [build_config(environment.model_dump(), {"env.num_envs": 1})]
+        if train.rigs:
+            rigs = divide_rigs(environment)
+        share = num_envs // max(len(train.rigs), 1)
+        envs = [MultiliftEnv(rig, first_env=k * share, memory=train.gru) for k, rig in enumerate(rigs)]
+        check_rigs(train, [env.vec for env in envs])
+        self.env = envs[0]
         self.frames_per_batch = num_envs * train.horizon
-        check_batch(train, self.env.vec, num_envs)
+        check_batch(train, self.env.vec, num_envs, len(envs))
         self.learner = make_learner(train, self.env)
-        self.rollouts: Rollouts | Workers
+        self.rollouts: Rollouts | RigRollouts | Workers
         if train.workers == 0:
-            self.rollouts = Rollouts(self.env, self.learner.policy, train.horizon, num_envs)
+            policies = [self.learner.policy, *(StochasticPolicy(self.learner.actor) for _ in envs[1:])]
+            parts = [Rollouts(env, own, train.horizon, num_envs) for env, own in zip(envs, policies, strict=True)]
+            self.rollouts = RigRollouts(parts) if train.rigs else parts[0]
         else:
             self.rollouts = Workers(environment, self.learner.actor)
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
         self.evaluator = Evaluator(config)
         self.gain: Gain | None = None
-        self._returns = np.zeros(num_envs)  # of the episodes in flight
+        self.episodes = EpisodeStatistics(self.env.vec, num_envs)
         self._stop, self._warned, self._best_saved, self.status = False, False, True, 128 + signal.SIGINT
         if checkpoint is not None:
             self._restore(checkpoint)
@@ -178,16 +193,16 @@ class Trainer:
         rate = actor["lr"]
         if self.iteration < train.warmup:
             actor["lr"] = 0.0
-        batch = self.rollouts.collect(self.iteration)
+        batches = self.rollouts.collect(self.iteration)
         sampling = time.perf_counter() - start
         torch.set_num_threads(train.threads)
-        values = update(self.learner, batch)
+        values = update(self.learner, batches)
         torch.set_num_threads(1)
         actor["lr"] = rate
         if train.desired_kl and self.iteration >= train.warmup:
             actor["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
         learning = values.pop("learning_seconds")
-        values |= self._episodes(batch)
+        values |= self.episodes.read(batches, self.iteration)
         self.iteration += 1
         return values | {
             "learning_rate": rate,
@@ -235,7 +250,7 @@ class Trainer:
             "critic": self.learner.critic.state_dict(),  # with its normaliser and that of the values
             "optimizer": self.learner.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
-            "returns": torch.from_numpy(self._returns.copy()),
+            "returns": torch.from_numpy(self.episodes.returns.copy()),
             "seconds": self.seconds,
             "best_policy": self.evaluator.best,
         }
@@ -274,7 +289,7 @@ class Trainer:
         for parameter, moments in optimizer.state.items():
             like = {"step": torch.zeros(()), "exp_avg": parameter.data, "exp_avg_sq": parameter.data}
             check_like(moments, like, "optimizer.state")
-        self._returns[:] = content["returns"].numpy()
+        self.episodes.returns[:] = content["returns"].numpy()
         self.iteration, self.seconds = content["iteration"], content["seconds"]
         self.evaluator.best = content["best_policy"]
 
@@ -292,33 +307,6 @@ class Trainer:
         trace = trace_episode(self.config, policy.bind, 0, self.config.seed)
         plot_paths(path, trace, f"best policy so far, iteration {self.iteration}")
         return path
-
-    def _episodes(self, batch: Any) -> dict[str, float]:
-        """Return statistics of the rollouts: reward terms, and of whole episodes that ended: return, success, failure.
-
-        Nothing counts before an episode's length has passed: until then those end that the staggered start cut short,
-        and of the whole ones that follow only the failures.
-        """
-        vec = self.env.vec
-        rewards = batch["next", "agents", "reward"].mean(dim=(-2, -1)).double().numpy()
-        done = batch["next", "done"].squeeze(-1).numpy()
-        elapsed = self.iteration * done.shape[1] + np.arange(done.shape[1])
-        counted = done & (elapsed >= vec.max_steps)
-        finished = []
-        for t in range(rewards.shape[1]):
-            self._returns += rewards[:, t]
-            finished += self._returns[counted[:, t]].tolist()
-            self._returns[done[:, t]] = 0.0
-        info = batch["next", "info"]
-        terms = info["reward_terms"].mean(dim=(0, 1)).tolist()
-        values = {f"reward/{name}": term for name, term in zip(vec.reward_terms, terms, strict=True)}
-        values["reward/total"] = float(rewards.mean())
-        if finished:
-            values["return"] = float(np.mean(finished))
-            for name in ("success", "failure"):
-                values[name] = float(info[name].squeeze(-1).numpy()[counted].mean())
-        values["diverged"] = info["diverged"].sum().item()
-        return values
 
     def _interrupt(self, signum: int, frame: Any) -> None:
         if self._stop:

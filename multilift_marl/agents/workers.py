@@ -19,7 +19,7 @@ from multilift_marl import _ray
 from multilift_marl._platform import STOPPING, cpu_count
 from multilift_marl.agents.mappo import StochasticPolicy, make_actor
 from multilift_marl.agents.networks import Actor
-from multilift_marl.agents.rollouts import Rollouts
+from multilift_marl.agents.rollouts import Batches, Rollouts
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
 from multilift_marl.envs.torchrl_env import MultiliftEnv
@@ -56,8 +56,8 @@ class Workers:
         self._workers = [self._make(k) for k in range(count)]
         self.received = 0
 
-    def collect(self, iteration: int) -> TensorDict:
-        """Return the next T steps of all environments, batch size [E, T]."""
+    def collect(self, iteration: int) -> Batches:
+        """Return the next T steps of all environments, one batch of size [E, T]."""
         weights = self._ray.put({name: tensor.numpy() for name, tensor in self._actor.state_dict().items()})
         pending = [worker.collect.remote(weights, iteration) for worker in self._workers]
         parts = []
@@ -70,7 +70,7 @@ class Workers:
         batch = TensorDict({}, size)
         for key, tensor in joined.items():
             batch[key] = tensor
-        return batch
+        return [batch]
 
     def get_state(self) -> dict[str, torch.Tensor]:
         """Return all that later batches depend on beside the weights, environment first."""
@@ -161,7 +161,7 @@ class _Worker:
     def collect(self, weights: Arrays, iteration: int) -> tuple[Arrays, Arrays]:
         """Return a batch's rows by key, and the state of the environments after it."""
         self._actor.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in weights.items()})
-        batch = self._rollouts.collect(iteration)
+        [batch] = self._rollouts.collect(iteration)
         return {key: tensor.numpy() for key, tensor in batch.items(True, True)}, self.get_state()
 
     def get_state(self) -> Arrays:

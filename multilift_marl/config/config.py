@@ -8,8 +8,9 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from multilift_marl.config.files import pin_files
-from multilift_marl.config.schema import RewardTerm, SystemConfig
+from multilift_marl.config.schema import ControlConfig, RewardTerm, SystemConfig
 from multilift_marl.config.train_schema import EvalConfig, TrainConfig
+from multilift_marl.config.units import scale_control
 from multilift_marl.rig.resolve import resolve_system
 from multilift_marl.rig.system import System
 
@@ -26,3 +27,8 @@ class Config(SystemConfig):
     def system(self) -> System:
         """The physical system that this configuration describes; a ConfigError if it cannot be or cannot fly."""
         return resolve_system(self)
+
+    @cached_property
+    def acting(self) -> ControlConfig:
+        """`control`, its full scales of actions in SI units whatever `env.units` is."""
+        return self.control if self.env.units == "si" else scale_control(self.control, self.system)

@@ -54,6 +54,9 @@ class EnvConfig(Section):
     communication_range: Annotated[Float | None, Between(0, 1e6, "m")] = Field(
         None, description="[m] beyond which drones do not hear each other; None: no limit"
     )
+    units: Literal["si", "cable"] = Field(
+        "si", description="of observations and full actions; cable: those of the similar rig with cables of 1 m"
+    )
     history: Int = Field(1, ge=1, le=50, description="steps that an observation holds, the newest first")
 
 

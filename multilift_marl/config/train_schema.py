@@ -68,6 +68,9 @@ class TrainConfig(Section):
     overrides: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field(
         {}, description="of the environment that it trains in, by dotted name"
     )
+    rigs: tuple[Annotated[dict[str, Any], AfterValidator(pin_files)], ...] = Field(
+        (), description="rigs that it trains with together, each by what differs in its environment, by dotted name"
+    )
     threads: Int = Field(
         2, ge=1, le=1024, description="threads of the update; weights are bit-equal for the same number"
     )

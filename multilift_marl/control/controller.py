@@ -39,7 +39,7 @@ class Controller:
         settings, dt = config.control, 1.0 / config.sim.control_hz
         e, n = world.num_envs, world.num_drones
         self.world, self.state = world, world.state if state is None else state
-        self.interface = ACTIONS[settings.action](settings, dt)
+        self.interface = ACTIONS[settings.action](config.acting, dt)
         self.action_names = tuple(number.name for number in self.interface.numbers)
         self.reference = Reference.zeros(e, n)
         self.disturbance: Disturbance | None = None

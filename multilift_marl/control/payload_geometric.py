@@ -111,7 +111,7 @@ class PayloadGeometric:
     INTERFACE: ClassVar[str] = "reference"
 
     def __init__(self, vec: MultiliftVec, gains: PayloadGains | None = None):
-        system, control, task = vec.world.system, vec.config.control, vec.task
+        system, control, task = vec.world.system, vec.config.acting, vec.task
         gains = PayloadGains() if gains is None else gains
         drone = make_gains(control, system)
         lead_steps = gains.lead * 3.0 / control.reference_frequency / task.dt

@@ -157,7 +157,8 @@ class FormationLead(Formation):
 
     def __init__(self, vec: MultiliftVec):
         lengths, angle = vec.world.system.cable_length, vec.config.cable.angle
-        self._height = float(np.mean(lengths)) * cos(radians(angle))
+        length = float(np.mean(lengths)) if vec.config.env.units == "si" else 1.0
+        self._height = length * cos(radians(angle))
         super().__init__(vec)
 
     def matrix(self) -> np.ndarray:

@@ -64,7 +64,7 @@ class SetPoints:
         return self._actions()
 
     def _actions(self) -> np.ndarray:
-        goal, control = self._vec.task.planned, self._vec.config.control
+        goal, control = self._vec.task.planned, self._vec.config.acting
         offset = self._place - goal.slots[0]
         c, s = goal.slot_frame[0].T
         turned = self._yaw - goal.drone_yaw[0] - self._vec.world.system.heading

@@ -24,9 +24,10 @@ from multilift_marl.tasks.load_sensing import true_load
 from multilift_marl.tasks.observation_kernels import check_written, compose_observation, compose_state
 from multilift_marl.tasks.observations import SENSED, Component, list_components
 from multilift_marl.tasks.rewards import RestBounds, Term, compose_reward, is_at_rest
+from multilift_marl.tasks.rig_numbers import RIG, describe_rig, observed_units, scale_numbers
 from multilift_marl.tasks.sensing import Sensing
 from multilift_marl.tasks.starts import make_hanging, true_hanging
-from multilift_marl.tasks.view import Errors, View, reduce_view, update_errors
+from multilift_marl.tasks.view import INTEGRAL_LIMIT, Errors, View, reduce_view, update_errors
 
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
 Call = Callable[[int, int], None]  # of environments lo to hi
@@ -157,9 +158,11 @@ class Task:
             planned=self.planned,
             has_plan=self.planned is not self.goal,
             errors=self.errors,
+            integral_limit=INTEGRAL_LIMIT * observed_units(config, ("m s", "rad s")),
             seen_errors=sensing.errors or self.errors.as_rows(),
             reference=reference,
             rig=self.rig,
+            rig_numbers=describe_rig(system, self.dt),
             nominal=self.nominal_hanging,
             resting_tension=system.resting_tension,
             limits=self.limits,
@@ -182,7 +185,8 @@ class Task:
     @classmethod
     def extra(cls, config: Config) -> tuple[Component, ...]:
         """Return what observations have beside the common components: the task's own, and what only sensors tell."""
-        return (*cls.EXTRA, *SENSED.get(config.env.sensing, ()))
+        rig = () if config.env.units == "si" else (RIG,)
+        return (*cls.EXTRA, *SENSED.get(config.env.sensing, ()), *rig)
 
     def prepare(self) -> None:
         """Check the options, set `settings`, and `own` where the task has arrays of its own."""
@@ -282,7 +286,12 @@ class Task:
     def _compose(self) -> dict[str, Call]:
         """Return the stages of a step that are the task's, each a call of (lo, hi)."""
         v, kernels, size = self.view, self.KERNELS, self.action.shape[2]
-        observe = compose_observation(self.extra(self.config), self.config.control.action)
+        extra, action = self.extra(self.config), self.config.control.action
+        observe = self._bind(compose_observation(extra, action), v, self.observation)
+        if self.config.env.units != "si":
+            units = [part.unit for part in list_components(action, extra) for _ in range(part.size)]
+            factors = 1 / observed_units(self.config, units)
+            observe = _follow(observe, prebind(scale_numbers, self.observation, factors))
         check = compose_check(kernels.check)
         stages = {
             "measure": self._bind(check, v, 0.0),
@@ -290,7 +299,7 @@ class Task:
             "reward": self._bind(
                 compose_reward(self.REWARD, kernels.is_good, kernels.update), v, self.weights, self.margins
             ),
-            "observe": self._bind(observe, v, self.observation),
+            "observe": observe,
         }
         true = v._replace(seen=v.state, load=v.true_load, seen_errors=v.true_errors)
         stages["observe state"] = self._bind(compose_state(self._state, kernels.preview, size), true, self.critic)
@@ -301,6 +310,16 @@ class Task:
     @staticmethod
     def _bind(kernel: Callable[..., Any], view: View, *arguments: Any) -> Call:
         return prebind(kernel, reduce_view(view, kernel), *arguments)
+
+
+def _follow(first: Call, then: Call) -> Call:
+    """Return a call of (lo, hi) that makes both, one after the other."""
+
+    def call(lo: int, hi: int) -> None:
+        first(lo, hi)
+        then(lo, hi)
+
+    return call
 
 
 def compose_check(check: Callable[..., Any] | None) -> Callable[..., Any]:

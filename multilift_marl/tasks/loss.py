@@ -235,7 +235,7 @@ class Loss(Task):
 
     def prepare(self) -> None:
         """See `Task.prepare`."""
-        option, world, control = self.options, self.world, self.config.control
+        option, world, control = self.options, self.world, self.config.acting
         early, late = option.loss_time
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")

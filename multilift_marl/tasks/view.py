@@ -17,7 +17,7 @@ from multilift_marl.tasks.failures import FailureMask, Limits
 from multilift_marl.tasks.load_sensing import Load
 from multilift_marl.tasks.starts import CableEquilibrium
 
-INTEGRAL_LIMIT = 0.5  # [m s] and [rad s], each component of the error integrals: a full action's worth of the scripts
+INTEGRAL_LIMIT = 0.5  # of each component of the error integrals, as observed: a full action's worth of the scripts
 
 
 class Errors(NamedTuple):
@@ -71,10 +71,14 @@ class View(NamedTuple):
     """What the drones fly about: `goal` itself, unless a plan leads there."""
     has_plan: bool
     errors: Errors
+    integral_limit: np.ndarray
+    """(2,) of its integrals' components [m s], [rad s]."""
     seen_errors: Errors
     """From `load`, a row for each of its; `true_errors` where nothing disturbs that."""
     reference: Reference
     rig: Rig
+    rig_numbers: np.ndarray
+    """(N, 8) what tells the rig from others; see `tasks/rig_numbers.py`."""
     nominal: CableEquilibrium
     """The nominal team."""
     resting_tension: np.ndarray
@@ -183,6 +187,6 @@ def update_errors(e, k, load, errors, v, dt):
         rotation = rotation_vector(matmul(attitude, transpose(matrow(planned.rotation, e))))
     for j in range(3):
         moved = errors.position_integral[e, k, j] + dt * offset[j]
-        errors.position_integral[e, k, j] = clip(moved, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+        errors.position_integral[e, k, j] = clip(moved, -v.integral_limit[0], v.integral_limit[0])
         moved = errors.rotation_integral[e, k, j] + dt * rotation[j]
-        errors.rotation_integral[e, k, j] = clip(moved, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
+        errors.rotation_integral[e, k, j] = clip(moved, -v.integral_limit[1], v.integral_limit[1])
