@@ -16,7 +16,7 @@ from flights import HERE, ROOT
 
 RECIPES = {
     "hover_acc_rates": "accelerations and tilt rates", "hover_ctbr": "thrust and body rates",
-    "hover_ctbm": "thrust and moments",
+    "hover_ctbm": "thrust and moments", "hover_rotor": "rotor thrusts",
 }  # fmt: skip
 SCRIPTS = {"formation_integral": "--", "formation_feedback": ":"}
 PANELS = (  # column of the curves, metric of the scripts, factor, label

@@ -41,6 +41,7 @@ FLIGHTS: dict[str, Flight] = {
     ),
     "hover_ctbr": Flight("hover_ctbr", {}, "hover_ctbr", "hover by thrust and body rates, from nothing"),
     "hover_ctbm": Flight("hover_ctbm", {}, "hover_ctbm", "hover by thrust and moments, from nothing"),
+    "hover_rotor": Flight("hover_rotor", {}, "hover_rotor", "hover by rotor thrusts, from nothing"),
     "hover_wind": Flight("hover_wind", {}, "hover_wind", "hover in wind of 5 m/s, noise, delay"),
     "hover_realistic": Flight("hover_realistic", {}, "hover_realistic", "hover, realistic"),
     "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
