@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from conftest import bold_actions, make
+from conftest import bold_actions, make, refusal
 
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.control.scripted import make_scripted
@@ -120,3 +120,14 @@ def test_every_task_has_them(task):
     assert observation.shape[-1] == len(vec.observation_names) and vec.observation_names[-1] == "rig_7"
     observation, *_ = vec.step(np.zeros((2, 4, 4)))
     assert np.isfinite(observation).all()
+
+
+def test_the_rates_of_a_script_are_those_of_the_cables():
+    """On short cables the gains of hold_ctbm are larger, and too large for the policy's rate sooner."""
+    metre, short, cable = (
+        make(num_envs=1, **{"control.action": "ctbm", "cable.length": length, "env.units": units})
+        for length, units in ((1.0, "cable"), (0.7, "si"), (0.7, "cable"))
+    )
+    make_scripted("hold_ctbm", metre)
+    make_scripted("hold_ctbm", short)
+    assert "raise it to 53.8 or more" in refusal(make_scripted, "hold_ctbm", cable)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from multilift_marl.config.units import unit_size
 from multilift_marl.control.scripted_formation import PLANNED, Formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.rig.vehicles import GRAVITY
@@ -155,11 +156,13 @@ class HoldCtbm(HoldCtbr):
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
         control, matrix = self._vec.config.control, super().matrix()
-        frequency = self._vec.config.env.policy_hz
-        if self.RATE_GAIN > frequency:  # a step would turn the rate back by more than all of it
+        config, gain = self._vec.config, self.RATE_GAIN
+        if config.env.units == "cable":
+            gain *= unit_size("rad/s", config.system)
+        if gain > config.env.policy_hz:  # a step would turn the rate back by more than all of it
             raise ConfigError(
-                f"the script hold_ctbm holds the attitude by itself, and env.policy_hz={frequency:g} is too slow for "
-                f"that; raise it to {self.RATE_GAIN:g} or more"
+                f"the script hold_ctbm holds the attitude by itself, and env.policy_hz={config.env.policy_hz:g} is too "
+                f"slow for that; raise it to {gain:.3g} or more"
             )
         full = (control.max_tilt_rate, control.max_tilt_rate, control.max_yaw_rate)
         for axis, gain in enumerate((self.RATE_GAIN, self.RATE_GAIN, self.YAW_RATE_GAIN)):
