@@ -4,7 +4,8 @@
 
 It starts from the gains of `script`, with candidates `spread` times the scales of `SLOTS` or `HELD` around them,
 simulates the same `env.num_envs` episodes with all candidates of a generation, and prints the final gains and their
-results in episodes that are not part of the search. Any configuration key changes the task.
+results in episodes that are not part of the search. Any configuration key changes the task; where it has `train.rigs`,
+one script is searched for all of them.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.cli.common import run_command, split_options
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
@@ -106,8 +108,11 @@ def make_script(script: str, free: Free, changes: np.ndarray) -> type[Formation]
 
 
 def fly(config: Config, script: type[Formation], seed: int) -> Score:
-    """Simulate one episode in every environment of `config`."""
-    flown = fly_episodes(config, script, config.env.num_envs, seed, TRAINING_EVALUATION)
+    """Simulate one episode in every environment of `config`, an equal share of them with each of `train.rigs`."""
+    rigs = evaluated_rigs(config)
+    each = max(1, config.env.num_envs // len(rigs))
+    parts = [fly_episodes(rig, script, each, seed, TRAINING_EVALUATION) for rig in rigs]
+    flown = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tracks = config.task == "track"
     error, success = flown["payload_rmse_m" if tracks else "payload_position_error_m"], flown["success_rate"].mean()
     angle = 0.0 if tracks else float(flown["payload_attitude_error_deg"].mean())
