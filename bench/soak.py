@@ -110,11 +110,11 @@ def checked(collect: Callable[[int], Any]) -> Callable[[int], Any]:
     """Return `collect` of rollouts, all of whose numbers must be finite."""
 
     def collect_checked(iteration: int) -> Any:
-        batch = collect(iteration)
-        for key, value in batch.items(include_nested=True, leaves_only=True):
+        batches = collect(iteration)
+        for key, value in (item for batch in batches for item in batch.items(include_nested=True, leaves_only=True)):
             if value.is_floating_point():
                 check_finite(f"batch, {key}", value.numpy())
-        return batch
+        return batches
 
     return collect_checked
 

@@ -98,7 +98,10 @@ def test_a_run_goes_on_with_other_workers(tmp_path, local_ray, before, after):
 
 
 def test_evaluation_by_workers_measures_the_same(tmp_path, local_ray, monkeypatch):
+    import ray
+
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ray, "cancel", None)  # of what has ended, it may abort this process
     common = ["policy=formation_feedback", "config=hover", "env.episode_seconds=1", "episodes=7", "baseline=none"]
     for k in (0, 2):
         assert evaluate([*common, f"workers={k}", f"out=w{k}"]) == 0

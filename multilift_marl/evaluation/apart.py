@@ -52,11 +52,12 @@ def fly_apart(
     pending = [task.remote(values, policy, seed, first, count, *here) for first, count in parts]
     try:
         return _gather(pending, parts, progress)
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from error
-    finally:
-        for result in pending:
-            ray.cancel(result, force=True)
+    except BaseException as error:
+        for result in pending:  # not by force: Ray aborts this process if such a task completes meanwhile
+            ray.cancel(result)
+        if isinstance(error, ray.exceptions.RayTaskError):
+            raise error.cause from error
+        raise
 
 
 def _gather(
