@@ -31,7 +31,7 @@ def checkpoint(task="hover", **overrides):
     """Return what a policy needs of a checkpoint: random weights, as large as after training, and statistics."""
     config = load_config(task, SHORT | overrides)
     actions = [number.name for number in ACTIONS[config.control.action].numbers]
-    names = observation_names(config.control.action, find_task(config.task).EXTRA, config.env.history)
+    names = observation_names(config.control.action, find_task(config.task).extra(config), config.env.history)
     torch.manual_seed(0)
     base = 0.5 * torch.randn(len(actions), len(names)) * (torch.rand(len(actions), len(names)) < 0.05)
     actor = Actor(config.train.actor, len(names), len(actions), config.train.hidden, 0.3, base)
@@ -129,9 +129,31 @@ READ = {
 }
 
 
+def test_the_contract_says_what_a_one_stands_for():
+    other = {"env.units": "cable", "cable.length": 0.5}
+    told = make_contract(policy(**other))["observation"]
+    scaled, plain = make(num_envs=4, **other), make(num_envs=4, **other | {"env.units": "si"})
+    observed, expected = (
+        dict(zip(vec.observation_names, vec.reset(seed=0)[0].T, strict=True)) for vec in (scaled, plain)
+    )
+    assert told["units"] == "cable"
+    sizes = set()
+    for part in told["components"]:
+        for name in told["names"][part["first"] :][: part["size"]]:
+            if part["name"] == "rig":
+                assert part["unit_size"] == 1
+            else:
+                np.testing.assert_allclose(observed[name] * part["unit_size"], expected[name], rtol=1e-5, atol=1e-6)
+                sizes.add(round(part["unit_size"], 3))
+    assert {0.5, 0.707, 1.0, 1.414} <= sizes
+
+
+@pytest.mark.parametrize("units", ["si", "cable"])
 @pytest.mark.parametrize(("interface", "name"), READ)
-def test_full_actions_are_what_the_contract_says(interface, name):
+def test_full_actions_are_what_the_contract_says(interface, name, units):
     other = {
+        "env.units": units,
+        "cable.length": 0.8,
         "control.action": interface,
         "control.max_offset": 0.3,
         "control.max_tilt_rate": 3.5,

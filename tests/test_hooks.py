@@ -71,13 +71,16 @@ def test_the_controller_holds_a_resting_team(model):
         assert np.abs(vec.world.state.drone_position - start).max() < 1e-4
 
 
+@pytest.mark.parametrize("heading", ["target", "outward"])
 @pytest.mark.parametrize("action", ACTIONS)
-def test_an_action_of_zero_hovers_with_every_interface(action):
-    vec = make("hover", num_envs=1, **STILL, **{"cable.hook": ASIDE, "control.action": action})
+def test_an_action_of_zero_hovers_with_every_interface(action, heading):
+    hooks = {"cable.hook": ASIDE, "control.action": action, "control.heading": heading}
+    vec = make("hover", num_envs=1, **STILL, **hooks)
     vec.reset(seed=0)
     level(vec)
     vec.controller.start(0)
     start = vec.world.state.drone_position.copy()
+    np.testing.assert_allclose(start, vec.task.goal.slots, atol=1e-9)
     for _ in range(15):
         vec.step(zeros(vec))
     assert np.abs(vec.world.state.drone_position - start).max() < 1e-4

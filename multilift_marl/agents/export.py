@@ -29,6 +29,7 @@ from multilift_marl.errors import CheckpointError, ConfigError
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks import find_task
 from multilift_marl.tasks.observations import FRAMES, list_components, observation_names
+from multilift_marl.tasks.rig_numbers import observed_units
 from multilift_marl.tasks.view import INTEGRAL_LIMIT
 
 NETWORK, CONTRACT = "policy.onnx", "policy.json"
@@ -200,13 +201,14 @@ def _describe_observation(policy: LearnedPolicy) -> dict[str, Any]:
     parts, at = [], 0
     for part in list_components(config.control.action, find_task(config.task).extra(config)):
         described = {key: getattr(part, key) for key in ("name", "size", "frame", "unit", "meaning")}
-        parts.append({"first": at, **described})
+        parts.append({"first": at, **described, "unit_size": float(observed_units(config, [part.unit])[0])})
         at += part.size
     return {
         "shape": ["batch", "drones", size],
         "dtype": "float32",
         "steps": config.env.history,
         "step_size": at,
+        "units": config.env.units,
         "components": parts,
         "integral_limit": INTEGRAL_LIMIT,
         "names": list(policy.observation_names),
