@@ -14,12 +14,16 @@ _COMMON = ("task", "seed", "train", "eval", "env.num_envs", "env.policy_hz", "en
 
 
 def divide_rigs(environment: Config) -> list[Config]:
-    """Return the environments of each rig, an equal share of all.
+    """Return the environments that this process steps: one of each rig, with an equal share of all.
+
+    Where workers step them, one that tells what they are like.
 
     Raises:
-        ConfigError: shares that are not whole; keys that rigs must have in common; workers.
+        ConfigError: shares that are not whole; keys that rigs must have in common; rigs and workers.
     """
     train, total = environment.train, environment.env.num_envs
+    if not train.rigs:
+        return [build_config(environment.model_dump(), {"env.num_envs": 1})] if train.workers else [environment]
     if train.workers:
         raise ConfigError("train.rigs and train.workers do not go together; set train.workers=0")
     if total % len(train.rigs):

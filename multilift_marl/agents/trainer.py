@@ -73,11 +73,8 @@ class Trainer:
         for env in (config.env, environment.env):
             check_communication(config.train, env)
         train, num_envs = config.train, environment.env.num_envs
-        rigs = [environment] if train.workers == 0 else [build_config(environment.model_dump(), {"env.num_envs": 1})]
-        if train.rigs:
-            rigs = divide_rigs(environment)
-        share = num_envs // max(len(train.rigs), 1)
-        envs = [MultiliftEnv(rig, first_env=k * share, memory=train.gru) for k, rig in enumerate(rigs)]
+        rigs = divide_rigs(environment)
+        envs = [MultiliftEnv(rig, first_env=k * rig.env.num_envs, memory=train.gru) for k, rig in enumerate(rigs)]
         check_rigs(train, [env.vec for env in envs])
         self.env = envs[0]
         self.frames_per_batch = num_envs * train.horizon
