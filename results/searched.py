@@ -14,8 +14,8 @@ Gains = tuple[tuple[str, int, int, float], ...]
 
 
 class HoverRigs(Formation):
-    """Of `hover_generalist`, one for all rigs in units of the cables: 32 minutes from `formation_feedback`, a generation
-    by six of the rigs, the next by the other six, 6 episodes of each. At 1 m it is the same in SI units."""
+    """Of `hover_generalist`, one for all rigs in units of the cables: 32 minutes from `formation_feedback`, in turn by
+    six of the rigs and by the other six, 6 episodes of each a candidate. At 1 m it is the same in SI units."""
 
     GAINS: ClassVar[Gains] = (
         ("payload_error_integral", 0, 0, -1.052),

@@ -12,7 +12,8 @@ HOLDING = {script.INTERFACE: name for name, script in LINEAR.items() if name.sta
 
 
 def make_holding(action, **settings):
-    vec = make(**{"num_envs": 24, "control.action": action, **settings})
+    heading = "outward" if action == "rotor" else "target"
+    vec = make(**{"num_envs": 24, "control.action": action, "control.heading": heading, **settings})
     return vec, make_scripted(HOLDING[action], vec)
 
 
@@ -52,27 +53,57 @@ def test_a_drone_off_its_slot_begins_to_move_by_the_law(action):
         assert action_taken[0] * vec.config.control.max_velocity == pytest.approx(expected, rel=1e-5)
 
 
-def test_where_the_script_alone_holds_the_attitude_a_slow_policy_is_refused():
-    slow = make(num_envs=1, **{"control.action": "ctbm", "env.policy_hz": 25.0})
-    assert "env.policy_hz=25 is too slow for that; raise it to 45" in refusal(make_scripted, "hold_ctbm", slow)
+def test_rotors_exert_what_the_moments_command():
+    """In both cases the wrench of a drone beside its slot, tilted, turning; thrusts within the limits."""
+    made, wrenches = {action: make_holding(action, num_envs=1) for action in ("ctbm", "rotor")}, []
+    for action, (vec, script) in made.items():
+        names = vec.observation_names
+        seen = np.zeros((1, 4, vec.observation_size), np.float32)
+        for name, value in {"slot_error_1": 0.02, "thrust_axis_0": 0.1, "heading_0": 1.0, "velocity_2": 0.1}.items():
+            seen[..., names.index(name)] = value
+        for axis, rate in enumerate((0.1, -0.05, 0.02)):
+            seen[..., names.index(f"{'body' if action == 'rotor' else 'turned'}_rates_{axis}")] = rate
+        vehicle, acted = vec.world.system.vehicle, script.act(seen)[0, 0]
+        assert np.abs(acted).max() < 1
+        hover = np.linalg.norm(vec.world.system.hook_force[0] + np.array([0.0, 0.0, vehicle.mass * 9.81]))
+        room = 4 * vehicle.max_thrust - hover
+        if action == "rotor":
+            wrenches.append(vehicle.allocation @ (acted * room / 4))
+        else:
+            moments = acted[1:] * vec.config.control.max_angular_acceleration * np.array(vehicle.inertia)
+            wrenches.append(np.array([acted[0] * room, *moments]))
+    assert np.abs(wrenches[0]).min() > 1e-4
+    np.testing.assert_allclose(wrenches[1], wrenches[0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("action", ["ctbm", "rotor"])
+def test_where_the_script_alone_holds_the_attitude_a_slow_policy_is_refused(action):
+    slow = make(num_envs=1, **{"control.action": action, "control.heading": "outward", "env.policy_hz": 25.0})
+    message = refusal(make_scripted, f"hold_{action}", slow)
+    assert f"hold_{action} holds" in message and "env.policy_hz=25 is too slow for that; raise it to 45" in message
 
 
 @pytest.mark.parametrize("action", HOLDING)
 def test_a_turned_drone_turns_back(action):
-    if action == "acc_rates":  # its yaw is the target's
+    if action == "acc_rates":  # its yaw is that at rest
         return
     vec, script = make_holding(action, num_envs=1)
     seen = np.zeros((1, 4, vec.observation_size), np.float32)
     seen[..., vec.observation_names.index("heading_0")] = np.cos(0.3)
     seen[..., vec.observation_names.index("heading_1")] = np.sin(0.3)
-    assert (script.act(seen)[..., -1] < 0).all()
+    turning = (
+        script.act(seen) @ vec.world.system.vehicle.allocation[3] if action == "rotor" else script.act(seen)[..., -1]
+    )
+    assert (turning < 0).all()
 
 
 def test_each_fits_its_interface_alone():
     for action, name in HOLDING.items():
-        assert fitting_scripts(make(num_envs=1, **{"control.action": action})) == [name]
+        assert fitting_scripts(make_holding(action, num_envs=1)[0]) == [name]
     assert not set(fitting_scripts(make(num_envs=1))) & set(HOLDING.values())
-    assert fitting_scripts(make(num_envs=1, **{"control.action": "rotor"})) == []
+    rotor = make(num_envs=1, **{"control.action": "rotor"})
+    assert fitting_scripts(rotor) == []
+    assert "set control.heading=outward" in refusal(make_scripted, "hold_rotor", rotor)
     vec = make(num_envs=1, **{"control.action": "ctbr"})
     assert "take hold_ctbr" in refusal(make_scripted, "formation_integral", vec)
 

@@ -30,8 +30,8 @@ _USAGE = """Evaluate a team on fixed seeds, beside the scripted ones on the same
   python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
 Scripts are formation, formation_integral, formation_feedback, formation_gusts, formation_lead, formation_narrow,
-formation_redistributed and payload_geometric; hold_velocity, hold_acceleration, hold_acc_rates, hold_ctbr and hold_ctbm
-with these action interfaces. task=<other> keeps the configuration's vehicles, payload, cables and
+formation_redistributed and payload_geometric; hold_velocity, hold_acceleration, hold_acc_rates, hold_ctbr, hold_ctbm
+and hold_rotor with these action interfaces. task=<other> keeps the configuration's vehicles, payload, cables and
 control, see python train.py --help.
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
 

@@ -12,6 +12,7 @@ from multilift_marl.config.values import Float, Int, Section
 RESIDUALS = (
     "formation", "formation_integral", "formation_feedback", "formation_gusts", "formation_lead", "formation_narrow",
     "formation_redistributed", "hold_velocity", "hold_acceleration", "hold_acc_rates", "hold_ctbr", "hold_ctbm",
+    "hold_rotor",
 )  # fmt: skip
 
 

@@ -17,7 +17,14 @@ from multilift_marl.control.scripted_formation import (
     FormationNarrow,
     FormationRedistributed,
 )
-from multilift_marl.control.scripted_hold import HoldAcceleration, HoldAccRates, HoldCtbm, HoldCtbr, HoldVelocity
+from multilift_marl.control.scripted_hold import (
+    HoldAcceleration,
+    HoldAccRates,
+    HoldCtbm,
+    HoldCtbr,
+    HoldRotor,
+    HoldVelocity,
+)
 from multilift_marl.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -36,6 +43,7 @@ LINEAR: dict[str, type[Formation]] = {
     "hold_acc_rates": HoldAccRates,
     "hold_ctbr": HoldCtbr,
     "hold_ctbm": HoldCtbm,
+    "hold_rotor": HoldRotor,
 }
 """Scripts that are maps of the observation."""
 SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric]] = {

@@ -1,4 +1,4 @@
-"""Scripts for the action interfaces below `reference`: velocity, acceleration, acc_rates, ctbr, ctbm.
+"""Scripts for the action interfaces below `reference`: velocity, acceleration, acc_rates, ctbr, ctbm, rotor.
 
 One linear PD law with an integral for the acceleration of each drone, converted to each interface. All are linear maps
 of the observation, so that a learned policy can start from them (`train.residual`) and gains can be searched
@@ -123,12 +123,11 @@ class HoldCtbr(HoldAcceleration):
 
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
-        control, system, law = self._vec.config.control, self._vec.world.system, self.law()
+        control, law = self._vec.config.control, self.law()
         matrix = np.zeros((len(self._actions), len(self._names)), np.float32)
         gains = self._vec.controller.gains
         mass = float(np.mean(gains.mass + gains.load_share))
-        force = system.hook_force[0] + np.array([0.0, 0.0, float(gains.mass[0]) * GRAVITY])  # at rest
-        hover = float(np.linalg.norm(force))
+        force, hover = self._force_at_rest(), self._hover_thrust()
 
         # More or less thrust than at rest, by the range above it; that below is about as large.
         matrix[0] = law[2] * mass / (4 * float(np.min(gains.thrust_max)) - hover)
@@ -144,6 +143,14 @@ class HoldCtbr(HoldAcceleration):
         matrix[3] = self._turn_back() / control.max_yaw_rate
         return matrix
 
+    def _force_at_rest(self) -> np.ndarray:
+        """Return what the first drone's rotors exert at rest, in its slot frame (3,) [N]."""
+        weight = float(self._vec.controller.gains.mass[0]) * GRAVITY
+        return self._vec.world.system.hook_force[0] + np.array([0.0, 0.0, weight])
+
+    def _hover_thrust(self) -> float:
+        return float(np.linalg.norm(self._force_at_rest()))
+
 
 class HoldCtbm(HoldCtbr):
     """The same law by thrust and moments: those that turn a drone at the body rates of `hold_ctbr`."""
@@ -152,6 +159,7 @@ class HoldCtbm(HoldCtbr):
     TILT_GAIN = 9.0
     RATE_GAIN: ClassVar[float] = 45.0  # [1/s] of a body rate from the desired one
     YAW_RATE_GAIN: ClassVar[float] = 15.0  # [1/s] rotors that change speed turn the drone at once: more oscillates
+    RATES: ClassVar[str] = "turned_rates"
 
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
@@ -161,12 +169,36 @@ class HoldCtbm(HoldCtbr):
             gain *= unit_size("rad/s", config.system)
         if gain > config.env.policy_hz:  # a step would turn the rate back by more than all of it
             raise ConfigError(
-                f"the script hold_ctbm holds the attitude by itself, and env.policy_hz={config.env.policy_hz:g} is too "
-                f"slow for that; raise it to {gain:.3g} or more"
+                f"the script hold_{self.INTERFACE} holds the attitude by itself, and "
+                f"env.policy_hz={config.env.policy_hz:g} is too slow for that; raise it to {gain:.3g} or more"
             )
         full = (control.max_tilt_rate, control.max_tilt_rate, control.max_yaw_rate)
         for axis, gain in enumerate((self.RATE_GAIN, self.RATE_GAIN, self.YAW_RATE_GAIN)):
             matrix[1 + axis] *= full[axis]
-            matrix[1 + axis, self._column("turned_rates", axis)] -= 1.0
+            matrix[1 + axis, self._column(self.RATES, axis)] -= 1.0
             matrix[1 + axis] *= gain / control.max_angular_acceleration
         return matrix
+
+
+class HoldRotor(HoldCtbm):
+    """The same law by the rotors' thrusts: those that exert the thrust and the moments of `hold_ctbm`."""
+
+    INTERFACE = "rotor"
+    RATES = "body_rates"
+    REFUSAL = (
+        "the script hold_rotor is one map for all drones, whose rotors must be in the same places about their slots; "
+        "set control.heading=outward"
+    )
+
+    @classmethod
+    def fits(cls, vec: MultiliftVec) -> bool:
+        """See `Formation.fits`."""
+        return vec.config.control.heading == "outward" and super().fits(vec)
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        gains, vehicle, wrench = self._vec.controller.gains, self._vec.world.system.vehicle, super().matrix()
+        hover, most = self._hover_thrust(), 4 * float(np.min(gains.thrust_max))
+        turning = self._vec.config.acting.max_angular_acceleration * np.array(vehicle.inertia)
+        wrench *= np.array([most - hover, *turning], np.float32)[:, None]
+        return (np.linalg.inv(vehicle.allocation) @ wrench / ((most - hover) / 4)).astype(np.float32)
