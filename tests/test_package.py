@@ -16,7 +16,7 @@ from multilift_marl._kernel_cache import cache_folder
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.cli.export import main as export
 from multilift_marl.cli.train import main as train
-from multilift_marl.config.schema import RandomizationConfig
+from multilift_marl.config.schema import PushConfig, RandomizationConfig
 from multilift_marl.errors import pip_install
 from multilift_marl.evaluation import plots
 from multilift_marl.tasks import find_task
@@ -127,9 +127,10 @@ def test_documents_name_everything_about_a_task(task):
         assert f"`{cause}`" in common, cause
 
 
-def test_the_table_of_hidden_parameters_is_complete():
+def test_the_tables_of_hidden_parameters_are_complete():
     text = (ROOT / "docs" / "randomization.md").read_text()
-    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(RandomizationConfig.model_fields)
+    known = [*RandomizationConfig.model_fields, *PushConfig.model_fields]
+    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == known
 
 
 @pytest.mark.parametrize("document", DOCUMENTS + TUTORIALS, ids=lambda path: str(path.relative_to(ROOT)))

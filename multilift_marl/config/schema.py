@@ -293,6 +293,23 @@ class WindConfig(Section):
     )
 
 
+class PushConfig(Section):
+    """Leaps of velocity of single bodies at random times (docs/randomization.md)."""
+
+    interval: Annotated[Float, Between(0.01, 1e6, "s")] = Field(
+        5.0, gt=0, description="[s] mean time between two pushes of a body"
+    )
+    payload_velocity: Annotated[Float, Between(0, 10, "m/s")] = Field(
+        0.0, ge=0, description="[m/s] leap of the payload's velocity, uniform up to this, any direction"
+    )
+    drone_velocity: Annotated[Float, Between(0, 10, "m/s")] = Field(
+        0.0, ge=0, description="[m/s] the same of a drone's velocity"
+    )
+    drone_rates: Annotated[Float, Between(0, 30, "rad/s")] = Field(
+        0.0, ge=0, description="[rad/s] the same of its body rates, at the same time"
+    )
+
+
 class RewardTerm(Section):
     """A reward term's own numbers; a bare number is its weight."""
 
@@ -333,3 +350,4 @@ class SystemConfig(_Imports):
     control: ControlConfig = ControlConfig()
     randomization: RandomizationConfig = RandomizationConfig()
     wind: WindConfig = WindConfig()
+    push: PushConfig = PushConfig()

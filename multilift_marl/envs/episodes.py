@@ -18,7 +18,7 @@ from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.failures import CAUSES
 from multilift_marl.tasks.sensing import Sensing
 
-TURBULENCE, PARAMETERS, SENSORS = 1, 2, 3  # streams of their own, so that none moves what the others draw
+TURBULENCE, PARAMETERS, SENSORS, PUSHES = 1, 2, 3, 4  # streams of their own, so that none moves what the others draw
 _MAX_REDRAWS = 1000
 
 
@@ -68,6 +68,8 @@ class Episodes:
         """
         if self._world.system.air.turbulence:
             self._world.seed_turbulence(e, np.random.SeedSequence(seed, spawn_key=(*key, TURBULENCE)))
+        if self._world.pushes is not None:
+            self._world.seed_pushes(e, np.random.SeedSequence(seed, spawn_key=(*key, PUSHES)))
         if self._sensing.enabled:
             self._sensing.start(e, np.random.SeedSequence(seed, spawn_key=(*key, SENSORS)))
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))

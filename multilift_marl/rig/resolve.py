@@ -107,6 +107,7 @@ def resolve_system(config: SystemConfig) -> System:
         min_separation=MIN_SEPARATION * ((spans[:, None] + spans) / 2 / _FALCON.span),
         wind=np.asarray(config.wind.velocity, float),
         air=config.wind,
+        push=config.push,
         timestep=config.sim.timestep,
         control_interval=whole_ratio(
             1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"

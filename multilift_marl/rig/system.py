@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from multilift_marl.config.schema import WindConfig
+from multilift_marl.config.schema import PushConfig, WindConfig
 from multilift_marl.math3d import quat_to_mat, thrust_frame
 from multilift_marl.rig.mesh import Mesh
 from multilift_marl.rig.vehicles import GRAVITY, Vehicle
@@ -42,6 +42,7 @@ class System:
         min_separation: distance between two drones that counts as a collision (N, N) [m].
         wind: mean wind (3,) [m/s].
         air: what else the air does.
+        push: pushes of its bodies.
         timestep: physics step [s].
         control_interval: physics steps for each control step.
         varied: keys of `randomization` by which environments differ.
@@ -75,6 +76,7 @@ class System:
     min_separation: np.ndarray
     wind: np.ndarray
     air: WindConfig
+    push: PushConfig
     timestep: float
     control_interval: int
     varied: frozenset[str] = frozenset()

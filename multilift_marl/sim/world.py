@@ -33,6 +33,7 @@ from multilift_marl.sim.parameters import (
     write_lags,
     write_masses,
 )
+from multilift_marl.sim.pushes import Pushes, apply_pushes, make_pushes, start_pushes
 from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.state import Air, EpisodeStats, HiddenLoads, SimData, SystemState, hover_drone
@@ -52,6 +53,8 @@ class Shard:
     rows: Rows
     apply: Callable[[], None]
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
+    push: Callable[[], None] | None
+    """`apply_pushes` of these environments, where there are any."""
     advance_cables: Callable[[], None] | None
     """What the cable model does before MuJoCo's step, if anything."""
     read: Callable[[], None]
@@ -73,7 +76,7 @@ class World:
         system: what to simulate, such as `load_config("hover").system`.
         num_envs: E.
         num_threads: threads; 0 for one on each available CPU. Results do not depend on it, bit for bit.
-        seed: of the turbulence that each `reset` starts with; `seed_turbulence` gives another.
+        seed: of the turbulence and pushes that each `reset` starts with; `seed_turbulence`, `seed_pushes` give others.
 
     Attributes:
         system, num_envs, num_drones, model, layout: as given, E, N, MuJoCo's model and where bodies are in it.
@@ -83,6 +86,7 @@ class World:
         hidden_loads: true loads; write `wind` and `payload_force` freely.
         drones: nominal numbers of each drone.
         air: turbulence, gusts and downwash.
+        pushes: when bodies are pushed next; None where they are not.
         stats: statistics since the reset.
         diverged: (E,) bool, until reset.
         cable_model, cables: module of the cable model and its numbers.
@@ -112,6 +116,8 @@ class World:
             wind=np.tile(system.wind, (num_envs, 1)), motors_off=np.zeros((num_envs, self.num_drones), bool),
         )  # fmt: skip
         self.air = Air.zeros(num_envs, self.num_drones)
+        self._pushing = make_pushes(system, num_envs)
+        self.pushes: Pushes | None = None if self._pushing is None else self._pushing[0]
         self.stats = EpisodeStats.zeros(num_envs)
         self.diverged = np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
@@ -144,6 +150,9 @@ class World:
         if system.air.turbulence:
             for e in np.flatnonzero(mask).tolist():
                 self.seed_turbulence(e, np.random.SeedSequence(self.seed, spawn_key=(e,)))
+        if self._pushing is not None:
+            for e in np.flatnonzero(mask).tolist():
+                self.seed_pushes(e, np.random.SeedSequence(self.seed, spawn_key=(e, 1)))
         self.load(mask)
         return state
 
@@ -174,6 +183,8 @@ class World:
         """Advance one shard with the thrusts in `thrust`; see `step`."""
         for _ in range(nstep):
             shard.apply()
+            if shard.push is not None:
+                shard.push()
             if shard.find_fast():
                 set_speculative(shard.batch, shard.fast)
             if shard.advance_cables is not None:
@@ -227,6 +238,13 @@ class World:
         """Start the turbulence of environment `env` anew from its stationary distribution, drawn from `seed`."""
         self.air.generator[env] = seed.generate_state(1, np.uint64)[0]
         start_turbulence(env, self.air)
+
+    def seed_pushes(self, env: int, seed: np.random.SeedSequence) -> None:
+        """Draw the times and sizes of the pushes of environment `env` from `seed` on, where there are any."""
+        if self._pushing is not None:
+            pushes, constants = self._pushing
+            pushes.generator[env] = seed.generate_state(1, np.uint64)[0]
+            start_pushes(env, pushes, constants.interval)
 
     def break_cables(self, mask: np.ndarray) -> None:
         """Let the cables in `mask` (E, N) bool break; `reset` and `load` make them whole again."""
@@ -302,9 +320,9 @@ class World:
             self._sync_broken(shard)
         self.diverged[:] = saved["diverged"]
 
-    def _groups(self) -> dict[str, SystemState | HiddenLoads | Parameters | Air | EpisodeStats | Nodes]:
-        names = ("state", "hidden_loads", "parameters", "air", "stats", *(("nodes",) if self.nodes is not None else ()))
-        return {name: getattr(self, name) for name in names}
+    def _groups(self) -> dict[str, SystemState | HiddenLoads | Parameters | Air | EpisodeStats | Nodes | Pushes]:
+        names = ("state", "hidden_loads", "parameters", "air", "stats", "nodes", "pushes")
+        return {name: group for name in names if (group := getattr(self, name)) is not None}
 
     def _sync_broken(self, shard: Shard) -> None:
         """Bring the shard's models into line with `state.cable_broken`."""
@@ -330,12 +348,13 @@ class World:
             rows = make_rows(self.layout, batch, lo)
             loads = self.thrust, self.hidden_loads
             apply = bind(apply_loads, rows, *loads, self._data, air_constants.rig, air, self._varied)
+            push = None if self._pushing is None else bind(apply_pushes, rows, *self._pushing)
             advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
             fast = np.zeros(hi - lo, bool)
             find = bind(find_fast, lo, self.state, fast, radii, self.system.timestep)
             broken = np.zeros((hi - lo, self.num_drones), bool)
             warnings = bind(find_warnings, lo, batch.warning, self.diverged)
-            shards.append(Shard(lo, hi, batch, rows, apply, advance, read, broken, find, fast, warnings))
+            shards.append(Shard(lo, hi, batch, rows, apply, push, advance, read, broken, find, fast, warnings))
         return shards
 
 
