@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from multilift_marl.control.scripted_formation import Formation, FormationLead, FormationNarrow
-from multilift_marl.control.scripted_hold import HoldAcceleration
+from multilift_marl.control.scripted_hold import HoldAcceleration, HoldCtbr
 
 Gains = tuple[tuple[str, int, int, float], ...]
 
@@ -188,6 +188,38 @@ class RecoverRealistic(Formation):
     )
 
 
+class RecoverRates(HoldCtbr):
+    """Of `recover_crazymarl_rates` without pushes: 8 minutes from `hold_ctbr` at 50 Hz without noise, 25 minutes at 250 Hz
+    with it, 48 and 64 episodes a candidate."""
+
+    GAINS: ClassVar[Gains] = (
+        ("slot_error", 0, 0, -12.368),
+        ("slot_error", 1, 1, -12.368),
+        ("slot_error", 2, 2, -15.821),
+        ("velocity", 0, 0, -6.719),
+        ("velocity", 1, 1, -6.719),
+        ("velocity", 2, 2, -8.019),
+        ("payload_error_integral", 0, 0, -2.598),
+        ("payload_error_integral", 1, 1, -2.598),
+        ("payload_error_integral", 2, 2, -13.158),
+        ("payload_error", 0, 0, 7.009),
+        ("payload_error", 1, 1, 7.009),
+        ("payload_error", 2, 2, 0.144),
+        ("payload_velocity", 0, 0, 1.815),
+        ("payload_velocity", 1, 1, 1.815),
+        ("payload_velocity", 2, 2, -1.551),
+        ("rotation_error_integral", 1, 2, 2.919),
+        ("payload_rotation_error", 1, 2, -0.251),
+        ("payload_angular_velocity", 1, 2, 0.436),
+        ("rotation_error_integral", 2, 1, 0.209),
+        ("payload_rotation_error", 2, 1, 4.269),
+        ("payload_angular_velocity", 2, 1, -0.159),
+        ("payload_rotation_error", 1, 0, 1.422),
+        ("payload_angular_velocity", 1, 0, 0.336),
+        ("heading", 0, 0, -0.903),
+    )
+
+
 class TrackRealistic(Formation):
     """Of `track_realistic` at 2 m/s and 4 m/s²: three quarters of what a search of 12 minutes from `TrackFollow` found
     there, which lost one payload of 100, and a quarter of `TrackRealisticFast`."""
@@ -359,6 +391,7 @@ SEARCHED: dict[str, type[Formation]] = {
     "gate_two": GateWalls,
     "gate_three": GateWalls,
     "recover_realistic": RecoverRealistic,
+    "recover_crazymarl_rates": RecoverRates,
     "track_follow_2_2": TrackFollowGentle,
     "track_follow_2_4": TrackFollow,
 }
