@@ -189,8 +189,8 @@ class RecoverRealistic(Formation):
 
 
 class RecoverRates(HoldCtbr):
-    """Of `recover_crazymarl_rates` without pushes: 8 minutes from `hold_ctbr` at 50 Hz without noise, 25 minutes at 250 Hz
-    with it, 48 and 64 episodes a candidate."""
+    """Of `recover_crazymarl_rates`: 8 minutes from `hold_ctbr` at 50 Hz without noise, 48 episodes a candidate, then 25
+    minutes at 250 Hz with it, 64 episodes."""
 
     GAINS: ClassVar[Gains] = (
         ("slot_error", 0, 0, -12.368),
