@@ -33,7 +33,7 @@ from multilift_marl.sim.state import place_at_hook
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
 from multilift_marl.tasks.observations import Component, cable_vector
-from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, stillness
+from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, failure, stillness
 from multilift_marl.tasks.starts import TargetOptions, check_heights, in_ball
 
 
@@ -182,6 +182,7 @@ class Recover(Task):
         "precision": Term(0.25, distance, 0.01, "m"),
         "attitude": Term(0.15, attitude, 6.0, "deg"),
         "stillness": Term(0.2, stillness, (0.2, 0.3), "m/s, rad/s"),
+        "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
     KERNELS: ClassVar[Kernels] = Kernels(plan=end_grace)
