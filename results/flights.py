@@ -85,8 +85,12 @@ FLIGHTS: dict[str, Flight] = {
     "recover_realistic": Flight("recover_realistic", {}, "recover_realistic", "recover, realistic", scripts=FOLLOWING),
     "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),
     "recover_crazymarl_rates": Flight(
-        "recover_crazymarl_rates", {}, "recover_crazymarl_rates", "recover, CrazyMARL's starts, body rates at 250 Hz",
-        "79.7 %: motor commands, no noise, no motor lag", ("searched",),
+        "recover_crazymarl_rates",
+        {},
+        "recover_crazymarl_rates",
+        "recover, CrazyMARL's starts, body rates at 250 Hz",
+        "79.7 %: motor commands, no noise, no motor lag",
+        ("searched",),
     ),
     "loss": Flight("loss", {}, "loss", "loss, 4 drones"),
     "loss_realistic": Flight(

@@ -16,10 +16,10 @@ _COMMON = ("task", "seed", "train", "eval", "env.num_envs", "env.policy_hz", "en
 def divide_rigs(environment: Config) -> list[Config]:
     """Return the environments that this process steps: one of each rig, with an equal share of all.
 
-    Where workers step them, one that tells what they are like.
+    With workers one environment, for sizes and names.
 
     Raises:
-        ConfigError: shares that are not whole; keys that rigs must have in common; rigs and workers.
+        ConfigError: shares that are not whole; keys that rigs must have in common; rigs together with workers.
     """
     train, total = environment.train, environment.env.num_envs
     if not train.rigs:

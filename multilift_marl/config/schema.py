@@ -294,13 +294,13 @@ class WindConfig(Section):
 
 
 class PushConfig(Section):
-    """Leaps of velocity of single bodies at random times (docs/randomization.md)."""
+    """Sudden changes of velocity of single bodies at random times (docs/randomization.md)."""
 
     interval: Annotated[Float, Between(0.01, 1e6, "s")] = Field(
         5.0, gt=0, description="[s] mean time between two pushes of a body"
     )
     payload_velocity: Annotated[Float, Between(0, 10, "m/s")] = Field(
-        0.0, ge=0, description="[m/s] leap of the payload's velocity, uniform up to this, any direction"
+        0.0, ge=0, description="[m/s] change of the payload's velocity, size uniform up to this, any direction"
     )
     drone_velocity: Annotated[Float, Between(0, 10, "m/s")] = Field(
         0.0, ge=0, description="[m/s] the same of a drone's velocity"

@@ -56,7 +56,7 @@ def fitting_scripts(vec: MultiliftVec) -> list[str]:
     """Return the names of the scripts that can act in the environments `vec`."""
     fitting = []
     for name, script in SCRIPTED.items():
-        known = script.fits(vec) if issubclass(script, Formation) else vec.config.env.sensing == "ideal"
+        known = not script.refusal(vec) if issubclass(script, Formation) else vec.config.env.sensing == "ideal"
         if known and script.INTERFACE == vec.config.control.action:
             fitting.append(name)
     return fitting

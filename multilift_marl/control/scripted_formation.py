@@ -38,7 +38,7 @@ class Formation:
         REFUSAL: what is said where they are missing in {task}.
 
     Raises:
-        ConfigError: the environments do not observe what the script needs.
+        ConfigError: the environments do not observe what the script needs; see `refusal`.
     """
 
     INTERFACE: ClassVar[str] = "reference"
@@ -47,8 +47,8 @@ class Formation:
     REFUSAL: ClassVar[str] = ""
 
     def __init__(self, vec: MultiliftVec):
-        if not self.fits(vec):
-            raise ConfigError(self.REFUSAL.format(task=vec.config.task))
+        if refusal := self.refusal(vec):
+            raise ConfigError(refusal)
         self._names, self._actions = vec.observation_names, vec.action_names
         self._max_offset = vec.config.control.max_offset
         self._matrix = self.matrix()
@@ -71,9 +71,10 @@ class Formation:
         """Forget nothing: the integral is part of the observation."""
 
     @classmethod
-    def fits(cls, vec: MultiliftVec) -> bool:
-        """Return whether the environments observe what the script needs."""
-        return all(name in vec.observation_names for name in cls.NEEDS)
+    def refusal(cls, vec: MultiliftVec) -> str:
+        """Return why the script cannot act in the environments; "" if it can."""
+        known = all(name in vec.observation_names for name in cls.NEEDS)
+        return "" if known else cls.REFUSAL.format(task=vec.config.task)
 
 
 class FormationIntegral(Formation):

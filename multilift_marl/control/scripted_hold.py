@@ -13,7 +13,6 @@ import numpy as np
 
 from multilift_marl.config.units import unit_size
 from multilift_marl.control.scripted_formation import PLANNED, Formation
-from multilift_marl.errors import ConfigError
 from multilift_marl.rig.vehicles import GRAVITY
 
 if TYPE_CHECKING:
@@ -144,7 +143,7 @@ class HoldCtbr(HoldAcceleration):
         return matrix
 
     def _force_at_rest(self) -> np.ndarray:
-        """Return what the first drone's rotors exert at rest, in its slot frame (3,) [N]."""
+        """Return what the first drone's rotors exert at rest, in the frame of a level payload (3,) [N]."""
         weight = float(self._vec.controller.gains.mass[0]) * GRAVITY
         return self._vec.world.system.hook_force[0] + np.array([0.0, 0.0, weight])
 
@@ -161,17 +160,22 @@ class HoldCtbm(HoldCtbr):
     YAW_RATE_GAIN: ClassVar[float] = 15.0  # [1/s] rotors that change speed turn the drone at once: more oscillates
     RATES: ClassVar[str] = "turned_rates"
 
+    @classmethod
+    def refusal(cls, vec: MultiliftVec) -> str:
+        """See `Formation.refusal`; a policy step must not turn a rate back by more than all of it."""
+        config, gain = vec.config, cls.RATE_GAIN
+        if config.env.units == "cable":
+            gain *= unit_size("rad/s", config.system)
+        if gain > config.env.policy_hz:
+            return (
+                f"the script hold_{cls.INTERFACE} holds the attitude by itself, and "
+                f"env.policy_hz={config.env.policy_hz:g} is too slow for that; raise it to {gain:.3g} or more"
+            )
+        return super().refusal(vec)
+
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
         control, matrix = self._vec.config.control, super().matrix()
-        config, gain = self._vec.config, self.RATE_GAIN
-        if config.env.units == "cable":
-            gain *= unit_size("rad/s", config.system)
-        if gain > config.env.policy_hz:  # a step would turn the rate back by more than all of it
-            raise ConfigError(
-                f"the script hold_{self.INTERFACE} holds the attitude by itself, and "
-                f"env.policy_hz={config.env.policy_hz:g} is too slow for that; raise it to {gain:.3g} or more"
-            )
         full = (control.max_tilt_rate, control.max_tilt_rate, control.max_yaw_rate)
         for axis, gain in enumerate((self.RATE_GAIN, self.RATE_GAIN, self.YAW_RATE_GAIN)):
             matrix[1 + axis] *= full[axis]
@@ -181,24 +185,29 @@ class HoldCtbm(HoldCtbr):
 
 
 class HoldRotor(HoldCtbm):
-    """The same law by the rotors' thrusts: those that exert the thrust and the moments of `hold_ctbm`."""
+    """The same law by the rotors' thrusts: those that exert the thrust and the moments of `hold_ctbm`.
+
+    An action above zero has another range than one below it. Moments, for which some rotors do more and others less,
+    are divided by the mean of both, the thrust by that above.
+    """
 
     INTERFACE = "rotor"
     RATES = "body_rates"
-    REFUSAL = (
-        "the script hold_rotor is one map for all drones, whose rotors must be in the same places about their slots; "
-        "set control.heading=outward"
-    )
 
     @classmethod
-    def fits(cls, vec: MultiliftVec) -> bool:
-        """See `Formation.fits`."""
-        return vec.config.control.heading == "outward" and super().fits(vec)
+    def refusal(cls, vec: MultiliftVec) -> str:
+        """See `Formation.refusal`."""
+        if vec.config.control.heading != "outward":
+            return (
+                "the script hold_rotor is one map for all drones, whose rotors must be in the same places about their "
+                "slots; set control.heading=outward"
+            )
+        return super().refusal(vec)
 
     def matrix(self) -> np.ndarray:
         """See `Formation.matrix`."""
-        gains, vehicle, wrench = self._vec.controller.gains, self._vec.world.system.vehicle, super().matrix()
-        hover, most = self._hover_thrust(), 4 * float(np.min(gains.thrust_max))
-        turning = self._vec.config.acting.max_angular_acceleration * np.array(vehicle.inertia)
-        wrench *= np.array([most - hover, *turning], np.float32)[:, None]
-        return (np.linalg.inv(vehicle.allocation) @ wrench / ((most - hover) / 4)).astype(np.float32)
+        gains, wrench = self._vec.controller.gains, super().matrix()
+        inverse, range_ = gains.allocation[0], (gains.thrust_max[0] - gains.thrust_min[0]) / 2
+        moments = self._vec.config.acting.max_angular_acceleration * gains.inertia[0][:, None] * wrench[1:]
+        matrix = np.outer(4 * inverse[:, 0], wrench[0]) + inverse[:, 1:] @ moments / range_
+        return matrix.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Pushes (`push.`): leaps of velocity of single bodies at random times, such as a collision or a hand would cause."""
+"""Pushes (`push.`): sudden changes of velocity of single bodies at random times, as by a hand or a collision."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class PushConstants(NamedTuple):
     interval: float
     """Mean of the time between two pushes of a body, in physics steps."""
     force: np.ndarray
-    """(N + 1,) that makes a free body leap by the largest velocity in one physics step [N]."""
+    """(N + 1,) that gives a free body the largest change of velocity in one physics step [N]."""
     torque: np.ndarray
     """(N + 1, 3) about each of its axes, by the largest angular velocity [N m]; zero of the payload."""
 
