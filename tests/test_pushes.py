@@ -13,7 +13,7 @@ PUSHES = {"push.payload_velocity": 0.4, "push.drone_velocity": 0.6, "push.drone_
 STEPS = 500
 
 
-def leaps(**overrides) -> dict[str, np.ndarray]:
+def changes(**overrides) -> dict[str, np.ndarray]:
     """Return what one push changes in 4000 worlds: two drones on slack cables, each body pushed in the first step."""
     found = []
     for pushed in (True, False):
@@ -29,17 +29,24 @@ def leaps(**overrides) -> dict[str, np.ndarray]:
     return {name: with_push - without for name, with_push, without in zip(names, *found, strict=True)}
 
 
-@pytest.mark.parametrize("shape", ["box", "point"])
-def test_a_push_is_a_leap_of_velocity_in_any_direction(shape):
-    found = leaps(**{"payload.shape": shape})
+SETTINGS = {
+    "box": {"payload.shape": "box"},
+    "point": {"payload.shape": "point"},
+    "mixed": {"vehicle.preset": ["falcon", "iris"]},
+}
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_a_push_changes_the_velocity_in_any_direction(settings):
+    found = changes(**settings)
     assert np.abs(found["payload_rates"]).max() < 1e-9
     for name, most in (("payload_velocity", 0.4), ("drone_velocity", 0.6), ("drone_rates", 3.0)):
-        leap = found[name].reshape(-1, 3)
-        size = np.linalg.norm(leap, axis=-1)
+        change = found[name].reshape(-1, 3)
+        size = np.linalg.norm(change, axis=-1)
         assert 0.98 * most < size.max() <= 1.001 * most, name
         np.testing.assert_allclose([size.mean(), size.std()], [most / 2, most / np.sqrt(12)], rtol=0.05, err_msg=name)
-        assert np.abs(leap.mean(axis=0)).max() < 0.03 * most, name
-        np.testing.assert_allclose((leap**2).mean(axis=0), most**2 / 9, rtol=0.1, err_msg=name)
+        assert np.abs(change.mean(axis=0)).max() < 0.03 * most, name
+        np.testing.assert_allclose((change**2).mean(axis=0), most**2 / 9, rtol=0.1, err_msg=name)
     apart = found["drone_velocity"]
     assert np.abs(np.mean(apart[:, 0] * apart[:, 1], axis=0)).max() < 0.01  # each drone's own
 
@@ -71,6 +78,7 @@ def test_only_the_bodies_that_are_asked_for_are_pushed():
     world.step(hover_thrust(world))
     np.testing.assert_allclose(world.state.payload_velocity - before, np.tile([0, 0, -9.81 * 0.004], (8, 1)), atol=1e-4)
     assert np.abs(world.state.drone_body_rates).max() < 1e-3
+    assert 0.2 < np.linalg.norm(world.state.drone_velocity, axis=-1).max() < 0.52
 
 
 def fly(num_envs, threads, steps=60, saved=None):
@@ -83,9 +91,19 @@ def fly(num_envs, threads, steps=60, saved=None):
 
 
 def test_they_are_the_same_whatever_is_simulated_beside():
-    (_, few), (_, many) = fly(3, 1), fly(6, 2)
+    (vec, few), (_, many) = fly(3, 1), fly(6, 2)
     np.testing.assert_array_equal(few, many[:, :3])
-    assert (few[:, 0] != few[:, 1]).any()
+    assert len(set(vec.world.pushes.left[:, 0])) == 3
+    calm = make(num_envs=3)
+    calm.reset(seed=5)
+    unpushed = np.array([calm.step(zeros(calm))[0] for _ in range(60)])
+    assert (np.abs(few - unpushed).max(axis=(0, 2, 3)) > 1e-3).sum() >= 2
+
+
+def test_worlds_push_by_their_seed_alone():
+    left = [World(make_system(2, **PUSHES), 2, 1, seed).pushes.left for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(left[0], left[1])
+    assert (left[0] != left[2]).any() and (left[0][0] != left[0][1]).any()
 
 
 def test_a_saved_state_goes_on_with_the_same_pushes():

@@ -19,6 +19,12 @@ def make_holding(action, **settings):
     return vec, make_scripted(HOLDING[action], vec)
 
 
+def lean(vec) -> float:
+    """Return the level part of drone 0's thrust axis at rest."""
+    force = vec.world.system.hook_force[0] + np.array([0.0, 0.0, vec.world.system.vehicles[0].mass * 9.81])
+    return float(np.hypot(*force[:2]) / np.linalg.norm(force))
+
+
 @pytest.mark.parametrize("action", HOLDING)
 def test_they_hold_the_payload_at_its_target(action):
     vec, script = make_holding(action)
@@ -40,9 +46,7 @@ def test_a_drone_off_its_slot_begins_to_move_by_the_law(action):
     seen[..., names.index("heading_0")] = 1.0  # at rest but for 5 cm outward
     seen[..., names.index("slot_error_0")] = 0.05
     if action in ("ctbr", "ctbm"):  # at rest drones lean outward, against their cables
-        force = vec.world.system.hook_force[0] + np.array([0.0, 0.0, vec.world.system.vehicle.mass * 9.81])
-        lean = np.hypot(*force[:2]) / np.linalg.norm(force)
-        seen[..., names.index("thrust_axis_0")] = lean
+        seen[..., names.index("thrust_axis_0")] = lean(vec)
     action_taken = script.act(seen)[0, 0]
     moving = {"velocity": 0, "acceleration": 0, "acc_rates": 0, "ctbr": 2, "ctbm": 2}[action]
     assert action_taken[moving] < -0.05  # inward, or its tilt that way
@@ -66,8 +70,7 @@ def exerted(task, action, seen, **settings):
         level(vec)
         vec.controller.start(0)
         observation = np.zeros((1, vec.num_drones, vec.observation_size), np.float32)
-        lean = -vec.world.system.resting_rotation[0][:, 2] @ np.array([1.0, 0.0, 0.0])
-        rest = {"heading_0": 1.0, "thrust_axis_0": abs(lean)}
+        rest = {"heading_0": 1.0, "thrust_axis_0": lean(vec)}
         for name, value in (rest | given).items():
             name = name.replace("turned", "body") if action == "rotor" else name
             observation[..., names.index(name)] = value
@@ -93,11 +96,8 @@ def test_rotors_exert_what_the_moments_command(rig, axis):
 
 
 def test_drones_may_differ():
-    vec = make(
-        num_envs=2,
-        **{"control.action": "rotor", "control.heading": "outward", "vehicle.preset": ["falcon", "hummingbird"]},
-        num_drones=2,
-    )
+    mixed = {"control.action": "rotor", "control.heading": "outward", "vehicle.preset": ["falcon", "hummingbird"]}
+    vec = make(num_envs=2, num_drones=2, **mixed)
     seen, _ = vec.reset(seed=0)
     assert make_scripted("hold_rotor", vec).act(seen).shape == (2, 2, 4)
 
