@@ -116,7 +116,7 @@ def observed(vec, spread=1.0, **values) -> np.ndarray:
 @pytest.mark.parametrize("name", LINEAR)
 def test_scripts_act_on_any_batch_within_the_limits(name):
     task = {"formation_narrow": "gate", "formation_redistributed": "loss"}.get(name, "track")
-    vec = make(task, num_envs=1, **{"control.action": LINEAR[name].INTERFACE})
+    vec = make(task, num_envs=1, **{"control.action": LINEAR[name].INTERFACE, "control.heading": "outward"})
     policy, observation = make_scripted(name, vec), 10 * observed(vec)
     assert policy.act(observation).shape == (5, 4, vec.action_size)
     assert policy.act(observation[0]).shape == (4, vec.action_size)

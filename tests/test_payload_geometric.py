@@ -82,7 +82,7 @@ def test_it_is_no_base_of_a_residual():
     assert set(LINEAR) == set(SCRIPTED) - {"payload_geometric"}
     for name in LINEAR:
         task = {"formation_narrow": "gate", "formation_redistributed": "loss"}.get(name, "track")
-        vec = make(task, num_envs=1, **{"control.action": LINEAR[name].INTERFACE})
+        vec = make(task, num_envs=1, **{"control.action": LINEAR[name].INTERFACE, "control.heading": "outward"})
         assert residual_matrix(name, vec).shape == (vec.action_size, vec.observation_size)
     message = refusal(ml.load_config, "hover", {"train.residual": "payload_geometric"})
     assert "train.residual" in message and "formation_integral" in message

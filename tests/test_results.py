@@ -178,6 +178,10 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "control.max_angular_acceleration",
         "train.gru",
         "train.sequence",
+        "push.interval",
+        "push.payload_velocity",
+        "push.drone_velocity",
+        "push.drone_rates",
     }
     own |= {key for key in stored if stored[key] == {} and any(name.startswith(f"{key}.") for name in later)}
     for key in ("control.attitude_frequency", "control.position_frequency"):
