@@ -52,6 +52,25 @@ def test_the_attitude_has_the_heading_and_tilt_that_were_drawn():
     assert turned[2, 1] == pytest.approx(np.sin(0.3)) and -turned[2, 0] == pytest.approx(np.cos(0.3) * np.sin(-0.4))
 
 
+def test_targets_lie_at_a_share_of_the_way_from_the_last_pose():
+    pose = {}
+    for share in (0, 0.5, 1):
+        vec = make("pose", num_envs=100, **{"task_options.target_share": share})
+        vec.reset(seed=0)
+        pose[share] = vec.task.own.plan.pose
+    assert same(pose[1], (default := make("pose", num_envs=100)).reset(seed=0) and default.task.own.plan.pose)
+    np.testing.assert_allclose(pose[0], np.repeat(pose[0][:, :1], 4, axis=1), rtol=0, atol=1e-12)
+    drawn_first = (pose[0.5][:, 0] == pose[1][:, 0]).all(axis=1)  # the same start, and then the same draw
+    way, half = (poses[drawn_first, 1] - poses[drawn_first, 0] for poses in (pose[1], pose[0.5]))
+    assert drawn_first.mean() > 0.8
+    way[:, 3], half[:, 3] = ((angle + pi) % (2 * pi) - pi for angle in (way[:, 3], half[:, 3]))
+    same_draw = np.abs(half - way / 2).max(axis=1) < 1e-9  # another was drawn where a team cannot hold one of them
+    assert same_draw.mean() > 0.7
+    vec = make("pose", num_envs=1000, **{"task_options.target_share": [0.2, 0.6]})
+    vec.reset(seed=0)
+    assert 26.5 < np.degrees(np.abs(vec.task.own.plan.pose[:, 1, 4:])).max() <= 27  # 0.6 of 45, from a level start
+
+
 def test_without_a_plan_the_same_targets_leap_and_drones_fly_to_their_slots():
     near = {f"task_options.target_{key}": value for key, value in (("xy", 0.2), ("yaw", 20.0), ("tilt", 5.0))}
     planned, leaping = (
@@ -67,6 +86,22 @@ def test_without_a_plan_the_same_targets_leap_and_drones_fly_to_their_slots():
         if step == 0:  # nothing but the filter of the references is between a drone and its slot
             assert same(leaping.task.planned.position, leaping.task.goal.position)
     assert references[0].mean() > 0.4 and references[-1].mean() < 0.1
+
+
+def test_without_a_plan_a_team_half_a_turn_from_its_target_holds_still():
+    """Its cables pull the other way there: fed forward as at the target, they would draw the drones together."""
+    level = {"task_options.plan": False, "task_options.target_tilt": 0.0, "control.action": "acc_rates"}
+    vec = make("pose", num_envs=32, **CALM, **level)
+    vec.reset(seed=0)
+    state, goal = vec.world.state, vec.task.goal
+    before, action = state.drone_position.copy(), np.zeros((32, 4, vec.action_size))
+    for _ in range(25):
+        vec.step(action)
+    assert (np.abs(vec.task.errors.angle) > 2).any()
+    assert np.abs(state.drone_position - before).max() < 2e-3
+    heading = np.arctan2(-state.payload_rotation[:, 0, 1], state.payload_rotation[:, 1, 1])
+    azimuth = heading[:, None] + vec.task.rig.azimuth
+    np.testing.assert_allclose(goal.slot_frame, np.stack((np.cos(azimuth), np.sin(azimuth)), axis=2), atol=1e-3)
 
 
 def test_a_new_target_comes_every_four_seconds_and_is_not_seen_before():
@@ -208,5 +243,7 @@ def test_a_point_payload_counts_as_turned_as_its_way_is():
 def test_impossible_options_are_refused():
     assert "way_seconds=5 must not exceed" in refusal(ml.make_vec, "pose", **{"task_options.way_seconds": 5.0})
     assert "lower one first" in refusal(ml.make_vec, "pose", **{"task_options.target_height": [2.0, 1.0]})
+    assert "from 0 to 1" in refusal(ml.make_vec, "pose", **{"task_options.target_share": [0, 1.1]})
+    assert "before it begins" in refusal(ml.make_vec, "pose", **{"task_options.target_share": [0.5, 0.2]})
     low = {"task_options.target_height": [0.1, 0.1]}
     assert "can hold hardly any" in refusal(lambda: make("pose", num_envs=1, **low).reset())

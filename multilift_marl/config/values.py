@@ -105,6 +105,7 @@ def _choice(value: Any) -> Any:
 Level = Annotated[Float, Field(ge=0), BeforeValidator(_level)]
 Delay = Annotated[Int, Field(ge=0, le=50)]
 Span = Annotated[tuple[Positive, Positive], BeforeValidator(_range), AfterValidator(_rising)]
+Shares = Annotated[tuple[Float, Float], BeforeValidator(_range), AfterValidator(_rising), Between(0, 1)]
 Choice = BeforeValidator(_choice)
 Delays = Annotated[tuple[Delay, Delay], BeforeValidator(_range)]
 

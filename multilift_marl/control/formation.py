@@ -143,8 +143,14 @@ def place_formation(e: int, goal: Goal, rig: Rig) -> None:
         cable = sub((rig.slots[n, 0], rig.slots[n, 1], rig.slots[n, 2]), anchor)
         put(goal.slots[e, n], add(add(position, mul(target, anchor)), turn(c, s, cable)))
         put(goal.cable_force[e, n], turn(c, s, (rig.force[n, 0], rig.force[n, 1], rig.force[n, 2])))
-        goal.slot_frame[e, n, 0] = cos(yaw + rig.azimuth[n])
-        goal.slot_frame[e, n, 1] = sin(yaw + rig.azimuth[n])
+        turn_slot_frame(e, n, yaw, goal, rig)
+
+
+@kernel
+def turn_slot_frame(e, n, yaw, goal, rig):
+    """Let the slot frame of drone n be that of a team of heading `yaw` [rad]."""
+    goal.slot_frame[e, n, 0] = cos(yaw + rig.azimuth[n])
+    goal.slot_frame[e, n, 1] = sin(yaw + rig.azimuth[n])
 
 
 @kernel

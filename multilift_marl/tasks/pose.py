@@ -11,17 +11,24 @@ from pydantic import Field
 from multilift_marl._jit import inlined, kernel
 from multilift_marl.config.config import Config
 from multilift_marl.config.validate import validate
-from multilift_marl.config.values import Float, Section
+from multilift_marl.config.values import Float, Section, Shares
 from multilift_marl.control.cable_forces import WrenchDistribution, make_wrench_distribution
 from multilift_marl.control.formation import Goal
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import matmul, matrow, rotation_vector, row, sub, transpose
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, stillness
+from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, failure, stillness
 from multilift_marl.tasks.starts import hang_team
 from multilift_marl.tasks.targets import Bounds, draw_plan, make_bounds
-from multilift_marl.tasks.trajectory import Plan, advance_plan, hold_plan_pose, select_candidate, set_goal_from_plan
+from multilift_marl.tasks.trajectory import (
+    Plan,
+    advance_plan,
+    hold_plan_pose,
+    select_candidate,
+    set_goal_from_plan,
+    turn_team,
+)
 
 
 class PoseOptions(Section):
@@ -31,6 +38,9 @@ class PoseOptions(Section):
     target_height: tuple[Float, Float] = Field((1.0, 2.0), description="[m] lowest and highest target")
     target_tilt: Float = Field(45.0, ge=0, lt=60, description="[deg] target roll and pitch within ± this")
     target_yaw: Float = Field(180.0, ge=0, le=180, description="[deg] target heading within ± this")
+    target_share: Shares = Field(
+        (1.0, 1.0), description="where targets lie on the way from the last pose, 0, to the one drawn, 1: uniform draw"
+    )
     target_seconds: Float = Field(4.0, gt=0, description="[s] until the next target")
     way_seconds: Float = Field(3.0, gt=0, description="[s] that the planned trajectory to a target takes")
     plan: bool = Field(True, description="a trajectory to each target is planned and followed; False: the goal leaps")
@@ -72,6 +82,9 @@ def start_at_first_pose(e, v, hanging):
     hang_team(e, v, planned, hanging, (row(planned.position, e), matrow(planned.rotation, e)), still, still)
     plan.stage[e] = 0
     set_goal_from_plan(e, 1, plan, v.goal, v.rig, v.nominal)  # last, since it shares the slot frames with the plan
+    if not v.has_plan:
+        for n in range(v.rig.slots.shape[0]):
+            turn_team(e, n, plan.pose[e, 0, 3], v)
 
 
 @inlined
@@ -130,6 +143,7 @@ class Pose(Task):
         "attitude": Term(0.2, attitude, 20.0, "deg"),
         "alignment": Term(0.15, attitude, 2.0, "deg"),
         "stillness": Term(0.1, stillness, (0.2, 0.3), "m/s, rad/s"),
+        "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
     KERNELS: ClassVar[Kernels] = Kernels(plan=advance_plan, update=note_reached)
@@ -175,7 +189,7 @@ class Pose(Task):
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw a level pose to start from and the targets; the team hangs there at rest; see `Task.start`."""
         option, tilt = self.options, radians(self.options.target_tilt)
-        ranges = (option.target_xy, *option.target_height, radians(option.target_yaw), tilt)
+        ranges = (option.target_xy, *option.target_height, radians(option.target_yaw), tilt, *option.target_share)
         if draw_plan(env, rng, self.view_for(draw_plan), ranges) < 0:
             raise ConfigError(
                 "this team can hold hardly any of the poses of task pose; lower task_options.target_tilt, raise "

@@ -10,7 +10,7 @@ import numpy as np
 from multilift_marl._jit import drawing, kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.cable_forces import is_stable, place_balanced
-from multilift_marl.control.formation import goal_hook
+from multilift_marl.control.formation import goal_hook, wrap
 from multilift_marl.control.gains import make_gains
 from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, row, scale, segment_distance, sub, turn, vec
 from multilift_marl.rig.system import System
@@ -67,19 +67,26 @@ def draw_plan(e, rng, v, ranges):
         e: the environment.
         rng: generator of the episode.
         v: View of task `pose`; its plan is written, its goal overwritten.
-        ranges: of x and y [m], lowest and highest z [m], of yaw [rad], of roll and pitch [rad]; the start is level.
+        ranges: of x and y [m], lowest and highest z [m], of yaw [rad], of roll and pitch [rad], where the
+            start is level; the least and the largest share of the way from the last pose at which a target lies.
     """
     plan, goal, rig, hanging, bounds = v.own.plan, v.goal, v.rig, v.nominal, v.settings.holdable
-    xy, low, high, yaw, tilt = ranges
+    xy, low, high, yaw, tilt, nearest, farthest = ranges
     vain, k = 0, 0
     while k < plan.pose.shape[1]:
         lean = tilt if k > 0 and bounds.tilts else 0.0
         pose = plan.pose[e, k]
         pose[0], pose[1], pose[2] = rng.uniform(-xy, xy), rng.uniform(-xy, xy), rng.uniform(low, high)
         pose[3], pose[4], pose[5] = rng.uniform(-yaw, yaw), rng.uniform(-lean, lean), rng.uniform(-lean, lean)
+        last = plan.pose[e, max(k - 1, 0)]
+        if k > 0 and nearest < 1.0:  # each component goes as far; the heading turns the shorter way
+            share = rng.uniform(nearest, farthest)
+            pose[3] = last[3] + wrap(pose[3] - last[3])
+            for i in range(6):
+                pose[i] = last[i] + share * (pose[i] - last[i])
+            pose[3] = wrap(pose[3])
         put(goal.position[e], (pose[0], pose[1], pose[2]))
         putmat(goal.rotation[e], attitude_of(pose[3], pose[4], pose[5]))
-        last = plan.pose[e, max(k - 1, 0)]
         leap = norm((pose[0] - last[0], pose[1] - last[1], pose[2] - last[2]))
         held = place_balanced(e, goal, rig, hanging)
         if leap > MAX_LEAP or not (held and _within(e, goal, rig, hanging, bounds)):

@@ -14,11 +14,13 @@ import numpy as np
 
 from multilift_marl._jit import inlined, kernel
 from multilift_marl.control.cable_forces import distribute_wrench, drone_offset, place_slots
-from multilift_marl.control.formation import hook_arm, place_formation, wrap
+from multilift_marl.control.formation import hook_arm, place_formation, turn_slot_frame, wrap
 from multilift_marl.math3d import (
     add,
     cross,
     ease,
+    heading,
+    mat,
     matmul,
     matrow,
     mul,
@@ -35,6 +37,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.tasks.view import load_row
 
 CANDIDATES = (  # the usual one first: whether to turn the longer way round, and two shares, see `Plan.course`
     (False, 0.5, 0.0),
@@ -178,8 +181,23 @@ def advance_plan(e, v):
         set_goal_from_plan(e, stage + 1, plan, v.goal, v.rig, v.nominal)
     if v.has_plan:
         evaluate_plan(e, v, v.control_dt)
+    else:
+        for n in range(v.rig.slots.shape[0]):
+            turn_team(e, n, heading(mat(v.load.rotation, e, load_row(n, v))), v)
     if v.rig.is_point:  # its attitude is that of the plan, or of the goal
         putmat(v.state.payload_rotation[e], matrow(v.planned.rotation, e))
+
+
+@inlined
+def turn_team(e, n, yaw, v):
+    """Let the slot frame of drone n, and the cable force that it feeds forward, be those of a team of heading `yaw`.
+
+    Without a plan the target may be half a turn away, and there its cable pulls the other way.
+    """
+    plan, c, s = v.own.plan, cos(yaw), sin(yaw)
+    turn_slot_frame(e, n, yaw, v.goal, v.rig)
+    cable_force = turn(c, s, mat_row(plan.cable_force, e, plan.stage[e] + 1, n))
+    put(v.goal.cable_force[e, n], add(cable_force, (0.0, 0.0, v.nominal.weight[n])))
 
 
 @inlined
