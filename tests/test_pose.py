@@ -58,7 +58,9 @@ def test_targets_lie_at_a_share_of_the_way_from_the_last_pose():
         vec = make("pose", num_envs=100, **{"task_options.target_share": share})
         vec.reset(seed=0)
         pose[share] = vec.task.own.plan.pose
-    assert same(pose[1], (default := make("pose", num_envs=100)).reset(seed=0) and default.task.own.plan.pose)
+    default = make("pose", num_envs=100)
+    default.reset(seed=0)
+    assert same(pose[1], default.task.own.plan.pose)
     np.testing.assert_allclose(pose[0], np.repeat(pose[0][:, :1], 4, axis=1), rtol=0, atol=1e-12)
     drawn_first = (pose[0.5][:, 0] == pose[1][:, 0]).all(axis=1)  # the same start, and then the same draw
     way, half = (poses[drawn_first, 1] - poses[drawn_first, 0] for poses in (pose[1], pose[0.5]))
