@@ -1,18 +1,20 @@
 """Search the gains of a script by the evolution strategy CMA-ES (Hansen, arXiv 1604.00772): `pip install cma`.
 
-  python results/search_gains.py config=pose_wind [minutes=30] [script=formation_feedback] [spread=0.3] [key=value ...]
+  python results/search_gains.py config=pose_wind [minutes=30] [script=formation_feedback] [spread=0.3] [cost=errors]
+                                 [key=value ...]
 
 It starts from the gains of `script`, with candidates `spread` times the scales of `SLOTS` or `HELD` around them,
 simulates the same `env.num_envs` episodes with all candidates of a generation, and prints the final gains and their
-results in episodes that are not part of the search. Any configuration key changes the task; where it has `train.rigs`,
-one script is searched for all of them.
+results in episodes that are not part of the search. `cost=errors` are lost episodes and errors at the end,
+`cost=return` is the return, what a learned team is paid. Any configuration key changes the task; where it has
+`train.rigs`, one script is searched for all of them.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -67,6 +69,7 @@ HELD: Free = (*OWN, *((name, axes, STIFFNESS * width) for name, axes, width in S
 """The same of scripts that hold their slots by accelerations."""
 POPULATION, RENEWED = 12, 3  # candidates of a generation; generations with the same episodes
 ERROR, ANGLE = 0.05, 5.0  # [m], [deg] as bad as a quarter of the episodes lost
+Cost = Literal["errors", "return"]
 
 
 class Score(NamedTuple):
@@ -78,6 +81,8 @@ class Score(NamedTuple):
     """[m], of failed episodes 3 m."""
     angle: float
     """[deg]"""
+    paid: float
+    """[-] Return of an episode."""
 
 
 def find_script(name: str) -> type[Formation]:
@@ -107,7 +112,7 @@ def make_script(script: str, free: Free, changes: np.ndarray) -> type[Formation]
     return type("Searched", (base,), {"GAINS": (*base.GAINS, *rows)})
 
 
-def fly(config: Config, script: type[Formation], seed: int) -> Score:
+def fly(config: Config, script: type[Formation], seed: int, cost: Cost = "errors") -> Score:
     """Simulate one episode in every environment of `config`, an equal share of them with each of `train.rigs`."""
     rigs = evaluated_rigs(config)
     each = max(1, config.env.num_envs // len(rigs))
@@ -116,11 +121,12 @@ def fly(config: Config, script: type[Formation], seed: int) -> Score:
     tracks = config.task == "track"
     error, success = flown["payload_rmse_m" if tracks else "payload_position_error_m"], flown["success_rate"].mean()
     angle = 0.0 if tracks else float(flown["payload_attitude_error_deg"].mean())
-    cost = 1 - success + 0.25 * error.mean() / ERROR + 0.25 * angle / ANGLE
-    return Score(float(cost), float(success), float(error.mean()), angle)
+    lost = 1 - success + 0.25 * error.mean() / ERROR + 0.25 * angle / ANGLE
+    paid = float(flown["return"].mean())
+    return Score(-paid if cost == "return" else float(lost), float(success), float(error.mean()), angle, paid)
 
 
-def search(config: Config, script: str, free: Free, spread: float, minutes: float) -> np.ndarray:
+def search(config: Config, script: str, free: Free, spread: float, minutes: float, cost: Cost = "errors") -> np.ndarray:
     """Return the changes of the gains `free` in the mean of the last generation; Ctrl-C ends the search early.
 
     Raises:
@@ -140,7 +146,7 @@ def search(config: Config, script: str, free: Free, spread: float, minutes: floa
         while time.monotonic() - begun < end:
             candidates = strategy.ask()
             seed = config.seed + generation // RENEWED
-            scores = [fly(config, make_script(script, free, scale * np.array(each)), seed) for each in candidates]
+            scores = [fly(config, make_script(script, free, scale * np.array(each)), seed, cost) for each in candidates]
             strategy.tell(candidates, [each.cost for each in scores])
             generation += 1
             best = min(scores)
@@ -162,6 +168,7 @@ class Options(Section):
     minutes: Positive = Field(30.0, description="[min] that the search takes")
     script: str = Field("formation_feedback", description="whose gains it begins with, a name or module:Class")
     spread: Positive = Field(0.3, description="[-] of the first candidates, over the scales of `SLOTS` or `HELD`")
+    cost: Cost = Field("errors", description="what a script is searched for: few lost episodes and errors, or return")
 
 
 def main(values: dict[str, Any]) -> int:
@@ -178,7 +185,7 @@ def main(values: dict[str, Any]) -> int:
     known = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1})).observation_names
     every = SLOTS if config.control.action == "reference" else HELD
     free = tuple(each for each in every if f"{each[0]}_0" in known)
-    changes = search(config, script, free, options.spread, options.minutes)
+    changes = search(config, script, free, options.spread, options.minutes, options.cost)
     found = make_script(script, free, changes)
     gains: dict[tuple[str, int, int], float] = {}
     for name, axis, moved, gain in found.GAINS:
@@ -187,8 +194,8 @@ def main(values: dict[str, Any]) -> int:
         print(f'        ("{name}", {axis}, {moved}, {gain:.3f}),')
     for title, each in ((script, begun), ("searched", found)):
         config = build_config(config.model_dump(), {"env.num_envs": 256})
-        _, success, error, angle = fly(config, each, config.seed + 10**6)
-        print(f"{title}: {success:.1%} of 256 new episodes; {100 * error:.2f} cm, {angle:.2f}°")
+        _, success, error, angle, paid = fly(config, each, config.seed + 10**6)
+        print(f"{title}: {success:.1%} of 256 new episodes; {100 * error:.2f} cm, {angle:.2f}°, return {paid:.1f}")
     return 0
 
 

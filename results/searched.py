@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from multilift_marl.control.scripted_formation import Formation, FormationLead, FormationNarrow
-from multilift_marl.control.scripted_hold import HoldAcceleration, HoldCtbr
+from multilift_marl.control.scripted_hold import HoldAccRates, HoldCtbr
 
 Gains = tuple[tuple[str, int, int, float], ...]
 
@@ -69,34 +69,34 @@ class HoverRealistic(Formation):
     )
 
 
-class HoverRealisticAcceleration(HoldAcceleration):
-    """Of `hover_realistic` by accelerations: 14 minutes from `hold_acceleration`, 48 episodes a candidate."""
+class HoverAccRates(HoldAccRates):
+    """Of `hover` by accelerations and tilt rates, for return: 8 minutes from `hold_acc_rates`, 48 episodes each."""
 
     GAINS: ClassVar[Gains] = (
-        ("slot_error", 0, 0, -15.978),
-        ("slot_error", 1, 1, -15.978),
-        ("slot_error", 2, 2, -8.477),
-        ("velocity", 0, 0, -5.940),
-        ("velocity", 1, 1, -5.940),
-        ("velocity", 2, 2, -6.152),
-        ("payload_error_integral", 0, 0, -9.214),
-        ("payload_error_integral", 1, 1, -9.214),
-        ("payload_error_integral", 2, 2, -14.781),
-        ("payload_error", 0, 0, 0.462),
-        ("payload_error", 1, 1, 0.462),
-        ("payload_error", 2, 2, -4.295),
-        ("payload_velocity", 0, 0, -3.784),
-        ("payload_velocity", 1, 1, -3.784),
-        ("payload_velocity", 2, 2, -0.133),
-        ("rotation_error_integral", 1, 2, 10.536),
-        ("payload_rotation_error", 1, 2, 2.803),
-        ("payload_angular_velocity", 1, 2, 0.547),
-        ("rotation_error_integral", 2, 1, -6.161),
-        ("payload_rotation_error", 2, 1, 1.176),
-        ("payload_angular_velocity", 2, 1, 0.015),
-        ("payload_rotation_error", 1, 0, 0.954),
-        ("payload_angular_velocity", 1, 0, 0.027),
-        ("heading", 0, 0, -0.814),
+        ("slot_error", 0, 0, -16.534),
+        ("slot_error", 1, 1, -16.534),
+        ("slot_error", 2, 2, -13.023),
+        ("velocity", 0, 0, -3.835),
+        ("velocity", 1, 1, -3.835),
+        ("velocity", 2, 2, -4.597),
+        ("payload_error_integral", 0, 0, -10.970),
+        ("payload_error_integral", 1, 1, -10.970),
+        ("payload_error_integral", 2, 2, -12.189),
+        ("payload_error", 0, 0, 3.877),
+        ("payload_error", 1, 1, 3.877),
+        ("payload_error", 2, 2, 0.112),
+        ("payload_velocity", 0, 0, -1.167),
+        ("payload_velocity", 1, 1, -1.167),
+        ("payload_velocity", 2, 2, -0.712),
+        ("rotation_error_integral", 1, 2, 5.591),
+        ("payload_rotation_error", 1, 2, 1.637),
+        ("payload_angular_velocity", 1, 2, 0.675),
+        ("rotation_error_integral", 2, 1, 1.528),
+        ("payload_rotation_error", 2, 1, 4.557),
+        ("payload_angular_velocity", 2, 1, 1.020),
+        ("payload_rotation_error", 1, 0, -0.945),
+        ("payload_angular_velocity", 1, 0, 0.169),
+        ("heading", 0, 0, 2.177),
     )
 
 
@@ -383,6 +383,7 @@ class TrackAgile(FormationLead):
 
 SEARCHED: dict[str, type[Formation]] = {
     "hover": HoverRigs,
+    "hover_acc_rates": HoverAccRates,
     "hover_realistic": HoverRealistic,
     "track_2_4": TrackAgile,
     "track_realistic_2_4": TrackRealistic,

@@ -223,6 +223,9 @@ def test_the_search_measures_what_evaluations_do(name, script):
     reported = fly_episodes(config, LINEAR[script], 16, 3, TRAINING_EVALUATION)
     assert evaluated.success == reported["success_rate"].mean()
     assert evaluated.error == reported["payload_position_error_m"].mean()
+    paid = search_gains.fly(config, LINEAR[script], seed=3, cost="return")
+    assert paid.cost == -reported["return"].mean()
+    assert paid[1:] == evaluated[1:]
 
 
 @pytest.mark.slow
@@ -242,11 +245,11 @@ def test_the_search_prints_gains_that_a_script_can_have(capsys):
 def test_the_search_finds_gains_that_cost_less(monkeypatch):
     start = {row[:3]: row[3] for row in LINEAR["formation_feedback"].GAINS}
 
-    def bowl(config, script, seed):
+    def bowl(config, script, seed, cost):
         gains = {}
         for name, axis, moved, gain in script.GAINS:
             gains[name, axis, moved] = gains.get((name, axis, moved), 0.0) + gain
-        return search_gains.Score(sum((gain - 0.3) ** 2 for gain in gains.values()), 0.0, 0.0, 0.0)
+        return search_gains.Score(sum((gain - 0.3) ** 2 for gain in gains.values()), 0.0, 0.0, 0.0, 0.0)
 
     clock = count()  # a second from one generation to the next
     monkeypatch.setattr(search_gains, "fly", bowl)

@@ -58,12 +58,13 @@ def test_one_worker_learns_what_one_process_does(tmp_path, local_ray, overrides)
     assert_equal(alone, one)
 
 
-@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize("workers", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_workers_replay_bit_for_bit_also_where_one_dies(tmp_path, local_ray, workers):
     whole, wounded = (learn(make_trainer(tmp_path, **{"train.workers": workers}), kill=kill) for kill in (False, True))
     assert_equal(whole, wounded)
 
 
+@pytest.mark.slow
 def test_the_first_batch_of_workers_is_that_of_one_process(tmp_path, local_ray):
     alone, three = (make_trainer(tmp_path, **{"train.workers": k}) for k in (0, 3))
     batches = [trainer.rollouts.collect(0)[0] for trainer in (alone, three)]
@@ -83,7 +84,7 @@ def test_noise_is_of_environment_and_iteration_alone():
     assert np.abs(np.corrcoef(many.transpose(1, 0, 2, 3).reshape(64, -1)) - np.eye(64)).max() < 0.2
 
 
-@pytest.mark.parametrize(("before", "after"), [(2, 0), (0, 2)])
+@pytest.mark.parametrize(("before", "after"), [pytest.param(2, 0, marks=pytest.mark.slow), (0, 2)])
 def test_a_run_goes_on_with_other_workers(tmp_path, local_ray, before, after):
     trainer = make_trainer(tmp_path, **{"train.workers": before})
     for _ in range(2):
