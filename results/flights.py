@@ -48,6 +48,13 @@ FLIGHTS: dict[str, Flight] = {
     "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
     "pose_falcon3": Flight("pose_falcon3", {}, "pose_falcon3", "pose, three drones, tilts to 45°"),
     "pose_wind": Flight("pose_wind", {}, "pose_wind", "pose, tilts to 45°, in wind of 5 m/s, noise, delay"),
+    "pose_tudelft": Flight(
+        "pose_tudelft",
+        {},
+        "pose_tudelft",
+        "pose without a plan, tilts to 45°, TU Delft's protocol",
+        scripts=("searched",),
+    ),
     "circle_slow": Flight("track_circle", {}, "track_circle", "circle, 0.2 rad/s"),
     "circle_fast": Flight("track_circle", {"task_options.rate": 0.4}, "track_circle", "circle, 0.4 rad/s"),
     "track": Flight("track", {}, "track", "figure-eight, 1 m/s, 0.5 m/s²", f"3.2 cm: geometric control, {ESTIMATED}"),

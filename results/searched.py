@@ -1,4 +1,5 @@
 """The best linear scripts that `search_gains.py` found for flights, by name: baselines, and scripts to learn from.
+Those by accelerations and tilt rates are in `searched_acc_rates.py`.
 
 Each is a policy of one's own, `results/searched.py:HoverRealistic`. Gains are those that the search printed.
 """
@@ -7,8 +8,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from searched_acc_rates import HoverAccRates, PoseTudelft
+
 from multilift_marl.control.scripted_formation import Formation, FormationLead, FormationNarrow
-from multilift_marl.control.scripted_hold import HoldAccRates, HoldCtbr
+from multilift_marl.control.scripted_hold import HoldCtbr
 
 Gains = tuple[tuple[str, int, int, float], ...]
 
@@ -66,37 +69,6 @@ class HoverRealistic(Formation):
         ("payload_angular_velocity", 2, 1, 0.037),
         ("payload_rotation_error", 1, 0, 0.244),
         ("payload_angular_velocity", 1, 0, -0.011),
-    )
-
-
-class HoverAccRates(HoldAccRates):
-    """Of `hover` by accelerations and tilt rates, for return: 8 minutes from `hold_acc_rates`, 48 episodes each."""
-
-    GAINS: ClassVar[Gains] = (
-        ("slot_error", 0, 0, -16.534),
-        ("slot_error", 1, 1, -16.534),
-        ("slot_error", 2, 2, -13.023),
-        ("velocity", 0, 0, -3.835),
-        ("velocity", 1, 1, -3.835),
-        ("velocity", 2, 2, -4.597),
-        ("payload_error_integral", 0, 0, -10.970),
-        ("payload_error_integral", 1, 1, -10.970),
-        ("payload_error_integral", 2, 2, -12.189),
-        ("payload_error", 0, 0, 3.877),
-        ("payload_error", 1, 1, 3.877),
-        ("payload_error", 2, 2, 0.112),
-        ("payload_velocity", 0, 0, -1.167),
-        ("payload_velocity", 1, 1, -1.167),
-        ("payload_velocity", 2, 2, -0.712),
-        ("rotation_error_integral", 1, 2, 5.591),
-        ("payload_rotation_error", 1, 2, 1.637),
-        ("payload_angular_velocity", 1, 2, 0.675),
-        ("rotation_error_integral", 2, 1, 1.528),
-        ("payload_rotation_error", 2, 1, 4.557),
-        ("payload_angular_velocity", 2, 1, 1.020),
-        ("payload_rotation_error", 1, 0, -0.945),
-        ("payload_angular_velocity", 1, 0, 0.169),
-        ("heading", 0, 0, 2.177),
     )
 
 
@@ -385,6 +357,7 @@ SEARCHED: dict[str, type[Formation]] = {
     "hover": HoverRigs,
     "hover_acc_rates": HoverAccRates,
     "hover_realistic": HoverRealistic,
+    "pose_tudelft": PoseTudelft,
     "track_2_4": TrackAgile,
     "track_realistic_2_4": TrackRealistic,
     "track_realistic_5_8": TrackRealisticFast,
