@@ -18,7 +18,7 @@ RECIPES = {
     "hover_acc_rates": "accelerations and tilt rates", "hover_ctbr": "thrust and body rates",
     "hover_ctbm": "thrust and moments", "hover_rotor": "rotor thrusts",
 }  # fmt: skip
-SCRIPTS = {"formation_integral": "--", "formation_feedback": ":"}
+SCRIPTS = {"formation_integral": "--", "payload_geometric": ":", "searched": "-."}
 PANELS = (  # column of the curves, metric of the scripts, factor, label
     ("eval/return", "return", 1.0, "return of an episode"),
     ("eval/payload_position_error_m", "payload_position_error_m", 100.0, "position error [cm]"),
@@ -36,7 +36,8 @@ def draw(path: Path) -> None:
                 values = [factor * float(row[column]) for row in rows]
                 panel.plot(frames, values, f"C{colour}", lw=1.2, label=None if seed else title)
         for script, style in SCRIPTS.items():
-            report: dict[str, Any] = json.loads((HERE / "hover" / f"{script}.json").read_text(encoding="utf-8"))
+            file = HERE / "hover_acc_rates" / f"{script}.json"
+            report: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
             level = factor * report["metrics"][metric]["mean"]
             panel.axhline(level, color="0.4", ls=style, lw=1, label=f"script {script}")
         panel.set_xlabel("environment steps [millions]")

@@ -63,6 +63,12 @@ FLIGHTS: dict[str, Flight] = {
     "track_5_8": Flight(
         "track", FASTEST, "track", "figure-eight, 5 m/s, 8 m/s²", f"19.7 cm: 10 Hz planner, {ESTIMATED}"
     ),
+    "track_rates_2_4": Flight(
+        "track_rates", AGILE, "track_rates", "figure-eight, 2 m/s, 4 m/s², tilt rates", scripts=("searched",)
+    ),
+    "track_rates_5_8": Flight(
+        "track_rates", FASTEST, "track_rates", "figure-eight, 5 m/s, 8 m/s², tilt rates", scripts=("searched",)
+    ),
     "track_realistic_2_4": Flight(
         "track_realistic", {}, "track_realistic", "figure-eight, 2 m/s, 4 m/s², realistic", scripts=FOLLOWING
     ),

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from flights import EPISODES, FLIGHTS, HERE, ROOT, SCRIPTED, SEED, error_metric
-from searched import SEARCHED
+from searched import SEARCHED, settings_of
 from tables import write_tables
 
 from multilift_marl._files import write_whole
@@ -186,8 +186,7 @@ def fly(job: Job) -> str:
         maker = policy.bind
         overrides = overrides | scales
     else:
-        action = SEARCHED[job.flight].INTERFACE if job.team == "searched" else "reference"
-        overrides = overrides | {"control.action": action}
+        overrides = overrides | (settings_of(job.flight) if job.team == "searched" else SCRIPTED)
     results = fly_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
     metrics = summarize(results)
     error = results[error_metric(flight)]

@@ -6,11 +6,11 @@ Each is a policy of one's own, `results/searched.py:HoverRealistic`. Gains are t
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from searched_acc_rates import HoverAccRates, PoseTudelft
+from searched_acc_rates import HoverAccRates, PoseTudelft, TrackAgile
 
-from multilift_marl.control.scripted_formation import Formation, FormationLead, FormationNarrow
+from multilift_marl.control.scripted_formation import Formation, FormationNarrow
 from multilift_marl.control.scripted_hold import HoldCtbr
 
 Gains = tuple[tuple[str, int, int, float], ...]
@@ -321,44 +321,15 @@ class TrackRealisticFast(Formation):
     )
 
 
-class TrackAgile(FormationLead):
-    """Of `track` at 2 m/s and 4 m/s²: 5 minutes from `formation_lead`, 16 episodes of 12 s a candidate."""
-
-    GAINS: ClassVar[Gains] = (
-        ("payload_error_integral", 0, 0, 0.046),
-        ("payload_error_integral", 1, 1, 0.046),
-        ("payload_error_integral", 2, 2, -0.321),
-        ("payload_error", 0, 0, -0.324),
-        ("payload_error", 1, 1, -0.324),
-        ("payload_error", 2, 2, -0.170),
-        ("payload_velocity", 0, 0, -0.291),
-        ("payload_velocity", 1, 1, -0.291),
-        ("payload_velocity", 2, 2, 0.058),
-        ("tracking_error", 0, 0, 0.255),
-        ("tracking_error", 1, 1, 0.255),
-        ("tracking_error", 2, 2, 0.145),
-        ("rotation_error_integral", 1, 2, -0.059),
-        ("payload_rotation_error", 1, 2, 0.105),
-        ("payload_angular_velocity", 1, 2, 0.070),
-        ("rotation_error_integral", 2, 1, -0.111),
-        ("payload_rotation_error", 2, 1, 0.015),
-        ("payload_angular_velocity", 2, 1, -0.001),
-        ("payload_rotation_error", 1, 0, -0.178),
-        ("payload_angular_velocity", 1, 0, 0.026),
-        ("target_ahead_200ms", 0, 0, -0.324),
-        ("target_ahead_200ms", 1, 1, -0.324),
-        ("target_ahead_400ms", 0, 0, 0.197),
-        ("target_ahead_400ms", 1, 1, 0.197),
-        ("heading", 0, 0, 0.043),
-    )
-
-
 SEARCHED: dict[str, type[Formation]] = {
     "hover": HoverRigs,
     "hover_acc_rates": HoverAccRates,
     "hover_realistic": HoverRealistic,
     "pose_tudelft": PoseTudelft,
     "track_2_4": TrackAgile,
+    "track_5_8": TrackAgile,
+    "track_rates_2_4": TrackAgile,
+    "track_rates_5_8": TrackAgile,
     "track_realistic_2_4": TrackRealistic,
     "track_realistic_5_8": TrackRealisticFast,
     "gate_realistic": GateRealistic,
@@ -370,3 +341,13 @@ SEARCHED: dict[str, type[Formation]] = {
     "track_follow_2_4": TrackFollow,
 }
 """The best one of a flight."""
+SCALES: dict[str, dict[str, float]] = {
+    "track_2_4": {"control.max_acceleration": 12.0},
+    "track_5_8": {"control.max_acceleration": 12.0},
+}
+"""Full scales of its actions, where they are not those of the flight [m/s²]."""
+
+
+def settings_of(flight: str) -> dict[str, Any]:
+    """Return the keys of the best script of a flight: by what it acts, and full scales."""
+    return {"control.action": SEARCHED[flight].INTERFACE} | SCALES.get(flight, {})

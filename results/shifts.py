@@ -16,8 +16,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from flights import FLIGHTS, HERE, error_metric
-from searched import SEARCHED
+from flights import FLIGHTS, HERE, SCRIPTED, error_metric
+from searched import SEARCHED, settings_of
 from tables import best_script
 
 from multilift_marl._files import write_whole
@@ -83,14 +83,14 @@ def main(flights: list[str]) -> None:
     for flight in flights:
         policy, best = load_policy(HERE / FLIGHTS[flight].recipe / "seed0" / "policy.pt"), best_script(flight)
         script: Callable[[MultiliftVec], Any] = partial(make_scripted, best)
-        action = "reference"
+        keys: dict[str, Any] = SCRIPTED
         if best == "searched":
-            script, action = SEARCHED[flight], SEARCHED[flight].INTERFACE
+            script, keys = SEARCHED[flight], settings_of(flight)
         scales = {f"control.{key}": getattr(policy.config.control, key) for key in ("max_offset", "max_yaw")}
         rows = []
         for shift in list_shifts(load_config(FLIGHTS[flight].config).env.num_drones):
             row: dict[str, Any] = {"shift": shift.title}
-            for team, own, maker in (("learned", scales, policy.bind), (best, {"control.action": action}, script)):
+            for team, own, maker in (("learned", scales, policy.bind), (best, keys, script)):
                 try:
                     row[team] = fly(flight, shift, own, maker)
                 except (ConfigError, ValueError) as error:  # a team that cannot lift so much, for example

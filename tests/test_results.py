@@ -263,7 +263,7 @@ def test_the_search_finds_gains_that_cost_less(monkeypatch):
 @pytest.mark.parametrize("flight", sorted(searched.SEARCHED))
 def test_searched_scripts_fit_their_flights(flight):
     script = searched.SEARCHED[flight]
-    config = reproduce.load_config(reproduce.FLIGHTS[flight].config, {"control.action": script.INTERFACE})
+    config = reproduce.load_config(reproduce.FLIGHTS[flight].config, searched.settings_of(flight))
     vec = ml.make_vec(config, num_envs=1, num_threads=1)
     assert not script.refusal(vec) and np.abs(script(vec).matrix()).max() > 0
 
