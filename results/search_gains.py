@@ -60,6 +60,8 @@ SLOTS: Free = (
     ("target_ahead_200ms", LEVEL, 0.5),
     ("target_ahead_400ms", LEVEL, 0.25),
     ("gap", LEVEL, 0.2),
+    ("planned_offset", LEVEL, 0.3),
+    ("planned_offset", UP, 0.3),
     ("heading", ((0, 0),), 0.1),
 )
 """Observation; axes in the slot frame, of it and of the slot's offset, that share a gain; scale of the search. Of these
@@ -68,7 +70,7 @@ OWN: Free = (("slot_error", LEVEL, 5.0), ("slot_error", UP, 5.0), ("velocity", L
 HELD: Free = (*OWN, *((name, axes, STIFFNESS * width) for name, axes, width in SLOTS if name != "tracking_error"))
 """The same of scripts that hold their slots by accelerations."""
 POPULATION, RENEWED = 12, 3  # candidates of a generation; generations with the same episodes
-ERROR, ANGLE = 0.05, 5.0  # [m], [deg] as bad as a quarter of the episodes lost
+ERROR, ANGLE = 0.05, 5.0  # [m], [deg] as bad as a quarter of the episodes lost; no error as bad as more than one
 Cost = Literal["errors", "return"]
 
 
@@ -120,10 +122,12 @@ def fly(config: Config, script: type[Formation], seed: int, cost: Cost = "errors
     flown = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tracks = config.task == "track"
     error, success = flown["payload_rmse_m" if tracks else "payload_position_error_m"], flown["success_rate"].mean()
-    angle = 0.0 if tracks else float(flown["payload_attitude_error_deg"].mean())
-    lost = 1 - success + 0.25 * error.mean() / ERROR + 0.25 * angle / ANGLE
+    turned = np.zeros_like(error) if tracks else flown["payload_attitude_error_deg"]
+    lost = 1 - success + np.mean(np.minimum(0.25 * error / ERROR, 1) + np.minimum(0.25 * turned / ANGLE, 1))
     paid = float(flown["return"].mean())
-    return Score(-paid if cost == "return" else float(lost), float(success), float(error.mean()), angle, paid)
+    return Score(
+        -paid if cost == "return" else float(lost), float(success), float(error.mean()), float(turned.mean()), paid
+    )
 
 
 def search(config: Config, script: str, free: Free, spread: float, minutes: float, cost: Cost = "errors") -> np.ndarray:
