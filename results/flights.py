@@ -107,7 +107,11 @@ FLIGHTS: dict[str, Flight] = {
     ),
     "loss": Flight("loss", {}, "loss", "loss, 4 drones"),
     "loss_realistic": Flight(
-        "loss_realistic", {}, "loss_realistic", "loss, realistic", scripts=("formation_redistributed",)
+        "loss_realistic",
+        {},
+        "loss_realistic",
+        "loss, realistic",
+        scripts=("formation_redistributed", "searched"),
     ),
     "loss_6": Flight("loss_6", {}, "loss_6", "loss, 6 drones"),
     "loss_snap": Flight("loss_snap", {}, "loss", "loss with its cable"),
