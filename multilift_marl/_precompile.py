@@ -1,4 +1,4 @@
-"""A second process that compiles kernels from the last to the first, while this one compiles them in their order.
+"""A second process (`_compile_helper.py`) compiles kernels from the last to the first, this one in their order.
 
 They meet in the middle: each finds on disk what the other has compiled. The helper learns what there is to compile from
 a small environment of the same configuration, whose kernels run as Python. It reads from its standard input, and writes
@@ -13,20 +13,17 @@ import contextlib
 import multiprocessing
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import threading
 from pathlib import Path
 from typing import Any
 
-from multilift_marl._platform import cpu_count, handles_signals
+from multilift_marl._platform import cpu_count
 
-_COMMAND = (
-    "import sys; sys.path.append({path!r}); from multilift_marl._precompile import compile_backwards as run; run()"
-)
+_COMMAND = "import sys; sys.path.append({path!r}); from multilift_marl._compile_helper import run; run()"
 _PATIENCE = 60.0  # [s] for a kernel that the helper has begun
-_BEGIN, _END, _TOTAL = "begin", "end", "total"  # first words of lines
+BEGIN, END, TOTAL = "begin", "end", "total"  # first words of lines
 
 
 class Helper:
@@ -76,11 +73,11 @@ class Helper:
             for line in self._output:
                 word, _, rest = line.rstrip("\n").partition(" ")
                 with self._news:
-                    if word == _BEGIN:
+                    if word == BEGIN:
                         self._begun.add(rest)
-                    elif word == _END:
+                    elif word == END:
                         self._ended.add(rest)
-                    elif word == _TOTAL:
+                    elif word == TOTAL:
                         self.total = int(rest)
                     self._news.notify_all()
         with self._news:
@@ -149,6 +146,12 @@ def end() -> None:
     _progress.end()
 
 
+def be_helper() -> None:
+    """State that this process is the helper, which starts none."""
+    global _helps
+    _helps = True
+
+
 def _start_helper() -> None:
     """Start a helper, unless there is one, or one would not help: on a single CPU, or in one of several processes."""
     global _helper
@@ -159,47 +162,3 @@ def _start_helper() -> None:
         return
     with contextlib.suppress(Exception):  # no memory, no processes; a configuration with what cannot be pickled
         _helper = Helper(config)
-
-
-def compile_backwards() -> None:
-    """Be the helper."""
-    global _helps
-    _helps = True
-    if handles_signals():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other process; this one ends with it
-    parent, _, request = sys.stdin.readline().partition(" ")
-    theirs = set[str]()
-    threading.Thread(target=_hear, args=(theirs,), daemon=True).start()
-    try:
-        for kernel, types in reversed(_list_kernels(pickle.loads(base64.b64decode(request)))):
-            if os.name == "posix" and os.getppid() != int(parent):  # others may hold the other end of our input
-                break
-            path = kernel._cache.path(types, kernel.targetctx)
-            if str(path) not in theirs and not path.exists():
-                print(_BEGIN, path, flush=True)
-                kernel.compile(types)
-                print(_END, path, flush=True)
-    finally:
-        os._exit(0)  # without waiting for the thread
-
-
-def _hear(theirs: set[str]) -> None:
-    """Note the kernels that the other process compiles; end with it."""
-    try:
-        for line in sys.stdin:
-            theirs.add(line.rstrip("\n"))
-    finally:
-        os._exit(0)
-
-
-def _list_kernels(config: Any) -> list[Any]:
-    """Return the kernels, and their types, of environments of a configuration, in the order of their first use."""
-    from multilift_marl._compiler import recorded
-    from multilift_marl.envs.core import MultiliftVec
-
-    few = min(config.env.num_envs, 2)
-    small = config.model_copy(update={"env": config.env.model_copy(update={"num_envs": few, "num_threads": 1})})
-    with contextlib.suppress(Exception), recorded() as calls:
-        MultiliftVec(small).reset(seed=0)
-    print(_TOTAL, len(calls), flush=True)
-    return calls

@@ -13,7 +13,7 @@ import pytest
 from conftest import make, zeros
 
 import multilift_marl as ml
-from multilift_marl import _compiler, _precompile
+from multilift_marl import _compile_helper, _compiler, _precompile
 from multilift_marl._jit import bind, kernel, kernel_name
 from multilift_marl.config.load import load_config
 
@@ -113,7 +113,7 @@ def test_a_helper_ends_with_the_process_that_started_it(tmp_path):
 
 @pytest.mark.parametrize("task", ["hover", "gate"])
 def test_a_helper_knows_all_kernels_of_an_environment(task):
-    known = set(_precompile._list_kernels(load_config(task)))
+    known = set(_compile_helper._list_kernels(load_config(task)))
     names = {each.__name__ for each, _ in known}
     assert {"apply_loads", "read_state", "check", "reward", "observe", "observe_state", "fly"} <= names
     before = {(each, types): each.overloads.get(types) for each, types in known}
