@@ -40,7 +40,7 @@ def test_ends_by_failure_divergence_and_time():
     outcome = Outcome.of(np.zeros((4, 2, 1), np.float32), np.ones((4, 3)))
     diverged, cause, ended = mask(4, 2), np.array([0, 3, 0, 0]), np.ones(4, bool)
     steps = np.array([0, 9, 9, 9])
-    assert end_step(diverged, cause, steps, 10, ended, outcome) == 1
+    assert end_step(diverged, cause, steps, 10, ended, outcome) == (1, -1)
     assert steps.tolist() == [1, 10, 10, 10] and ended.tolist() == [False, True, True, True]
     terminated, truncated, success, failure, lost = outcome.flags.tolist()
     assert terminated == failure == [False, True, True, False]

@@ -14,9 +14,15 @@ from multilift_marl.config.load import build_config, load_config
 from multilift_marl.tasks import TASKS
 from multilift_marl.tasks.hover import Hover
 from multilift_marl.tasks.observations import Component, own_velocity
-from multilift_marl.tasks.rewards import describe
+from multilift_marl.tasks.rewards import Term, describe
 
 ROOT = Path(__file__).parents[1]
+
+
+@inlined
+def not_a_number(e, v):
+    """Not a number in the last environment."""
+    return np.nan if e == v.time.shape[0] - 1 else 0.0
 
 
 def paid(vec, **errors):
@@ -112,6 +118,18 @@ def test_a_component_that_is_not_written_is_refused_by_name(where, registries):
     vec._checked = False
     said = refusal(lambda: vec._observe(0) or vec.task.check_written(0))
     assert "is not finite; mend what computes it" in said
+
+
+def test_a_reward_that_is_not_finite_is_refused_by_name(registries):
+    class Broken(Hover):
+        name = "broken"
+        REWARD = Hover.REWARD | {"broken": Term(1.0, not_a_number)}
+
+    TASKS["broken"] = Broken
+    vec = make(load_config("hover", {"task": "broken"}), num_envs=3)
+    vec.reset(seed=0)
+    said = refusal(vec.step, zeros(vec))
+    assert "reward term broken is not finite in environment 2; mend what computes it" in said
 
 
 def test_the_stages_of_a_step_can_be_read_and_reading_changes_nothing():

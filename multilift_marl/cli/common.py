@@ -34,6 +34,9 @@ from multilift_marl.tasks.base import resolve_reward
 from multilift_marl.tasks.rewards import describe
 
 Options = TypeVar("Options", bound=Section)
+UNTRAINED = (
+    "the best policy of this run is the untrained one, which flies the script; checkpoint=last evaluates the last one"
+)
 _EXTRAS = {
     "onnx": "export",
     "onnxscript": "export",

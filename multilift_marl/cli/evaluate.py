@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl.agents.policy import find_policy, load_policy
-from multilift_marl.cli.common import limit_torch_threads, make_folder, run_command, split_options, title
+from multilift_marl.cli.common import UNTRAINED, limit_torch_threads, make_folder, run_command, split_options, title
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.config.values import Between, Float, Int, Section
@@ -149,6 +149,8 @@ def _find_named(options: Options, name: str, overrides: dict[str, Any]) -> _Team
 
 def _find_run(options: Options) -> _Team:
     policy = load_policy(options.run, options.checkpoint)
+    if options.checkpoint == "best" and getattr(policy, "frames", None) == 0:
+        print(f"note: {UNTRAINED}")
     return _Team("policy", policy.source, policy.config, policy.bind, policy.folder)
 
 

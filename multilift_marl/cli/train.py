@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from multilift_marl.cli.common import run_command, split_options, title
+from multilift_marl.cli.common import UNTRAINED, run_command, split_options, title
 from multilift_marl.config.load import load_config
 from multilift_marl.config.values import Section
 from multilift_marl.errors import ConfigError
@@ -80,6 +80,8 @@ def _train(values: dict[str, Any]) -> int:
     minutes = trainer.seconds / 60
     if not finished:
         print(f"stopped after {minutes:.1f} min of training; go on with: python train.py resume={folder}")
+        if trainer.evaluator.best is not None and trainer.evaluator.best["iteration"] == 0:
+            print(f"note: {UNTRAINED}")
         return trainer.status
     baseline = " baseline=formation_integral" if trainer.config.control.action == "reference" else ""
     print(
@@ -105,7 +107,8 @@ def _compare(trainer: Trainer) -> str:
     )
     if best["iteration"] == 0:
         return f"{text}\nlearning gained nothing: no policy was better than the untrained one, which flies the script"
-    return text if gain.better else f"{text}\nlearning gained nothing: the difference is not beyond the noise"
+    verdict = "learning gained: the difference is beyond" if gain.better else "learning gained nothing: it is not beyond"
+    return f"{text}\n{verdict} the noise of these episodes"
 
 
 if __name__ == "__main__":

@@ -286,7 +286,8 @@ def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
     if name not in CONFIGS:
         load_entry_points()
     if name not in CONFIGS:
-        raise ConfigError(f"no configuration named '{shorten(name)}'{nearest(name, [*list_configs(), *CONFIGS])}")
+        hint = nearest(name, [*list_configs(), *CONFIGS], otherwise="; one's own needs import=<module>, or is a file")
+        raise ConfigError(f"no configuration named '{shorten(name)}'{hint}")
     source = CONFIGS[name]
     return _read(source, above) if isinstance(source, Path) else _add_bases(dict(source), Path(), (*above, name))
 

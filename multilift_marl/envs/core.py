@@ -168,7 +168,9 @@ class MultiliftVec:
         self._set_action(action, self._ended if begin is None else self._ended & ~begin)
         self.world.run(self._run_shard)
         self.world.check_warnings()
-        out_of_time = self._end_step()
+        out_of_time, bad = self._end_step()
+        if bad >= 0:
+            self._refuse_reward(bad)
         if out_of_time:
             truncated = self.outcome.flags[1]
             np.logical_and(truncated, self.task.succeeded(), out=self.outcome.flags[2])
@@ -281,6 +283,12 @@ class MultiliftVec:
                 self.task.check_written(e)
                 self._checked = True
             self._stacked[e] = np.tile(self.task.observation[e], self.config.env.history)
+
+    def _refuse_reward(self, env: int) -> None:
+        """Name the reward term that is not finite in an environment, by a ConfigError."""
+        bad = ~np.isfinite(self.outcome.terms[env])
+        name = self.reward_terms[int(bad.argmax())] if bad.any() else "the sum"
+        raise ConfigError(f"reward term {name} is not finite in environment {env}; mend what computes it")
 
     def use_controller(self, controller: Controller) -> None:
         """Let another controller of this world fly the drones from the next reset on."""

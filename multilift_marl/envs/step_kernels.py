@@ -82,11 +82,11 @@ def end_step(diverged, cause, steps, max_steps, ended, outcome):
         outcome: Outcome, written; whether time limits are successes is for the task to say.
 
     Returns:
-        How many episodes have reached their time limit.
+        How many episodes have reached their time limit, and an environment whose reward is not finite, or -1.
     """
     flags = outcome.flags
     terms = outcome.terms
-    out_of_time = 0
+    out_of_time, bad = 0, -1
     for e in range(steps.shape[0]):
         steps[e] += 1
         if diverged[e]:
@@ -102,9 +102,11 @@ def end_step(diverged, cause, steps, max_steps, ended, outcome):
         flags[4, e] = diverged[e]
         outcome.cause[e] = cause[e]
         reward = _sum(terms[e])
+        if not isfinite(reward):
+            bad = e
         for n in range(outcome.reward.shape[1]):
             outcome.reward[e, n] = reward
-    return out_of_time
+    return out_of_time, bad
 
 
 @kernel
