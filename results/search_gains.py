@@ -6,7 +6,8 @@
 It starts from the gains of `script`, with candidates `spread` times the scales of `SLOTS` or `HELD` around them,
 simulates the same `env.num_envs` episodes with all candidates of a generation, and prints the final gains and their
 results in episodes that are not part of the search. `cost=errors` are lost episodes and errors at the end,
-`cost=return` is the return, what a learned team is paid. Any configuration key changes the task; where it has
+`cost=success` lost episodes, failures and errors above all, where payloads cannot be level, and `cost=return` is the
+return, what a learned team is paid. Any configuration key changes the task; where it has
 `train.rigs`, one script is searched for all of them.
 """
 
@@ -62,6 +63,8 @@ SLOTS: Free = (
     ("gap", LEVEL, 0.2),
     ("planned_offset", LEVEL, 0.3),
     ("planned_offset", UP, 0.3),
+    ("lost_direction", LEVEL, 0.1),
+    ("team_lost", ((0, 2),), 0.1),
     ("heading", ((0, 0),), 0.1),
 )
 """Observation; axes in the slot frame, of it and of the slot's offset, that share a gain; scale of the search. Of these
@@ -71,7 +74,7 @@ HELD: Free = (*OWN, *((name, axes, STIFFNESS * width) for name, axes, width in S
 """The same of scripts that hold their slots by accelerations."""
 POPULATION, RENEWED = 12, 3  # candidates of a generation; generations with the same episodes
 ERROR, ANGLE = 0.05, 5.0  # [m], [deg] as bad as a quarter of the episodes lost; no error as bad as more than one
-Cost = Literal["errors", "return"]
+Cost = Literal["errors", "success", "return"]
 
 
 class Score(NamedTuple):
@@ -124,10 +127,10 @@ def fly(config: Config, script: type[Formation], seed: int, cost: Cost = "errors
     error, success = flown["payload_rmse_m" if tracks else "payload_position_error_m"], flown["success_rate"].mean()
     turned = np.zeros_like(error) if tracks else flown["payload_attitude_error_deg"]
     lost = 1 - success + np.mean(np.minimum(0.25 * error / ERROR, 1) + np.minimum(0.25 * turned / ANGLE, 1))
+    failed = (flown["failure_cause"] > 0).mean()
     paid = float(flown["return"].mean())
-    return Score(
-        -paid if cost == "return" else float(lost), float(success), float(error.mean()), float(turned.mean()), paid
-    )
+    costs = {"errors": lost, "success": 1 - success + 0.5 * failed + 0.3 * np.minimum(error, 1).mean(), "return": -paid}
+    return Score(float(costs[cost]), float(success), float(error.mean()), float(turned.mean()), paid)
 
 
 def search(config: Config, script: str, free: Free, spread: float, minutes: float, cost: Cost = "errors") -> np.ndarray:
@@ -172,7 +175,7 @@ class Options(Section):
     minutes: Positive = Field(30.0, description="[min] that the search takes")
     script: str = Field("formation_feedback", description="whose gains it begins with, a name or module:Class")
     spread: Positive = Field(0.3, description="[-] of the first candidates, over the scales of `SLOTS` or `HELD`")
-    cost: Cost = Field("errors", description="what a script is searched for: few lost episodes and errors, or return")
+    cost: Cost = Field("errors", description="what a script is searched for, see above")
 
 
 def main(values: dict[str, Any]) -> int:
