@@ -19,6 +19,17 @@ from multilift_marl.agents.policy import LearnedPolicy, load_policy
 from multilift_marl.config.config import Config
 
 PAGE = ROOT / "docs" / "models.md"
+FROM_NOTHING = (
+    "Changes that it did not see in training are in [learning.md](learning.md#from-nothing); **where actions come one "
+    "step (20 ms) late it holds {late} of 50 payloads**."
+)
+ELSEWHERE = {
+    "hover_acc_rates": FROM_NOTHING.format(late="2 %"),
+    "hover_ctbr": FROM_NOTHING.format(late="12 %"),
+    "hover_ctbm": FROM_NOTHING.format(late="none"),
+    "hover_rotor": FROM_NOTHING.format(late="none"),
+}
+"""What policies without a table of shifts do under changes."""
 POLICIES = ROOT / "multilift_marl" / "policies"
 HEAD = """# Policies that come with the package
 
@@ -51,7 +62,8 @@ def card(name: str) -> str:
     if tested:
         parts += ["Under changes that it did not see in training:", shifts(tested)]
     else:
-        parts.append("Not recorded: what it does under changes that it did not see in training.")
+        prose = ELSEWHERE.get(name, "Not recorded: what it does under changes that it did not see in training.")
+        parts.append(prose)
     return "\n\n".join(parts)
 
 

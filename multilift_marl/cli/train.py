@@ -107,8 +107,9 @@ def _compare(trainer: Trainer) -> str:
     )
     if best["iteration"] == 0:
         return f"{text}\nlearning gained nothing: no policy was better than the untrained one, which flies the script"
-    verdict = "learning gained: the difference is beyond" if gain.better else "learning gained nothing: it is not beyond"
-    return f"{text}\n{verdict} the noise of these episodes"
+    if gain.better:
+        return f"{text}\nlearning gained: the difference is beyond the noise of these episodes"
+    return f"{text}\nlearning gained nothing: the difference is not beyond the noise"
 
 
 if __name__ == "__main__":
