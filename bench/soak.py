@@ -74,7 +74,9 @@ def fly(task: str, mode: str, seconds: float, num_envs: int) -> tuple[Watch, int
     vec.stagger()
     watch, steps, episodes, start = Watch(), 0, 0, time.monotonic()
     for i in range(SAMPLES + 1):
-        while time.monotonic() - start < seconds * i / SAMPLES:
+        stepped = False
+        while not stepped or time.monotonic() - start < seconds * i / SAMPLES:  # a step at least, however short it is
+            stepped = True
             shape = (num_envs, vec.num_drones, len(vec.action_names))
             action = rng.uniform(-1.0, 1.0, shape) if policy is None else policy.act(observation)
             observation, reward, terminated, truncated, _ = vec.step(action)

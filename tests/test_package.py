@@ -179,7 +179,10 @@ SHORTER = {  # of each script: keys that go, and what is added
     "bench/tasks.py": (["repeats", "seconds"], "repeats=1 seconds=0.02 env.num_envs=4"),
     "bench/workers.py": (["repeats", "workers"], "repeats=1 workers=0,1 env.num_envs=4 train.horizon=8"),
     "bench/training.py": (["repeats"], f"repeats=1 {SHORT} train.minibatches=2"),
-    "results/search_gains.py": (["minutes"], "minutes=0.001 env.num_envs=2 env.episode_seconds=2.0"),
+    "results/search_gains.py": (
+        ["minutes", "env.num_envs", "env.episode_seconds"],
+        "minutes=0.001 env.num_envs=2 env.episode_seconds=2.0",
+    ),
     "examples/cleanrl_ppo.py": ([], "1"),  # iteration
     "examples/fly_exported.py": ([], "1"),
     "examples/ray_tune.py": (["16"], f"2 {SHORT}"),  # trials
