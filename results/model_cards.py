@@ -62,8 +62,7 @@ def card(name: str) -> str:
     if tested:
         parts += ["Under changes that it did not see in training:", shifts(tested)]
     else:
-        prose = ELSEWHERE.get(name, "Not recorded: what it does under changes that it did not see in training.")
-        parts.append(prose)
+        parts.append(ELSEWHERE.get(name, "Not recorded: what it does under changes that it did not see in training."))
     return "\n\n".join(parts)
 
 
