@@ -13,6 +13,7 @@ from conftest import SMALL, make, refusal
 
 import multilift_marl as ml
 from multilift_marl import plugins
+from multilift_marl._jit import inlined
 from multilift_marl.agents.checkpoint import load_checkpoint
 from multilift_marl.agents.policy import ExportedPolicy
 from multilift_marl.agents.trainer import new_run
@@ -26,7 +27,11 @@ from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import CheckpointError
 from multilift_marl.evaluation.rollout import fly_episodes
 from multilift_marl.tasks import TASKS
+from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.hover import Hover
+from multilift_marl.tasks.observations import Component
+from multilift_marl.tasks.rewards import Term
+from multilift_marl.tasks.starts import StartOptions
 from multilift_marl.view.__main__ import make_session
 
 ROOT = Path(__file__).parents[1]
@@ -233,6 +238,48 @@ def test_what_is_registered_has_a_name_of_its_own(folder):
         (lambda: ml.register_config("mine", "no.yaml"), "no configuration file"),
     ):
         assert message in refusal(call)
+
+
+@inlined
+def nothing(e, n, v):
+    """Nothing."""
+    return 0.0
+
+
+OWN = Component("mine", 1, "-", "-", "nothing", nothing)
+
+
+@pytest.mark.parametrize(
+    "declared, message",
+    [
+        ({"start": Task.start}, "it has no start(self, env, rng, mass)"),
+        ({"Options": dict}, "Options is <class 'dict'>; derive"),
+        ({"REWARD": (1.0,)}, "REWARD is (1.0,); give a dict"),
+        ({"REWARD": {"near": 1.0}}, "REWARD['near'] is 1.0; give Term"),
+        ({"REWARD": {"near": Term(1.0, "distance")}}, "REWARD['near'].value is 'distance'; give an @inlined"),
+        ({"KERNELS": None}, "KERNELS is None; give"),
+        ({"KERNELS": Kernels(plan="sway")}, "KERNELS.plan is 'sway'; give an @inlined"),
+        ({"KERNELS": Kernels(is_good=None)}, "KERNELS.is_good is None"),
+        ({"EXTRA": OWN._replace(size=2)}, "EXTRA holds 'mine'"),
+        ({"EXTRA": [OWN]}, "EXTRA is [Component("),
+        ({"EXTRA": (OWN, OWN)}, "EXTRA has 2 components 'mine'"),
+        ({"EXTRA": (OWN._replace(name="velocity"),)}, "component 'velocity', as observations of all tasks do"),
+        ({"EXTRA": (OWN._replace(frame="slots"),)}, "unknown frame 'slots'; did you mean 'slot'?"),
+        ({"EXTRA_STATE": (OWN._replace(size=0),)}, "component 'mine' has size 0"),
+        ({"EXTRA_STATE": (OWN._replace(size=True),)}, "component 'mine' has size True"),
+        ({"EXTRA": (OWN._replace(value=None),)}, "component 'mine' has value None"),
+    ],
+)
+def test_what_a_task_declares_is_checked_when_it_is_registered(folder, declared, message):
+    message_given = refusal(ml.register_task, type("Odd", (Hover,), {"name": "odd", **declared}))
+    assert message_given.startswith("task odd: ") and message in message_given
+    assert "odd" not in ml.list_tasks()
+
+
+def test_a_task_needs_bounds_of_success(folder):
+    ml.register_task(type("Boundless", (Hover,), {"name": "boundless", "Options": StartOptions}))
+    message = "the task's Options have no success_distance; add the field, or override prepare() to set `settings`"
+    assert refusal(ml.make_vec, "boundless", num_envs=1) == message
 
 
 def test_a_task_brings_its_configuration_under_its_name(folder):

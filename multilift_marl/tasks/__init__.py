@@ -10,6 +10,7 @@ from multilift_marl.config.load import register_config
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.plugins import load_entry_points
 from multilift_marl.tasks.base import Task
+from multilift_marl.tasks.declared import check_declared
 from multilift_marl.tasks.gate import Gate
 from multilift_marl.tasks.hover import Hover
 from multilift_marl.tasks.land import Land
@@ -47,7 +48,8 @@ def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None)
         The class.
 
     Raises:
-        ConfigError: no task, one without a name, or with that of a shipped task or configuration.
+        ConfigError: no task, one without a name, or with that of a shipped task or configuration, or one that declares
+            what cannot be; see `check_declared`.
     """
     name = getattr(task, "name", None)
     if not (isinstance(task, type) and issubclass(task, Task) and isinstance(name, str)):
@@ -55,6 +57,7 @@ def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None)
     if name in _SHIPPED and task is not TASKS[name]:
         raise ConfigError(f"a task of one's own cannot have the name '{name}': choose one that is not taken")
     if name not in _SHIPPED:
+        check_declared(task)
         register_config(name, {"task": name} if config is None else config)
     TASKS[name] = task
     return task

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from multilift_marl._jit import compose, inlined
+from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import norm, row, sub
 
 
@@ -44,7 +45,16 @@ class RestBounds(NamedTuple):
 
     @classmethod
     def of(cls, options: Any) -> RestBounds:
-        """Return `success_distance`, `success_angle`, `success_speed` and `success_body_rate` of a task's options."""
+        """Return `success_distance`, `success_angle`, `success_speed` and `success_body_rate` of a task's options.
+
+        Raises:
+            ConfigError: one of the first two is no field of theirs.
+        """
+        for name in ("success_distance", "success_angle"):
+            if not hasattr(options, name):
+                raise ConfigError(
+                    f"the task's Options have no {name}; add the field, or override prepare() to set `settings`"
+                )
         speed, body_rate = (getattr(options, f"success_{name}", np.inf) for name in ("speed", "body_rate"))
         return cls(options.success_distance, radians(options.success_angle), speed, body_rate)
 
