@@ -8,6 +8,15 @@ from collections.abc import Callable, Iterable
 from functools import cache
 
 
+_ELSEWHERE = {
+    "steps": "frames", "timesteps": "frames", "total_timesteps": "frames", "num_steps": "frames", "lr": "learning_rate",
+    "max_steps": "episode_seconds", "episode_steps": "episode_seconds", "agents": "num_drones",
+    "num_agents": "num_drones", "n_agents": "num_drones", "std": "initial_std", "hidden_sizes": "hidden",
+    "rollout_length": "horizon",
+}  # fmt: skip
+"""What other libraries call a key, and what it is called here."""
+
+
 class ConfigError(ValueError):
     """A configuration, an override or a physical system that cannot be."""
 
@@ -31,6 +40,8 @@ class FlightError(RuntimeError):
 def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str, otherwise: str = "") -> str:
     """Return "; did you mean 'x'?" for the closest of `names`, or the list of them where none is close.
 
+    A key's name in other libraries is close to ours.
+
     Args:
         name: what was given.
         names: what is known.
@@ -38,7 +49,8 @@ def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str, o
         otherwise: the cure where none is close.
     """
     names = sorted(names)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    known = _ELSEWHERE.get(name)
+    close = [known] if known in names else difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     return f"; did you mean '{full(close[0])}'?" if close else f"; known: {', '.join(names)}{otherwise}"
 
 

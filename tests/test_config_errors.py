@@ -33,6 +33,8 @@ def refuse_values(**overrides) -> str:
         ("cable.stifness", "cable.stiffness"),
         ("train.learningrate", "train.learning_rate"),
         ("eval.episode", "eval.episodes"),
+        ("train.steps", "train.frames"),  # as other libraries call it
+        ("env.n_agents", "env.num_drones"),
     ],
 )
 def test_unknown_key_names_the_nearest(key, nearest):

@@ -175,14 +175,18 @@ def test_command_line_errors_are_one_sentence(tmp_path, monkeypatch, capsys, arg
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_finished_run_says_so_and_how_to_go_on(tmp_path, capsys):
+@pytest.mark.parametrize(
+    "called, command", [("train.py", "python train.py"), ("/opt/bin/multilift-train", "multilift-train")]
+)
+def test_a_finished_run_says_so_and_how_to_go_on(tmp_path, capsys, monkeypatch, called, command):
     trainer = make_trainer(tmp_path, **{"train.frames": 128})
     trainer.step()
     trainer.save("last")
+    monkeypatch.setattr("sys.argv", [called])
     assert train([f"resume={trainer.folder}"]) == 0
     shown = capsys.readouterr().out
     assert f"{trainer.folder} is finished, with 128 steps" in shown
-    assert f"python train.py resume={trainer.folder} train.frames=256" in shown
+    assert f"{command} resume={trainer.folder} train.frames=256" in shown
 
 
 def test_resume_refuses_what_cannot_change(tmp_path, capsys):

@@ -101,6 +101,12 @@ def run_command(
         return _refuse(f"cannot read or write {place} ({reason(error)}); make room, or use another folder")
 
 
+def spell_command(name: str) -> str:
+    """Return how a command, "train" or "evaluate", is called as this process was: a script of a clone, or installed."""
+    installed = Path(sys.argv[0]).name.startswith("multilift-")
+    return f"multilift-{name}" if installed else f"python {name}.py"
+
+
 def _refuse(message: str) -> int:
     """Print a user's error as one line, and return its exit status."""
     with suppress(OSError):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from multilift_marl.cli.common import UNTRAINED, run_command, split_options, title
+from multilift_marl.cli.common import UNTRAINED, run_command, spell_command, split_options, title
 from multilift_marl.config.load import load_config
 from multilift_marl.config.values import Section
 from multilift_marl.errors import ConfigError
@@ -62,7 +62,7 @@ def _train(values: dict[str, Any]) -> int:
                 )
         trainer = resume_run(folder, overrides)
         if trainer.finished:
-            more = f"python train.py resume={folder} train.frames={2 * trainer.frames}"
+            more = f"{spell_command('train')} resume={folder} train.frames={2 * trainer.frames}"
             print(f"{folder} is finished, with {trainer.frames:,} steps; for more, say how many in all: {more}")
             return 0
         print(f"resuming {folder} at iteration {trainer.iteration} of {trainer.iterations}")
@@ -79,7 +79,7 @@ def _train(values: dict[str, Any]) -> int:
     finished = trainer.run()
     minutes = trainer.seconds / 60
     if not finished:
-        print(f"stopped after {minutes:.1f} min of training; go on with: python train.py resume={folder}")
+        print(f"stopped after {minutes:.1f} min of training; go on with: {spell_command('train')} resume={folder}")
         if trainer.evaluator.best is not None and trainer.evaluator.best["iteration"] == 0:
             print(f"note: {UNTRAINED}")
         return trainer.status
@@ -88,7 +88,7 @@ def _train(values: dict[str, Any]) -> int:
         f"trained {trainer.frames:,} steps in {minutes:.1f} min\n"
         f"{_compare(trainer)}\n"
         f"curves:   tensorboard --logdir {folder}\n"
-        f"evaluate: python evaluate.py run={folder} episodes=200 seed=1000{baseline} video=true"
+        f"evaluate: {spell_command('evaluate')} run={folder} episodes=200 seed=1000{baseline} video=true"
     )
     return 0
 
