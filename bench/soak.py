@@ -1,11 +1,13 @@
 """Whether memory and threads stay flat over many steps, and nothing that a learner is given is NaN.
 
-    python bench/soak.py mode=random|policy|training [minutes=3] [iterations=200] [num_envs=64] [task=<name>]
+    python bench/soak.py mode=random|policy|training [minutes=3 | steps=<N>] [iterations=200] [num_envs=64] \
+        [num_threads=0] [task=<name>]
 
 `random` flies every task in turn by random actions, which soon fail, so that episodes start often; `policy` by the
 policy that comes with the package; `training` trains `hover` in small batches. It fails, with exit status 1, by NaN,
 and by threads that were added or memory that grew beyond `BOUND` within a task (of training: within the run), each
-after the first quarter of it. `task` is the only one to fly, in place of all.
+after the first quarter of it. `task` is the only one to fly, in place of all. `steps`, of all tasks together, are made
+in place of `minutes`, an equal share by each.
 """
 
 from __future__ import annotations
@@ -63,9 +65,11 @@ def check_finite(name: str, *arrays: Any) -> None:
             sys.exit(f"{name}: NaN or infinite numbers would be given to a learner")
 
 
-def fly(task: str, mode: str, seconds: float, num_envs: int) -> tuple[Watch, int]:
-    """Step a task for some time; return the samples and how many episodes ended."""
-    vec = ml.make_vec(task, num_envs=num_envs)
+def fly(
+    task: str, mode: str, seconds: float, num_envs: int, most: float | None = None, num_threads: int = 0
+) -> tuple[Watch, int]:
+    """Step a task for some time, or `most` environment steps; return the samples and how many episodes ended."""
+    vec = ml.make_vec(task, num_envs=num_envs, num_threads=num_threads)
     policy = ml.load_policy(task) if mode == "policy" else None
     rng = np.random.Generator(np.random.PCG64(0))
     observation, _ = vec.reset(seed=0)
@@ -73,9 +77,13 @@ def fly(task: str, mode: str, seconds: float, num_envs: int) -> tuple[Watch, int
     observation, _ = vec.reset(seed=0)
     vec.stagger()
     watch, steps, episodes, start = Watch(), 0, 0, time.monotonic()
+
+    def done() -> float:
+        return (time.monotonic() - start) / seconds if most is None else steps / most
+
     for i in range(SAMPLES + 1):
         before = steps
-        while steps == before or time.monotonic() - start < seconds * i / SAMPLES:  # one at least, however short it is
+        while steps == before or done() < i / SAMPLES:  # one at least, however short it is
             shape = (num_envs, vec.num_drones, len(vec.action_names))
             action = rng.uniform(-1.0, 1.0, shape) if policy is None else policy.act(observation)
             observation, reward, terminated, truncated, _ = vec.step(action)
@@ -124,8 +132,9 @@ def checked(collect: Callable[[int], Any]) -> Callable[[int], Any]:
 
 def main(arguments: list[str]) -> int:
     """Run one mode, print a table; return the exit status."""
-    options = {"mode": "random", "minutes": 3.0, "iterations": 200, "num_envs": 64} | parse_overrides(arguments)
-    mode, count = str(options["mode"]), int(options["num_envs"])
+    defaults = {"mode": "random", "minutes": 3.0, "iterations": 200, "num_envs": 64, "num_threads": 0}
+    options = defaults | parse_overrides(arguments)
+    mode, count, threads = str(options["mode"]), int(options["num_envs"]), int(options["num_threads"])
     if mode not in ("random", "policy", "training"):
         sys.exit(__doc__)
     print("| | env steps | episodes | memory [MB] | growth [MB] | growth [B/step] | threads |")
@@ -136,7 +145,8 @@ def main(arguments: list[str]) -> int:
         if mode == "training":
             watch, episodes = train(int(options["iterations"]), count)
         else:
-            watch, episodes = fly(name, mode, 60.0 * float(options["minutes"]) / len(tasks), count)
+            most = float(options["steps"]) / len(tasks) if "steps" in options else None
+            watch, episodes = fly(name, mode, 60.0 * float(options["minutes"]) / len(tasks), count, most, threads)
         warm = watch.warm()
         rate = MEGABYTE * watch.growth() / max(warm[-1][0] - warm[0][0], 1)
         failed |= watch.growth() > BOUND or watch.new_threads() > 0
