@@ -128,6 +128,7 @@ def spread_by_ray(function: Callable[[Any], str], jobs: list[Any], workers: int,
     import ray
     from ray import cloudpickle
 
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])  # other processes cannot import this file
     owns = connect(address, workers, "ray")
     waiting, running = [cloudpickle.dumps((function, job)) for job in jobs], list[Any]()
     task = ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_call_here)

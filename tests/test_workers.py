@@ -110,6 +110,24 @@ def test_evaluation_by_workers_measures_the_same(tmp_path, local_ray, monkeypatc
     assert alone == apart
 
 
+def test_results_of_flights_are_spread_and_yielded_as_they_come(local_ray):
+    sys.path.insert(0, str(ROOT / "results"))
+    from reproduce import spread_by_ray
+
+    def measure(job):
+        return f"{job} by {'its own process' if os.getpid() != here else 'this one'} in {os.getcwd()}"
+
+    here = os.getpid()
+    lines = list(spread_by_ray(measure, ["gate", "hover", "land"], 2, "local"))
+    assert sorted(lines) == [f"{job} by its own process in {ROOT}" for job in ("gate", "hover", "land")]
+
+    def fail(job):
+        raise ConfigError(f"{job} cannot be")
+
+    with pytest.raises(ConfigError, match="cannot be"):
+        list(spread_by_ray(fail, ["gate", "hover"], 2, "local"))
+
+
 @pytest.mark.parametrize(
     ("settings", "word"),
     [
