@@ -7,7 +7,6 @@ import logging
 from collections.abc import Callable, Iterable
 from functools import cache
 
-
 _ELSEWHERE = {
     "steps": "frames", "timesteps": "frames", "total_timesteps": "frames", "num_steps": "frames", "lr": "learning_rate",
     "max_steps": "episode_seconds", "episode_steps": "episode_seconds", "agents": "num_drones",
