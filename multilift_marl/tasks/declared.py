@@ -25,7 +25,7 @@ def check_declared(task: type[Task]) -> None:
         raise ConfigError(f"task {task.name}: {problem}")
 
 
-def _find_problems(task: type[Task]) -> Iterator[str]:
+def _find_problems(task: Any) -> Iterator[str]:
     """Yield what is wrong and how to mend it."""
     from multilift_marl.tasks.base import Kernels, Task
 
