@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import linecache
+import re
 from collections.abc import Callable, Mapping
 from functools import cache, partial
 from operator import itemgetter
 from typing import Any, TypeVar, TypeVarTuple, cast
 
 from numba import config, int64, typeof
+from numba.core.errors import NumbaError
 
 from multilift_marl._compiler import Kernel, record
 from multilift_marl._kernel_cache import make_cache, sources_digest
+from multilift_marl.errors import ConfigError
 
 _UNCOMPILED: bool = config.DISABLE_JIT  # type: ignore[attr-defined]
 F = TypeVar("F", bound=Callable[..., Any])
@@ -61,6 +65,17 @@ def _compile(function: F, makes_arrays: bool | None = None, quick: bool = False,
     return cast(F, dispatcher)
 
 
+def is_kernel(function: Any, arguments: int) -> bool:
+    """Return whether kernels can call a function by so many arguments: one that is compiled, or any where none is."""
+    if not callable(function) or not (_UNCOMPILED or isinstance(function, Kernel)):
+        return False
+    try:
+        inspect.signature(getattr(function, "py_func", function)).bind(*range(arguments))
+    except TypeError:
+        return False
+    return True
+
+
 def compose(name: str, source: str, functions: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
     """Compile the function `name` that `source` defines and that calls `functions` by their names.
 
@@ -95,8 +110,27 @@ def _compiled(kernel: Any, types: tuple[Any, ...]) -> Callable[..., Any]:
     """Return what a kernel is for these types; while calls are recorded, the kernel itself."""
     if record(kernel, types):
         return kernel
-    kernel.compile(types)
+    try:
+        kernel.compile(types)
+    except NumbaError as error:  # a mistake in what a user wrote: Numba's text has a hundred lines
+        raise ConfigError(f"kernel {kernel.__name__} cannot be compiled: {_explain(str(error))}") from error
     return kernel.overloads[types].entry_point
+
+
+def _explain(text: str) -> str:
+    """Return what Numba complains of in one line: its first sentence, without the fields of named tuples, and where."""
+    text = re.sub(r"\x1b\[\d*m", "", text)
+    message = next(line for line in text.splitlines() if line.strip() and not line.startswith("Failed in "))
+    message = re.sub(r"( of type \w+)\(.*", r"\1", message)
+    if called := re.search(r"^ >>> (.*)$", text, re.MULTILINE):
+        message = f"{message} {called[1]}"
+    places = re.findall(r'File "(.+)", line (\d+):', text)
+    if not places:
+        return message
+    file, line = places[-1]
+    quoted = re.findall(r"^(.*\S.*)\n *\^", text, re.MULTILINE)
+    source = quoted[-1] if quoted else linecache.getline(file, int(line))
+    return f"{message} ({file}, line {line}: {source.strip()})"
 
 
 def bind(function: Callable[[*Arguments], object], *arguments: *Arguments) -> Callable[[], None]:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from multilift_marl._jit import is_kernel
 from multilift_marl.config.values import Section
 from multilift_marl.errors import ConfigError, nearest, shorten
 from multilift_marl.tasks.observations import FRAMES, Component, list_components
@@ -38,13 +39,14 @@ def _find_problems(task: Any) -> Iterator[str]:
     for name, term in task.REWARD.items():
         if not isinstance(term, Term):
             yield f"REWARD['{name}'] is {_text(term)}; give Term(weight, kernel, margin=...)"
-        if not callable(term.value):
-            yield f"REWARD['{name}'].value is {_text(term.value)}; give an @inlined function of (e, v, *margins)"
+        if not is_kernel(term.value, 2 + len(term.margins)):
+            wanted = ", ".join(["e", "v", *(f"margin {i + 1}" for i in range(len(term.margins)))])
+            yield f"REWARD['{name}'].value is {_text(term.value)}; give a function of ({wanted}) with @inlined"
     if not isinstance(task.KERNELS, Kernels):
         yield f"KERNELS is {_text(task.KERNELS)}; give tasks.base.Kernels(...)"
     for name, kernel in task.KERNELS._asdict().items():
-        if not callable(kernel) and (kernel is not None or name == "is_good"):
-            yield f"KERNELS.{name} is {_text(kernel)}; give an @inlined function of (e, v)"
+        if not is_kernel(kernel, 2) and (kernel is not None or name == "is_good"):
+            yield f"KERNELS.{name} is {_text(kernel)}; give a function of (e, v) with @inlined"
     for where in ("EXTRA", "EXTRA_STATE"):
         yield from _find_component_problems(getattr(task, where), where)
     common = {part.name for part in list_components("reference")}
@@ -63,12 +65,12 @@ def _find_component_problems(parts: Any, where: str) -> Iterator[str]:
             yield f"component '{part.name}' has an unknown frame '{part.frame}'{nearest(part.frame, [*FRAMES, '-'])}"
         if isinstance(part.size, bool) or not isinstance(part.size, int) or part.size < 1:
             yield f"component '{part.name}' has size {_text(part.size)}; give how many numbers it has, 1 or more"
-        if not callable(part.value):
-            yield f"component '{part.name}' has value {_text(part.value)}; give an @inlined function of (e, n, v)"
+        if not is_kernel(part.value, 3):
+            yield f"component '{part.name}' has value {_text(part.value)}; give a function of (e, n, v) with @inlined"
     for name, count in Counter(part.name for part in parts).items():
         if count > 1:
             yield f"{where} has {count} components '{name}'; give each a name of its own"
 
 
 def _text(value: object) -> str:
-    return shorten(repr(value))
+    return shorten(repr(getattr(value, "py_func", value)))
