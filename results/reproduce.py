@@ -69,7 +69,7 @@ def train_seed(recipe: str, seed: int) -> str:
 
 def keep(recipe: str, run: Path) -> None:
     """Keep curve, duration and best weights of a run in results/<recipe>/seed<seed>/."""
-    from multilift_marl.agents.checkpoint import load_checkpoint
+    from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
     from multilift_marl.agents.logging import read_metrics
     from multilift_marl.agents.policy import strip_checkpoint
     from multilift_marl.evaluation.plots import plot_training
@@ -87,6 +87,8 @@ def keep(recipe: str, run: Path) -> None:
     (folder / "training.json").write_text(json.dumps(duration) + "\n", encoding="utf-8")
     plot_training(folder / "training.png", rows)
     strip_checkpoint(run / "checkpoints" / "best.pt", folder / "policy.pt")
+    kept = load_checkpoint(folder / "policy.pt")  # a run that was resumed may have got more frames since
+    save_checkpoint(folder / "policy.pt", kept | {"config": last["config"]})
 
 
 class Job(NamedTuple):
