@@ -175,7 +175,7 @@ SHORTER = {  # of each script: keys that go, and what is added
     "bench/peers.py": (["cache", "repeats", "seconds", "save"], "peers=multilift_marl repeats=1 seconds=0.05"),
     "bench/randomization.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
     "bench/start.py": (["repeats", "task", "num_envs"], "repeats=1 num_envs=2"),
-    "bench/soak.py": (["minutes", "iterations"], "minutes=0.01 iterations=8"),
+    "bench/soak.py": (["minutes", "iterations", "steps", "num_envs"], "minutes=0.01 iterations=8"),
     "bench/tasks.py": (["repeats", "seconds"], "repeats=1 seconds=0.02 env.num_envs=4"),
     "bench/workers.py": (["repeats", "workers"], "repeats=1 workers=0,1 env.num_envs=4 train.horizon=8"),
     "bench/training.py": (["repeats"], f"repeats=1 {SHORT} train.minibatches=2"),
