@@ -120,7 +120,8 @@ def _compiled(kernel: Any, types: tuple[Any, ...]) -> Callable[..., Any]:
 def _explain(text: str) -> str:
     """Return what Numba complains of in one line: its first sentence, without the fields of named tuples, and where."""
     text = re.sub(r"\x1b\[\d*m", "", text)
-    message = next(line for line in text.splitlines() if line.strip() and not line.startswith("Failed in "))
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("Failed in ")]
+    message = lines[0] if lines else "for a reason that Numba does not name"
     message = re.sub(r"( of type \w+)\(.*", r"\1", message)
     if called := re.search(r"^ >>> (.*)$", text, re.MULTILINE):
         message = f"{message} {called[1]}"

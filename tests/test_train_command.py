@@ -176,7 +176,7 @@ def test_command_line_errors_are_one_sentence(tmp_path, monkeypatch, capsys, arg
 
 
 @pytest.mark.parametrize(
-    "called, command", [("train.py", "python train.py"), ("/opt/bin/multilift-train", "multilift-train")]
+    "called, command", [("train.py", "python train.py"), ("bin/multilift-train", "multilift-train")]
 )
 def test_a_finished_run_says_so_and_how_to_go_on(tmp_path, capsys, monkeypatch, called, command):
     trainer = make_trainer(tmp_path, **{"train.frames": 128})
