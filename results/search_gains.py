@@ -1,21 +1,21 @@
 """Search the gains of a script by the evolution strategy CMA-ES (Hansen, arXiv 1604.00772): `pip install cma`.
 
   python results/search_gains.py config=pose_wind [minutes=30] [script=formation_feedback] [spread=0.3] [cost=errors]
-                                 [key=value ...]
+                                 [rigs=6] [key=value ...]
 
 It starts from the gains of `script`, with candidates `spread` times the scales of `SLOTS` or `HELD` around them,
 simulates the same `env.num_envs` episodes with all candidates of a generation, and prints the final gains and their
 results in episodes that are not part of the search. `cost=errors` are lost episodes and errors at the end,
 `cost=success` lost episodes, failures and errors above all, where payloads cannot be level, and `cost=return` is the
 return, what a learned team is paid. Any configuration key changes the task; where it has
-`train.rigs`, one script is searched for all of them.
+`train.rigs`, one script is searched for all of them, `rigs` of them in each generation, in turn (by default all).
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -133,8 +133,27 @@ def fly(config: Config, script: type[Formation], seed: int, cost: Cost = "errors
     return Score(float(costs[cost]), float(success), float(error.mean()), float(turned.mean()), paid)
 
 
-def search(config: Config, script: str, free: Free, spread: float, minutes: float, cost: Cost = "errors") -> np.ndarray:
+def some_rigs(config: Config, most: int | None, generation: int) -> Config:
+    """Return `config` with the `most` of its `train.rigs` that are a generation's turn."""
+    rigs = config.train.rigs
+    if most is None or most >= len(rigs):
+        return config
+    turn = [rigs[(generation * most + i) % len(rigs)] for i in range(most)]
+    return build_config(config.model_dump(), {"train.rigs": turn})
+
+
+def search(
+    config: Config,
+    script: str,
+    free: Free,
+    spread: float,
+    minutes: float,
+    cost: Cost = "errors",
+    rigs: int | None = None,
+) -> np.ndarray:
     """Return the changes of the gains `free` in the mean of the last generation; Ctrl-C ends the search early.
+
+    With `rigs`, each generation flies as many of `train.rigs`, in turn.
 
     Raises:
         ConfigError: the package `cma` is missing.
@@ -153,7 +172,8 @@ def search(config: Config, script: str, free: Free, spread: float, minutes: floa
         while time.monotonic() - begun < end:
             candidates = strategy.ask()
             seed = config.seed + generation // RENEWED
-            scores = [fly(config, make_script(script, free, scale * np.array(each)), seed, cost) for each in candidates]
+            flown = some_rigs(config, rigs, generation)
+            scores = [fly(flown, make_script(script, free, scale * np.array(each)), seed, cost) for each in candidates]
             strategy.tell(candidates, [each.cost for each in scores])
             generation += 1
             best = min(scores)
@@ -176,6 +196,9 @@ class Options(Section):
     script: str = Field("formation_feedback", description="whose gains it begins with, a name or module:Class")
     spread: Positive = Field(0.3, description="[-] of the first candidates, over the scales of `SLOTS` or `HELD`")
     cost: Cost = Field("errors", description="what a script is searched for, see above")
+    rigs: Annotated[int, Field(ge=1)] | None = Field(
+        None, description="of `train.rigs` that a generation flies, in turn"
+    )
 
 
 def main(values: dict[str, Any]) -> int:
@@ -192,7 +215,7 @@ def main(values: dict[str, Any]) -> int:
     known = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1})).observation_names
     every = SLOTS if config.control.action == "reference" else HELD
     free = tuple(each for each in every if f"{each[0]}_0" in known)
-    changes = search(config, script, free, options.spread, options.minutes, options.cost)
+    changes = search(config, script, free, options.spread, options.minutes, options.cost, options.rigs)
     found = make_script(script, free, changes)
     gains: dict[tuple[str, int, int], float] = {}
     for name, axis, moved, gain in found.GAINS:

@@ -277,6 +277,8 @@ SEARCHED: dict[str, type[Formation]] = {
     "gate_two": GateWalls,
     "gate_three": GateWalls,
     "recover_realistic": RecoverSuccess,
+    "loss": LossRealistic,
+    "loss_snap": LossRealistic,
     "loss_realistic": LossRealistic,
     "recover_crazymarl_rates": RecoverRates,
     "track_follow_2_2": TrackFollowGentle,

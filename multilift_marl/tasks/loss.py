@@ -240,10 +240,10 @@ class Loss(Task):
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
         known = self.config.env
-        if not option.broadcast and known.sensing in ("onboard", "blind") and known.communication != "all":
+        if not option.broadcast and known.sensing in ("onboard", "blind") and known.communication == "none":
             raise ConfigError(
                 f"env.sensing={known.sensing} does not show the payload's tilt, by which drones notice a loss; set "
-                "task_options.broadcast=true, or env.sensing=onboard and env.communication=all"
+                "task_options.broadcast=true, or env.sensing=onboard and env.communication=neighbours or all"
             )
         self._ranges = make_ranges(option)
         world.breakable = world.breakable or option.snap
