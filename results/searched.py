@@ -228,8 +228,9 @@ class RecoverSuccess(Formation):
 
 
 class LossRealistic(FormationRedistributed):
-    """Of `loss_realistic`: three searches of 30 minutes in all from `formation_redistributed` by success, 96 episodes a
-    candidate. What gains most: the slots are 0.66 m farther out from the start."""
+    """Of `loss_realistic`, and the best of `loss` and `loss_snap`: three searches of 30 minutes in all from
+    `formation_redistributed` by success, 96 episodes a candidate. What gains most: the slots are 0.66 m farther out
+    from the start."""
 
     GAINS: ClassVar[Gains] = (
         ("payload_error_integral", 0, 0, -0.820),

@@ -194,9 +194,20 @@ def test_news_that_nobody_would_use_are_refused():
         make(num_envs=1, **{"env.sensing": "onboard", "env.communication": "all", "env.communication_delay": 26})
 
 
-@pytest.mark.parametrize("settings", [{"env.communication": "neighbours"}, {"env.sensing": "blind"}])
+def test_drones_notice_a_loss_by_what_their_neighbours_tell():
+    keys = {"env.sensing": "onboard", "env.communication": "neighbours", "task_options.loss_time": [1.0, 1.0]}
+    vec = make("loss", num_envs=4, **keys)
+    vec.reset(seed=0)
+    for _ in range(90):
+        vec.step(0 * vec.task.action)
+    others = vec.task.own.known & ~vec.task.mask.lost
+    assert others.sum(axis=1).tolist() == [3] * 4
+    assert (np.where(others, vec.task.own.known_who, vec.task.own.who[:, None]) == vec.task.own.who[:, None]).all()
+
+
+@pytest.mark.parametrize("settings", [{"env.communication": "none"}, {"env.sensing": "blind"}])
 def test_a_loss_that_cannot_be_noticed_has_to_be_announced(settings):
-    known = {"env.sensing": "onboard", "env.communication": "all", "task_options.broadcast": False}
+    known = {"env.sensing": "onboard", "env.communication": "neighbours", "task_options.broadcast": False}
     make("loss", num_envs=1, **known)
     with pytest.raises(ConfigError, match=r"does not show the payload's tilt|communicate what they measure"):
         make("loss", num_envs=1, **(known | settings))
