@@ -48,6 +48,7 @@ SLOTS: Free = (
     ("payload_velocity", UP, 0.1),
     ("tracking_error", LEVEL, 0.3),
     ("tracking_error", UP, 0.3),
+    ("velocity", LEVEL, 0.1),
     ("rotation_error_integral", LIFT, 0.2),
     ("payload_rotation_error", LIFT, 0.15),
     ("payload_angular_velocity", LIFT, 0.05),
@@ -70,7 +71,10 @@ SLOTS: Free = (
 """Observation; axes in the slot frame, of it and of the slot's offset, that share a gain; scale of the search. Of these
 a task has those that it observes."""
 OWN: Free = (("slot_error", LEVEL, 5.0), ("slot_error", UP, 5.0), ("velocity", LEVEL, 2.5), ("velocity", UP, 2.5))
-HELD: Free = (*OWN, *((name, axes, STIFFNESS * width) for name, axes, width in SLOTS if name != "tracking_error"))
+HELD: Free = (
+    *OWN,
+    *((name, axes, STIFFNESS * width) for name, axes, width in SLOTS if name not in ("tracking_error", "velocity")),
+)
 """The same of scripts that hold their slots by accelerations."""
 POPULATION, RENEWED = 12, 3  # candidates of a generation; generations with the same episodes
 ERROR, ANGLE = 0.05, 5.0  # [m], [deg] as bad as a quarter of the episodes lost; no error as bad as more than one
