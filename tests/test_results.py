@@ -13,6 +13,7 @@ from conftest import refusal
 
 import multilift_marl as ml
 from multilift_marl.agents.checkpoint import load_checkpoint
+from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.control.scripted import LINEAR, fitting_scripts
 from multilift_marl.control.scripted_formation import Formation
 from multilift_marl.envs.core import TRAINING_EVALUATION
@@ -23,6 +24,7 @@ sys.path.insert(0, str(ROOT / "results"))
 import reproduce  # noqa: E402
 import search_gains  # noqa: E402
 import searched  # noqa: E402
+import searched_rigs  # noqa: E402
 import tables  # noqa: E402
 
 
@@ -258,6 +260,30 @@ def test_the_search_finds_gains_that_cost_less(monkeypatch):
     changes = search_gains.search(ml.load_config("pose"), "formation_feedback", free, spread=0.3, minutes=2.0)
     before = np.array([start.get((name, *axes[0]), 0.0) for name, axes, _ in free])
     assert np.abs(before + changes - 0.3).max() < 0.3 * np.abs(before - 0.3).max()
+
+
+def test_a_search_flies_some_of_the_rigs_in_turn():
+    config = ml.load_config("pose_generalist")
+    turns = [search_gains.some_rigs(config, 5, generation).train.rigs for generation in range(12)]
+    assert all(len(turn) == 5 for turn in turns)
+    assert [rig for turn in turns for rig in turn] == list(config.train.rigs) * 5
+    assert search_gains.some_rigs(config, None, 3) is config
+
+
+@pytest.mark.parametrize(
+    ("script", "drones"), [(searched.GateTeams, 3), (searched.GateTeams, 6), (searched.GateTeamsLarge, 8)]
+)
+def test_rings_of_many_drones_become_ellipses_in_a_gate(script, drones):
+    config = ml.load_config("gate", {"env.num_envs": 4, "env.num_drones": drones})
+    assert fly_episodes(config, script, 4, 3, TRAINING_EVALUATION)["success_rate"].all()
+
+
+@pytest.mark.parametrize("name", ["pose_generalist", "track_generalist"])
+def test_scripts_for_several_rigs_fly_each_of_them(name):
+    script = {"pose_generalist": searched_rigs.PoseRigs, "track_generalist": searched_rigs.TrackRigs}[name]
+    config = ml.load_config(name, {"env.num_envs": 1, "env.episode_seconds": 5.0})
+    for rig in evaluated_rigs(config):
+        assert (fly_episodes(rig, script, 1, 3, TRAINING_EVALUATION)["failure_cause"] == 0).all()
 
 
 @pytest.mark.parametrize("flight", sorted(searched.SEARCHED))
