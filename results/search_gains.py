@@ -216,6 +216,8 @@ def main(values: dict[str, Any]) -> int:
             f"the script '{script}' acts by control.action={begun.INTERFACE} and cannot fly "
             f"control.action={config.control.action}; set control.action={begun.INTERFACE}"
         )
+    if options.rigs and not config.train.rigs:
+        raise ConfigError(f"rigs={options.rigs} of train.rigs, but config={options.config} has none; leave rigs out")
     known = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1})).observation_names
     every = SLOTS if config.control.action == "reference" else HELD
     free = tuple(each for each in every if f"{each[0]}_0" in known)

@@ -302,6 +302,8 @@ def test_searched_scripts_fit_their_flights(flight):
         ({"control.action": "velocity"}, "cannot fly control.action=velocity"),
         ({"minutes": "abc"}, "minutes must be a number, but is 'abc'"),
         ({"minutes": 0}, "minutes must be greater than 0"),
+        ({"rigs": 2}, "config=pose_wind has none"),
+        ({"rigs": 0}, "rigs must be greater than or equal to 1"),
         ({"spread": float("nan")}, "spread must be a finite number"),
     ],
 )
