@@ -34,7 +34,7 @@ def checkpoint(task="hover", **overrides):
     names = observation_names(config.control.action, find_task(config.task).extra(config), config.env.history)
     torch.manual_seed(0)
     base = 0.5 * torch.randn(len(actions), len(names)) * (torch.rand(len(actions), len(names)) < 0.05)
-    actor = Actor(config.train.actor, len(names), len(actions), config.train.hidden, 0.3, base)
+    actor = Actor(config.train.actor, len(names), len(actions), config.train.hidden, 0.3, base, asinh=config.train.asinh)
     spread = torch.logspace(-2, 1, len(names))
     actor.normalizer.update(spread * (torch.randn(1000, len(names)) + torch.randn(len(names))))
     with torch.no_grad():
@@ -49,10 +49,12 @@ def policy(task="hover", **overrides):
     return LearnedPolicy(checkpoint(task, **overrides), "the test")
 
 
-@pytest.mark.parametrize("kind", ["local", "set", "attention"])
-@pytest.mark.parametrize("history", [1, 3])
-def test_the_network_acts_as_the_policy_for_any_teams(tmp_path, kind, history):
-    learned = policy(**{"train.actor": kind, "env.history": history})
+@pytest.mark.parametrize(
+    ("kind", "history", "asinh"),
+    [("local", 1, 0), ("local", 3, 0), ("local", 1, 20), ("set", 3, 20), ("set", 1, 0), ("attention", 1, 0)],
+)
+def test_the_network_acts_as_the_policy_for_any_teams(tmp_path, kind, history, asinh):
+    learned = policy(**{"train.actor": kind, "env.history": history, "train.asinh": asinh})
     contract = export_policy(learned, tmp_path / "new" / "folder")
     file = tmp_path / "new" / "folder" / contract["network"]["file"]
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
@@ -69,6 +71,7 @@ def test_the_network_acts_as_the_policy_for_any_teams(tmp_path, kind, history):
         assert action.dtype == np.float32 and (np.abs(action) <= 1).all()
     assert 0.02 < (np.abs(action) == 1).mean() < 0.98  # some are clipped, and most are not
     assert contract["network"]["largest_difference"] <= 1e-5
+    assert ("asinh(20 x" in contract["inside"]["normaliser"]) == bool(asinh)
 
 
 def test_files_say_nothing_of_the_machine_they_were_made_on(tmp_path):

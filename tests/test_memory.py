@@ -19,9 +19,9 @@ from multilift_marl.evaluation.rollout import fly_episodes
 GRU = {"train.gru": 12, "train.sequence": 8, "train.warmup": 0}
 
 
-def make_actor() -> Actor:
+def make_actor(asinh: float = 0.0) -> Actor:
     torch.manual_seed(0)
-    actor = Actor("local", 11, 4, (16, 16), 0.3, torch.zeros(4, 11), gru=6)
+    actor = Actor("local", 11, 4, (16, 16), 0.3, torch.zeros(4, 11), gru=6, asinh=asinh)
     actor.normalizer.update(3 * torch.randn(100, 11) + 1)
     nn.init.orthogonal_(actor.team.net[-1].weight)  # as after training
     return actor
@@ -52,8 +52,9 @@ def test_sequences_are_those_of_torchs_own_gru():
             torch.testing.assert_close(found[b, begin:end, n], theirs, rtol=0, atol=1e-13)
 
 
-def test_a_sequence_remembers_what_single_steps_do():
-    actor, observation = make_actor(), torch.randn(2, 6, 3, 11)
+@pytest.mark.parametrize("asinh", [0.0, 20.0])
+def test_a_sequence_remembers_what_single_steps_do(asinh):
+    actor, observation = make_actor(asinh), torch.randn(2, 6, 3, 11)
     memory = torch.zeros(2, 3, 6)
     unrolled = actor.unroll(observation, memory, torch.zeros(2, 6, dtype=torch.bool))
     for t in range(6):

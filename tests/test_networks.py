@@ -11,24 +11,26 @@ KINDS = ("local", "set", "attention")
 SHARED, SIZE, REST = 5, 7, 3
 
 
-def make_actor(kind: str) -> Actor:
+def make_actor(kind: str, asinh: float = 0.0) -> Actor:
     torch.manual_seed(0)
-    actor = Actor(kind, 11, 4, (16, 16), 0.3, torch.zeros(4, 11))
+    actor = Actor(kind, 11, 4, (16, 16), 0.3, torch.zeros(4, 11), asinh=asinh)
     actor.normalizer.update(torch.randn(100, 11))
     with torch.no_grad():
         torch.nn.init.orthogonal_(actor.team.net[-1].weight)  # as after training
     return actor
 
 
-def make_critic(kind: str, num_drones: int) -> CentralCritic:
+def make_critic(kind: str, num_drones: int, asinh: float = 0.0) -> CentralCritic:
     torch.manual_seed(0)
     drones = DroneNumbers(SHARED, num_drones, SIZE)
-    return CentralCritic(kind, SHARED + num_drones * SIZE + REST, drones, (16, 16), PopArtValueNorm(shape=1))
+    size = SHARED + num_drones * SIZE + REST
+    return CentralCritic(kind, size, drones, (16, 16), PopArtValueNorm(shape=1), asinh)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_actors_give_each_drone_its_action_in_any_order(kind):
-    actor, observation = make_actor(kind), torch.randn(6, 5, 11)
+@pytest.mark.parametrize("asinh", [0.0, 20.0])
+def test_actors_give_each_drone_its_action_in_any_order(kind, asinh):
+    actor, observation = make_actor(kind, asinh), torch.randn(6, 5, 11)
     order = torch.randperm(5)
     torch.testing.assert_close(actor(observation[:, order])[0], actor(observation)[0][:, order])
 
@@ -56,8 +58,9 @@ def test_what_others_observe_matters_to_team_networks_alone(kind, told):
 
 
 @pytest.mark.parametrize("kind", ["set", "attention"])
-def test_critics_of_sets_value_a_team_in_any_order(kind):
-    critic, state = make_critic(kind, 4), torch.randn(6, SHARED + 4 * SIZE + REST)
+@pytest.mark.parametrize("asinh", [0.0, 20.0])
+def test_critics_of_sets_value_a_team_in_any_order(kind, asinh):
+    critic, state = make_critic(kind, 4, asinh), torch.randn(6, SHARED + 4 * SIZE + REST)
     rows = state[:, SHARED : SHARED + 4 * SIZE].reshape(6, 4, SIZE)[:, torch.randperm(4)]
     permuted = torch.cat([state[:, :SHARED], rows.reshape(6, -1), state[:, -REST:]], -1)
     torch.testing.assert_close(critic(permuted), critic(state))

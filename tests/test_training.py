@@ -201,6 +201,23 @@ def test_normalizer_equals_the_statistics_of_all_batches():
     torch.testing.assert_close(1 / normalizer.scale, everything.std(0, correction=0))
 
 
+@pytest.mark.parametrize("k", [1e-3, 20.0, 1e6])
+def test_the_fine_scale_follows_each_standardised_number(k):
+    """Odd, 1 at one deviation, K / asinh(K) times as steep at 0, whatever the mean; gradients stay finite."""
+    normalizer = Normalizer(2, asinh=k)
+    normalizer.update(torch.randn(10_000, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([2.0, 0.1]) + 5)
+    deviation = 1 / normalizer.scale
+    assert normalizer.outputs == 4
+    plain, fine = normalizer(deviation[None]).unflatten(-1, (2, 2)).unbind(-1)
+    torch.testing.assert_close(plain[0], ((deviation - normalizer.shift) / deviation).clamp(-8, 8))
+    torch.testing.assert_close(fine[0], torch.ones(2))
+    torch.testing.assert_close(normalizer(-deviation)[1::2], -torch.ones(2))
+    x = torch.zeros(2, requires_grad=True)
+    normalizer(x)[1::2].sum().backward()
+    torch.testing.assert_close(x.grad, k / torch.tensor(k, dtype=torch.float64).asinh().float() / deviation)
+    assert normalizer(torch.full((2,), 1e9)).isfinite().all()
+
+
 def test_value_norm_keeps_999_thousandths_of_older_returns(tmp_path):
     """A batch of zeros, then one of ones, have the mean (1 - β)/(1 - β²) = 1/(1 + β)."""
     value_norm = make_trainer(tmp_path).learner.critic.value_norm

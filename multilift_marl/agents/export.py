@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from multilift_marl.agents.logging import package_versions
-from multilift_marl.agents.networks import Actor
+from multilift_marl.agents.networks import Actor, Normalizer
 from multilift_marl.agents.policy import CONTRACT_FORMAT, LearnedPolicy, TrainedPolicy
 from multilift_marl.config.config import Config
 from multilift_marl.control.actions import ACTIONS, THRUST, Team
@@ -172,7 +172,7 @@ def make_contract(policy: LearnedPolicy) -> dict[str, Any]:
         "action": _describe_action(policy),
         "frames": FRAMES,
         "inside": {
-            "normaliser": f"each number, standardised, within ± {policy.actor.normalizer.clip:g} deviations",
+            "normaliser": _describe_normalizer(policy.actor.normalizer),
             "script": f"the matrix of {config.train.residual}, added to the network's action",
             "clipping": "actions within [-1, 1]",
         },
@@ -245,6 +245,13 @@ def _measure_thrusts(config: Config) -> np.ndarray:
     )  # fmt: skip
     interface.set_action(0, e, action, team)()
     return interface.thrusts(team)
+
+
+def _describe_normalizer(normalizer: Normalizer) -> str:
+    """Return in words what becomes of each observed number."""
+    standardised = f"each number, standardised, within ± {normalizer.clip:g} deviations"
+    k = f"{normalizer.asinh:g}"
+    return standardised + (f", then asinh({k} x / deviation) / asinh({k}) of it" if normalizer.asinh else "")
 
 
 def _describe_formation(config: Config) -> list[dict[str, Any]]:

@@ -80,7 +80,7 @@ def make_actor(config: TrainConfig, vec: MultiliftVec) -> Actor:
     """Return an untrained policy for `vec`, which acts as its script."""
     base = torch.from_numpy(residual_matrix(config.residual, vec))
     sizes = (vec.observation_size, vec.action_size)
-    return Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru)
+    return Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru, config.asinh)
 
 
 def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
@@ -101,9 +101,10 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
     critic: CentralCritic | LocalCritic
     if config.algorithm == "mappo":
-        critic = CentralCritic(config.critic, vec.state_size, vec.task.drone_numbers, config.hidden, value_norm)
+        numbers = vec.task.drone_numbers
+        critic = CentralCritic(config.critic, vec.state_size, numbers, config.hidden, value_norm, config.asinh)
     else:
-        critic = LocalCritic(vec.observation_size, config.hidden, value_norm)
+        critic = LocalCritic(vec.observation_size, config.hidden, value_norm, config.asinh)
 
     # 3. The optimiser, with rates of their own.
     groups = [{"params": list(actor.parameters())}, {"params": list(critic.parameters())}]

@@ -16,7 +16,20 @@ if TYPE_CHECKING:  # policies need torch only
 
 
 class Normalizer(nn.Module):
-    """Standardises each number by running statistics that are part of the network (Chan et al. 1979)."""
+    """Standardises each number by running statistics that are part of the network (Chan et al. 1979).
+
+    With `asinh` = K it adds a fine scale: beside each number x, asinh(K x / σ) / asinh(K), which changes K / asinh(K)
+    times as fast near x = 0 and about as its logarithm far from there. Errors that are metres at the start of an episode
+    are millimetres at its end; standardised, these are too small to act on.
+
+    Args:
+        size: of what it takes.
+        asinh: K; 0: without the fine scale.
+        clip: bound of the standardised numbers.
+
+    Attributes:
+        outputs: size of what it returns.
+    """
 
     mean: torch.Tensor
     square: torch.Tensor
@@ -24,9 +37,10 @@ class Normalizer(nn.Module):
     shift: torch.Tensor
     scale: torch.Tensor
 
-    def __init__(self, size: int, clip: float = 8.0):
+    def __init__(self, size: int, asinh: float = 0.0, clip: float = 8.0):
         super().__init__()
-        self.clip = clip
+        self.asinh, self.clip = asinh, clip
+        self.outputs = 2 * size if asinh else size
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("square", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
@@ -47,8 +61,12 @@ class Normalizer(nn.Module):
         self.scale.copy_(1.0 / (self.square / total).sqrt().clamp(min=1e-2))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return (..., size) with zero mean and unit variance, clipped."""
-        return (x - self.shift).mul_(self.scale).clamp(-self.clip, self.clip)
+        """Return (..., outputs): zero mean, unit variance, clipped; each followed by the same on the fine scale."""
+        rows = (x - self.shift).mul_(self.scale).clamp(-self.clip, self.clip)
+        if not self.asinh:
+            return rows
+        fine = (x * (self.asinh * self.scale)).asinh() / math.asinh(self.asinh)
+        return torch.stack([rows, fine], -1).flatten(-2)
 
 
 def fast_tanh(x: torch.Tensor) -> torch.Tensor:
@@ -168,18 +186,20 @@ class Actor(nn.Module):
         initial_std: deviation at the start.
         base: of the script.
         gru: H, size of the memory; 0 for a policy without.
+        asinh: see `Normalizer`.
     """
 
     base: torch.Tensor
 
     def __init__(
         self, kind: str, observation_size: int, action_size: int, hidden: Sequence[int], initial_std: float,
-        base: torch.Tensor, gru: int = 0,
+        base: torch.Tensor, gru: int = 0, asinh: float = 0.0,
     ):  # fmt: skip
         super().__init__()
-        self.normalizer = Normalizer(observation_size)
-        self.team = TeamNet(kind, observation_size + gru, hidden, action_size, gain=0.0)
-        self.memory = Memory(observation_size, gru) if gru else None
+        self.normalizer = Normalizer(observation_size, asinh)
+        inputs = self.normalizer.outputs
+        self.team = TeamNet(kind, inputs + gru, hidden, action_size, gain=0.0)
+        self.memory = Memory(inputs, gru) if gru else None
         self.register_buffer("base", base)
         self.log_std = nn.Parameter(torch.full((action_size,), math.log(initial_std)))
 
@@ -233,21 +253,25 @@ class CentralCritic(nn.Module):
         drones: where the numbers of the drones stand in the state.
         hidden: widths of the hidden layers.
         value_norm: running statistics of the returns.
+        asinh: see `Normalizer`.
     """
 
     def __init__(
-        self, kind: str, state_size: int, drones: DroneNumbers, hidden: Sequence[int], value_norm: ValueNorm
+        self, kind: str, state_size: int, drones: DroneNumbers, hidden: Sequence[int], value_norm: ValueNorm,
+        asinh: float = 0.0,
     ):  # fmt: skip
         super().__init__()
-        self.normalizer, self.value_norm = Normalizer(state_size), value_norm
+        self.normalizer, self.value_norm = Normalizer(state_size, asinh), value_norm
         self.kind, self.drones = kind, drones
-        inputs = state_size if kind == "flat" else state_size - (drones.rows - 1) * drones.size
+        of_each = self.normalizer.outputs // state_size
+        inputs = of_each * (state_size if kind == "flat" else state_size - (drones.rows - 1) * drones.size)
         self.team = TeamNet("local" if kind == "flat" else kind, inputs, hidden, 1, gain=0.1)
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
         """Return the value for each drone."""
         first, count, size = self.drones
         rows = self.normalizer(state).unsqueeze(-2)
+        first, size = (rows.shape[-1] // state.shape[-1] * number for number in (first, size))
         if self.kind != "flat":
             shared, own, rest = rows.split([first, count * size, rows.shape[-1] - first - count * size], -1)
             own = own.reshape(*own.shape[:-2], count, size)
@@ -259,10 +283,10 @@ class CentralCritic(nn.Module):
 class LocalCritic(nn.Module):
     """Value of each drone from its own observation: (..., N, D) to (..., N, 1) (IPPO)."""
 
-    def __init__(self, observation_size: int, hidden: Sequence[int], value_norm: ValueNorm):
+    def __init__(self, observation_size: int, hidden: Sequence[int], value_norm: ValueNorm, asinh: float = 0.0):
         super().__init__()
-        self.normalizer, self.value_norm = Normalizer(observation_size), value_norm
-        self.net = mlp(observation_size, hidden, 1, gain=0.1)
+        self.normalizer, self.value_norm = Normalizer(observation_size, asinh), value_norm
+        self.net = mlp(self.normalizer.outputs, hidden, 1, gain=0.1)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """Return the value for each drone."""

@@ -159,7 +159,7 @@ class LearnedPolicy(TrainedPolicy):
         train = config.train
         with torch.random.fork_rng(devices=[]):  # initial weights, overwritten at once, must not cost random numbers
             base = torch.zeros(size[1], size[0])
-            self.actor = Actor(train.actor, *size, train.hidden, train.initial_std, base, train.gru)
+            self.actor = Actor(train.actor, *size, train.hidden, train.initial_std, base, train.gru, train.asinh)
         try:
             check_like(content["actor"], self.actor.state_dict(), "actor")
         except ValueError as error:

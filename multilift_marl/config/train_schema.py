@@ -65,6 +65,12 @@ class TrainConfig(Section):
     hidden: tuple[Annotated[Int, Field(ge=1, le=8192)], ...] = Field(
         (64, 64), min_length=1, description="[-] widths of the hidden layers"
     )
+    asinh: Float = Field(
+        0.0,
+        ge=0,
+        le=1e6,
+        description="[-] K: networks take asinh(K x / deviation) of each number x, too, fine near 0; 0: they do not",
+    )
     initial_std: Float = Field(0.12, gt=0, description="[-] of the action distribution at the start")
     overrides: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field(
         {}, description="of the environment that it trains in, by dotted name"
