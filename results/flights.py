@@ -12,6 +12,8 @@ SEED = 1000
 FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
 AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
 FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
+UNSEEN_RIG = {"env.num_drones": 5, "vehicle.preset": "falcon", "cable.length": 0.6, "payload.mass": 2.16}
+"""Of docs/learning.md, "Several rigs at once"."""
 
 ESTIMATED = "load without sensor"  # the largest difference from the published figures; docs/track.md, docs/recover.md
 AUTO = "41 cm: path of 2.8 m/s², start included; MPC, no motor lag, no drag"
@@ -82,6 +84,13 @@ FLIGHTS: dict[str, Flight] = {
         "track_follow", AGILE, "track_follow", "figure-eight, 2 m/s, 4 m/s², no preview", scripts=FOLLOWING
     ),
     "track_auto6": Flight("track_auto6", {}, "track_auto6", "figure-eight, 4.5 m/s, 4 m/s², six drones, 7 kg", AUTO),
+    "track_generalist": Flight(
+        "track_generalist",
+        UNSEEN_RIG,
+        "track_generalist",
+        "figure-eight, 2 m/s, 2 m/s², one network for many rigs, on a rig that it did not see",
+        scripts=("formation_lead", "searched"),
+    ),
     "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),
     "land": Flight("land", {}, "land", "land"),
     "gate": Flight("gate", {}, "gate", "gate"),

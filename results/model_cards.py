@@ -91,6 +91,7 @@ def _training(name: str, policy: LearnedPolicy) -> str:
     if train.residual == "formation" and config.control.action != "reference":
         start = "zero actions"  # what `formation` is with these
     gru = f", GRU of {train.gru}" if train.gru else ""
+    fine = f", inputs also on a fine scale (`train.asinh={train.asinh:g}`)" if train.asinh else ""
     overrides = ", ".join(f"`{key}={value}`" for key, value in sorted(train.overrides.items()))
     rows = {
         "task": f"`{config.task}`, {config.env.num_drones} drones, episodes of {config.env.episode_seconds:g} s",
@@ -100,7 +101,7 @@ def _training(name: str, policy: LearnedPolicy) -> str:
         "best policy": f"after {policy.frames:,} environment steps" if policy.frames else "the untrained one",
         "training seeds recorded": f"{len(seeds)} ({', '.join(seeds)})" if seeds else "-",
         "starts from": start,
-        "network": f"`{train.actor}`, {' × '.join(map(str, train.hidden))}{gru}",
+        "network": f"`{train.actor}`, {' × '.join(map(str, train.hidden))}{gru}{fine}",
         "environment of training alone": overrides or "as evaluated",
         "command": f"`python train.py config={name}`",
     }

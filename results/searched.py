@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from searched_acc_rates import HoverAccRates, PoseTudelft, TrackAgile
+from searched_rigs import TrackRigs
 from searched_track import TrackFollow, TrackFollowGentle, TrackRealistic, TrackRealisticFast
 
 from multilift_marl.control.scripted_formation import Formation, FormationNarrow, FormationRedistributed
@@ -337,6 +338,7 @@ SEARCHED: dict[str, type[Formation]] = {
     "loss_snap": LossRealistic,
     "loss_realistic": LossRealistic,
     "recover_crazymarl_rates": RecoverRates,
+    "track_generalist": TrackRigs,
     "track_follow_2_2": TrackFollowGentle,
     "track_follow_2_4": TrackFollow,
 }
