@@ -34,7 +34,9 @@ def checkpoint(task="hover", **overrides):
     names = observation_names(config.control.action, find_task(config.task).extra(config), config.env.history)
     torch.manual_seed(0)
     base = 0.5 * torch.randn(len(actions), len(names)) * (torch.rand(len(actions), len(names)) < 0.05)
-    actor = Actor(config.train.actor, len(names), len(actions), config.train.hidden, 0.3, base, asinh=config.train.asinh)
+    actor = Actor(
+        config.train.actor, len(names), len(actions), config.train.hidden, 0.3, base, asinh=config.train.asinh
+    )
     spread = torch.logspace(-2, 1, len(names))
     actor.normalizer.update(spread * (torch.randn(1000, len(names)) + torch.randn(len(names))))
     with torch.no_grad():

@@ -178,6 +178,7 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "env.communication_loss",
         "env.communication_range",
         "control.max_angular_acceleration",
+        "train.asinh",
         "train.gru",
         "train.sequence",
         "push.interval",

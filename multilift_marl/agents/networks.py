@@ -19,8 +19,8 @@ class Normalizer(nn.Module):
     """Standardises each number by running statistics that are part of the network (Chan et al. 1979).
 
     With `asinh` = K it adds a fine scale: beside each number x, asinh(K x / σ) / asinh(K), which changes K / asinh(K)
-    times as fast near x = 0 and about as its logarithm far from there. Errors that are metres at the start of an episode
-    are millimetres at its end; standardised, these are too small to act on.
+    times as fast near x = 0 and about as its logarithm far from there. Errors that are metres at the start of an
+    episode are millimetres at its end; standardised, these are too small to act on.
 
     Args:
         size: of what it takes.
