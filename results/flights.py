@@ -88,7 +88,7 @@ FLIGHTS: dict[str, Flight] = {
         "track_generalist",
         UNSEEN_RIG,
         "track_generalist",
-        "figure-eight, 2 m/s, 2 m/s², one network for many rigs, on a rig that it did not see",
+        "figure-eight, 2 m/s, 2 m/s², one network for many rigs, on another one",
         scripts=("formation_lead", "searched"),
     ),
     "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),

@@ -60,7 +60,10 @@ def card(name: str) -> str:
             parts += [_teams(flight, best), _limits(flight)]
     tested = [flight for flight in flights if (HERE / flight / "shifts.json").is_file()]
     if tested:
-        parts += ["Under changes that it did not see in training:", shifts(tested)]
+        parts += [
+            "Each change alone, hidden from the drones; what was random in training is above:",
+            shifts(tested),
+        ]
     else:
         parts.append(ELSEWHERE.get(name, "Not recorded: what it does under changes that it did not see in training."))
     return "\n\n".join(parts)
@@ -94,7 +97,7 @@ def _training(name: str, policy: LearnedPolicy) -> str:
     fine = f", inputs also on a fine scale (`train.asinh={train.asinh:g}`)" if train.asinh else ""
     overrides = ", ".join(f"`{key}={value}`" for key, value in sorted(train.overrides.items()))
     rows = {
-        "task": f"`{config.task}`, {config.env.num_drones} drones, episodes of {config.env.episode_seconds:g} s",
+        "task": f"`{config.task}`, {_drones(config)}, episodes of {config.env.episode_seconds:g} s",
         "actions": f"`{config.control.action}` ({len(policy.action_names)} of each drone)",
         "observation": f"{len(policy.observation_names)} numbers of each drone, `env.sensing={config.env.sensing}`",
         "trained by": f"{train.algorithm}, {frames:,} environment steps{minutes}",
@@ -106,6 +109,14 @@ def _training(name: str, policy: LearnedPolicy) -> str:
         "command": f"`python train.py config={name}`",
     }
     return "| | |\n|---|---|\n" + "\n".join(f"| {key} | {value} |" for key, value in rows.items())
+
+
+def _drones(config: Config) -> str:
+    """Return how many drones the policy was trained with, of all its rigs."""
+    counts = {rig.get("env.num_drones", config.env.num_drones) for rig in config.train.rigs}
+    if not counts:
+        return f"{config.env.num_drones} drones"
+    return f"{len(config.train.rigs)} rigs of {min(counts)} to {max(counts)} drones"
 
 
 def _conditions(config: Config) -> str:

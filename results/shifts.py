@@ -88,7 +88,8 @@ def main(flights: list[str]) -> None:
             script, keys = SEARCHED[flight], settings_of(flight)
         scales = {f"control.{key}": getattr(policy.config.control, key) for key in ("max_offset", "max_yaw")}
         rows = []
-        for shift in list_shifts(load_config(FLIGHTS[flight].config).env.num_drones):
+        drones = load_config(FLIGHTS[flight].config, FLIGHTS[flight].overrides).env.num_drones
+        for shift in list_shifts(drones):
             row: dict[str, Any] = {"shift": shift.title}
             for team, own, maker in (("learned", scales, policy.bind), (best, keys, script)):
                 try:

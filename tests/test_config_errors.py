@@ -126,6 +126,8 @@ def test_a_key_below_a_value_is_refused():
         ("env.num_drones", 65, "must be less than or equal to 64"),
         ("env.num_envs", [4], "must be a"),
         ("seed", -1, "must be greater than or equal to 0"),
+        ("train.asinh", -20, "must be 0, for no fine scale, or 0.001 to 1e6"),
+        ("train.asinh", 1e-300, "must be 0, for no fine scale, or 0.001 to 1e6"),
         ("payload.mass", "heavy", "must be a number"),
         ("payload.mass", True, "must be a number"),
         ("payload.mass", -1.4, "must be greater than 0"),

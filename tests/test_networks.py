@@ -36,9 +36,10 @@ def test_actors_give_each_drone_its_action_in_any_order(kind, asinh):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_untrained_actor_acts_as_its_base(kind):
+@pytest.mark.parametrize("asinh", [0.0, 20.0])
+def test_an_untrained_actor_acts_as_its_base(kind, asinh):
     base, observation = torch.randn(4, 11), torch.randn(6, 5, 11)
-    actor = Actor(kind, 11, 4, (16, 16), 0.3, base)
+    actor = Actor(kind, 11, 4, (16, 16), 0.3, base, asinh=asinh)
     torch.testing.assert_close(actor(observation)[0], torch.einsum("ak,enk->ena", base, observation))
 
 

@@ -25,6 +25,7 @@ import reproduce  # noqa: E402
 import search_gains  # noqa: E402
 import searched  # noqa: E402
 import searched_rigs  # noqa: E402
+import shifts  # noqa: E402
 import tables  # noqa: E402
 
 
@@ -317,3 +318,18 @@ def test_a_search_without_its_package_says_what_to_install(monkeypatch):
     assert "pip install cma" in refusal(
         search_gains.search, ml.load_config("pose"), "formation", search_gains.SLOTS, 0.3, 1.0
     )
+
+
+def test_changes_of_a_flight_are_of_its_own_number_of_drones(monkeypatch):
+    flown = {}
+
+    def fly(flight, shift, own, maker):
+        flown[shift.title] = shift
+        return {}
+
+    monkeypatch.setattr(shifts, "fly", fly)
+    monkeypatch.setattr(shifts, "write_whole", lambda path, content: None)
+    shifts.main(["track_generalist"])  # five drones, by keys of the flight
+    numbers = [flown[f"one drone {which}"].overrides["env.num_drones"] for which in ("less", "more")]
+    weaker = flown["one drone 15 % weaker"].factors["vehicle_thrust_coefficient"]
+    assert numbers == [4, 6] and len(weaker) == 5

@@ -28,7 +28,8 @@ class Normalizer(nn.Module):
         clip: bound of the standardised numbers.
 
     Attributes:
-        outputs: size of what it returns.
+        copies: how often each number is in what it returns.
+        outputs: size of that.
     """
 
     mean: torch.Tensor
@@ -40,7 +41,8 @@ class Normalizer(nn.Module):
     def __init__(self, size: int, asinh: float = 0.0, clip: float = 8.0):
         super().__init__()
         self.asinh, self.clip = asinh, clip
-        self.outputs = 2 * size if asinh else size
+        self.copies = 2 if asinh else 1
+        self.outputs = self.copies * size
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("square", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
@@ -263,16 +265,15 @@ class CentralCritic(nn.Module):
         super().__init__()
         self.normalizer, self.value_norm = Normalizer(state_size, asinh), value_norm
         self.kind, self.drones = kind, drones
-        of_each = self.normalizer.outputs // state_size
-        inputs = of_each * (state_size if kind == "flat" else state_size - (drones.rows - 1) * drones.size)
+        inputs = state_size if kind == "flat" else state_size - (drones.rows - 1) * drones.size
+        inputs *= self.normalizer.copies
         self.team = TeamNet("local" if kind == "flat" else kind, inputs, hidden, 1, gain=0.1)
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
         """Return the value for each drone."""
-        first, count, size = self.drones
-        rows = self.normalizer(state).unsqueeze(-2)
-        first, size = (rows.shape[-1] // state.shape[-1] * number for number in (first, size))
+        count, rows = self.drones.rows, self.normalizer(state).unsqueeze(-2)
         if self.kind != "flat":
+            first, size = self.normalizer.copies * self.drones.first, self.normalizer.copies * self.drones.size
             shared, own, rest = rows.split([first, count * size, rows.shape[-1] - first - count * size], -1)
             own = own.reshape(*own.shape[:-2], count, size)
             rows = torch.cat([own, torch.cat([shared, rest], -1).expand(*own.shape[:-1], -1)], -1)

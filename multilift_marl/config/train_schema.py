@@ -23,6 +23,13 @@ def check_residual(name: str) -> str:
     return name
 
 
+def check_asinh(k: float) -> float:
+    """Return K of the networks' fine scale; refuse, by a ValueError, what is none or beyond single precision."""
+    if k != 0 and not 1e-3 <= k <= 1e6:
+        raise ValueError("must be 0, for no fine scale, or 0.001 to 1e6")
+    return k
+
+
 class TrainConfig(Section):
     """PPO for a team with shared parameters."""
 
@@ -65,10 +72,8 @@ class TrainConfig(Section):
     hidden: tuple[Annotated[Int, Field(ge=1, le=8192)], ...] = Field(
         (64, 64), min_length=1, description="[-] widths of the hidden layers"
     )
-    asinh: Float = Field(
+    asinh: Annotated[Float, AfterValidator(check_asinh)] = Field(
         0.0,
-        ge=0,
-        le=1e6,
         description="[-] K: networks take asinh(K x / deviation) of each number x, too, fine near 0; 0: they do not",
     )
     initial_std: Float = Field(0.12, gt=0, description="[-] of the action distribution at the start")
