@@ -254,6 +254,38 @@ class RecoverRates(HoldCtbr):
     )
 
 
+class RecoverRatesSuccess(HoldCtbr):
+    """Of `recover_crazymarl_rates`: 20 minutes from `RecoverRates`, from which the learned teams start, by success, 96
+    episodes a candidate, a spread of 0.4."""
+
+    GAINS: ClassVar[Gains] = (
+        ("slot_error", 0, 0, -13.068),
+        ("slot_error", 1, 1, -13.068),
+        ("slot_error", 2, 2, -9.786),
+        ("velocity", 0, 0, -6.091),
+        ("velocity", 1, 1, -6.091),
+        ("velocity", 2, 2, -4.596),
+        ("payload_error_integral", 0, 0, -3.374),
+        ("payload_error_integral", 1, 1, -3.374),
+        ("payload_error_integral", 2, 2, -9.021),
+        ("payload_error", 0, 0, 7.180),
+        ("payload_error", 1, 1, 7.180),
+        ("payload_error", 2, 2, -0.539),
+        ("payload_velocity", 0, 0, 1.188),
+        ("payload_velocity", 1, 1, 1.188),
+        ("payload_velocity", 2, 2, -2.586),
+        ("rotation_error_integral", 1, 2, 5.410),
+        ("payload_rotation_error", 1, 2, -0.278),
+        ("payload_angular_velocity", 1, 2, 0.529),
+        ("rotation_error_integral", 2, 1, -1.722),
+        ("payload_rotation_error", 2, 1, 4.702),
+        ("payload_angular_velocity", 2, 1, 1.245),
+        ("payload_rotation_error", 1, 0, 1.609),
+        ("payload_angular_velocity", 1, 0, -0.097),
+        ("heading", 0, 0, -0.354),
+    )
+
+
 class RecoverSuccess(Formation):
     """Of `recover_realistic`: 25 minutes from `RecoverRealistic`, from which the learned teams start, by success, 96
     episodes a candidate."""
@@ -337,7 +369,7 @@ SEARCHED: dict[str, type[Formation]] = {
     "loss": LossRealistic,
     "loss_snap": LossRealistic,
     "loss_realistic": LossRealistic,
-    "recover_crazymarl_rates": RecoverRates,
+    "recover_crazymarl_rates": RecoverRatesSuccess,
     "track_generalist": TrackRigs,
     "track_follow_2_2": TrackFollowGentle,
     "track_follow_2_4": TrackFollow,
