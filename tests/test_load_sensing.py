@@ -205,10 +205,11 @@ def test_a_goal_that_leaps_is_no_motion_of_the_payload(level):
     assert np.abs(vec.task.view.load.velocity).max() < speed + 0.3
 
 
-def test_who_cannot_see_a_tilt_must_be_told_of_a_loss():
-    for level in ("onboard", "blind"):
+def test_who_can_neither_see_a_tilt_nor_feel_a_leap_must_be_told_of_a_loss():
+    make("loss", num_envs=1, **{"env.sensing": "onboard"})
+    for level, drones in (("blind", 4), ("onboard", 6)):
         with pytest.raises(ConfigError, match="set task_options"):
-            make("loss", num_envs=1, **{"env.sensing": level})
+            make("loss", num_envs=1, num_drones=drones, **{"env.sensing": level})
 
 
 def test_the_true_state_is_no_ones_to_read():

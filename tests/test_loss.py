@@ -173,6 +173,42 @@ def test_nobody_is_told_of_a_loss_and_all_notice_it():
     assert 0.1 < late.min() and late.max() < 0.3
 
 
+def test_drones_that_talk_to_nobody_notice_a_loss_by_their_own_cables():
+    vec = make("loss", num_envs=48, **{"env.sensing": "onboard"})
+    observation, _ = vec.reset(seed=0)
+    script, own = make_scripted("formation_redistributed", vec), vec.task.own
+    at = [i for i, name in enumerate(vec.observation_names) if name.startswith(("team_lost", "planned_offset"))]
+    rest, change, rated = vec.task.view.resting_tension, np.full((48, 4), np.nan), np.ones(48, bool)
+    held = np.zeros((48, 4))
+    for step in range(1, 240):
+        observation, _, terminated, _, _ = vec.step(script.act(observation))
+        since = 0.02 * step - own.when
+        rated &= ~terminated
+        assert not own.known[since < 0].any() and (observation[since < 0][..., at] == 0).all()  # no false alarm
+        tension = vec.world.state.cable_tension / rest
+        held = np.where((since < 0)[:, None], tension, held)
+        change = np.where((abs(since - 0.06) < 0.011)[:, None], tension - held, change)
+        if terminated.any():
+            vec.reset(mask=terminated)
+    others = rated[:, None] & ~vec.task.mask.lost
+    late = (own.known_when - own.when[:, None])[others]
+    assert rated.sum() > 30 and own.known[others].all()
+    assert 0.02 < late.min() and np.quantile(late, 0.95) < 0.1
+    sure = others & ~own.unsure
+    assert sure.sum() > 50 and (own.known_who == own.who[:, None])[sure].mean() > 0.97
+    # Motors have nearly stopped after 0.06 s: tensions have changed by what `tension_leaps` tells.
+    expected = vec.task.settings.leaps[own.who]
+    assert np.abs(change - expected)[others & np.isfinite(change)].mean() < 0.06
+
+
+def test_a_neighbour_and_its_mirror_image_cannot_be_told_apart_by_a_leap():
+    leaps = make("loss", num_envs=1, **{"env.sensing": "onboard"}).task.settings.leaps
+    assert leaps[1, 0] == pytest.approx(leaps[3, 0], abs=0.03) and leaps[1, 0] > 0.2 and leaps[2, 0] < -0.4
+    two = make("loss", num_envs=1, num_drones=2).task.settings.leaps
+    # Two cables: the other end of the payload springs up, and the tension falls by what turns it.
+    assert two[1, 0] < -0.2 and two[1, 0] == pytest.approx(two[0, 1], rel=1e-9)
+
+
 def test_where_it_is_broadcast_a_loss_is_known_at_once():
     vec = make("loss_6", num_envs=16)
     assert vec.task.options.broadcast

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, hypot, radians, sin
+from math import cos, radians, sin
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
@@ -13,8 +13,9 @@ from multilift_marl.config.values import Between, Float, Section
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.redistribution import RAMP, WAIT, plan_offset, redistributed_slots
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import add, mat, mul, scale, vec
+from multilift_marl.math3d import scale
 from multilift_marl.tasks.base import Kernels, Task
+from multilift_marl.tasks.loss_notice import LEAP_SECONDS, LEAST_LEAP, notice_loss, tension_leaps
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.rewards import (
     RestBounds,
@@ -26,10 +27,8 @@ from multilift_marl.tasks.rewards import (
     update_peak_tension,
 )
 from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
-from multilift_marl.tasks.view import load_row
 
 HARMLESS = 0.75  # tensions up to this share of the limit are no snatch
-LEAD = 0.1  # [s] by which a tilt is foreseen: 4 drones notice a loss 0.13 s after it, 6 after 0.17 s
 
 
 class LossOptions(StartOptions):
@@ -72,6 +71,12 @@ class LossArrays(NamedTuple):
     """(E, N) whom they take for lost, int64."""
     known_when: np.ndarray
     """(E, N) since when they know [s]."""
+    unsure: np.ndarray
+    """(E, N) bool, drones that do not know on which side it is yet."""
+    noticed_at: np.ndarray
+    """(E, N, 3) where they took the payload to be when they noticed it by their cables [m]."""
+    past_tension: np.ndarray
+    """(E, N, K) of their cables in the last K policy steps, over that at rest, the oldest first [-]."""
 
 
 class LossSettings(NamedTuple):
@@ -83,8 +88,12 @@ class LossSettings(NamedTuple):
     snap: bool
     """Whether the lost drone's cable breaks."""
     broadcast: bool
+    by_cable: bool
+    """Whether drones notice a loss by their own cables alone."""
     noticed_angle: float
     """[rad]"""
+    leaps: np.ndarray
+    """(N lost, N) of the tensions when a drone is lost, see `tension_leaps` [-]."""
     offsets: np.ndarray
     """(N lost, N, 3) by how much slots are to move after a loss, see `redistributed_slots` [m]."""
 
@@ -99,42 +108,6 @@ def stop_motors(e, v):
         if v.settings.snap:
             v.state.cable_broken[e, who] = True
     update_peak_tension(e, v, v.own.peak_tension)
-
-
-@inlined
-def coming_tilt(e, n, v):
-    """Return the level part of the rotation vector to which the payload turns in `LEAD` as drone n knows it [rad]."""
-    k = load_row(n, v)
-    spin = mul(mat(v.load.rotation, e, k), vec(v.load.body_rates, e, k))
-    return add(vec(v.seen_errors.rotation, e, k), scale(LEAD, spin))[:2]
-
-
-@inlined
-def lowest_corner(e, tilt, v):
-    """Return the drone whose corner of the payload sinks most by a tilt."""
-    lowest, who = 1e9, 0
-    for k in range(v.rig.azimuth.shape[0]):
-        azimuth = v.goal.yaw[e] + v.rig.azimuth[k]
-        height = tilt[0] * sin(azimuth) - tilt[1] * cos(azimuth)  # of tilt x corner
-        if height < lowest:
-            lowest, who = height, k
-    return who
-
-
-@inlined
-def notice_loss(e, v):
-    """Let drones know of a loss: when it is broadcast, or when the payload tilts as it does then.
-
-    What they know of the payload is that of the last policy step where sensors measure it.
-    """
-    lost = v.mask.lost[e, v.own.who[e]]
-    for n in range(v.own.known.shape[1]):
-        tilt = coming_tilt(e, n, v)
-        noticed = hypot(tilt[0], tilt[1]) > v.settings.noticed_angle
-        if not v.own.known[e, n] and (lost if v.settings.broadcast else noticed):
-            v.own.known[e, n] = True
-            v.own.known_who[e, n] = v.own.who[e] if v.settings.broadcast else lowest_corner(e, tilt, v)
-            v.own.known_when[e, n] = v.own.when[e] if v.settings.broadcast else v.time[e]
 
 
 @inlined
@@ -171,9 +144,9 @@ def knows_loss(e, n, v):
 
 @inlined
 def lost_direction(e, n, v):
-    """Cosine and sine of the lost drone's azimuth from the own one; 0 before."""
+    """Cosine and sine of the lost drone's azimuth from the own one; 0 before, the sine also while it is unsure."""
     angle, known = v.rig.azimuth[v.own.known_who[e, n]] - v.rig.azimuth[n], knows_loss(e, n, v)
-    return known * cos(angle), known * sin(angle)
+    return known * cos(angle), 0.0 if v.own.unsure[e, n] else known * sin(angle)
 
 
 @inlined
@@ -239,27 +212,44 @@ class Loss(Task):
         early, late = option.loss_time
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
-        known = self.config.env
-        if not option.broadcast and known.sensing in ("onboard", "blind") and known.communication == "none":
-            raise ConfigError(
-                f"env.sensing={known.sensing} does not show the payload's tilt, by which drones notice a loss; set "
-                "task_options.broadcast=true, or env.sensing=onboard and env.communication=neighbours or all"
-            )
+        e, n, gains = world.num_envs, world.num_drones, make_gains(control, world.system)
+        leaps = tension_leaps(world.system, gains.mass)
+        by_cable = self._notice_by_cable(leaps)
         self._ranges = make_ranges(option)
         world.breakable = world.breakable or option.snap
-        e, n, gains = world.num_envs, world.num_drones, make_gains(control, world.system)
         offsets = redistributed_slots(world.system, gains, not option.snap, control.max_offset)
         self.own = LossArrays(
             np.zeros(e), np.zeros(e, np.int64), np.zeros(e), np.zeros(e), np.zeros((e, n), bool),
-            np.zeros((e, n), np.int64), np.zeros((e, n)),
+            np.zeros((e, n), np.int64), np.zeros((e, n)), np.zeros((e, n), bool), np.zeros((e, n, 3)),
+            np.ones((e, n, 2 * max(1, round(LEAP_SECONDS / self.dt)))),
         )  # fmt: skip
         self.settings = LossSettings(
             RestBounds.of(option),
             option.success_tension,
             option.snap,
             option.broadcast,
+            by_cable,
             radians(option.noticed_angle),
+            leaps,
             offsets,
+        )
+
+    def _notice_by_cable(self, leaps: np.ndarray) -> bool:
+        """Return whether drones notice a loss by their own cables alone.
+
+        Raises:
+            ConfigError: they have to, but measure nothing of them, or some loss hardly changes a tension.
+        """
+        known = self.config.env
+        if self.options.broadcast or known.sensing not in ("onboard", "blind") or known.communication != "none":
+            return False
+        felt = (np.abs(leaps) >= LEAST_LEAP) | np.eye(len(leaps), dtype=bool)
+        if known.sensing == "onboard" and felt.all():
+            return True
+        why = "" if known.sensing == "blind" else f", and some of {len(leaps)} drones would not feel it by their cables"
+        raise ConfigError(
+            f"env.sensing={known.sensing} does not show the payload's tilt, by which drones notice a loss{why}; set "
+            "task_options.broadcast=true, or env.sensing=onboard and env.communication=neighbours or all"
         )
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
@@ -269,6 +259,7 @@ class Loss(Task):
         self.own.when[env] = rng.uniform(*self.options.loss_time)
         self.mask.lost[env], self.own.peak_tension[env], self.own.counted_tension[env] = False, 0.0, 0.0
         self.own.known[env], self.own.known_who[env], self.own.known_when[env] = False, 0, 0.0
+        self.own.unsure[env], self.own.past_tension[env] = False, 1.0
 
     def succeeded(self) -> np.ndarray:
         """At rest throughout the last seconds, with a drone less, and never too large a tension."""

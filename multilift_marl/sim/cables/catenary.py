@@ -53,9 +53,11 @@ def hang(chord, opening, length, stiffness, weight, links):
         _hang_slack(chord, distance, length, links)
         _turn_links(opening, links)
         return
+    # Start from a straight chain, pulled at its middle by what stretches it to the distance, at least its weight.
     middle = max(stiffness * (distance / n - length), n * weight)
     force = sub(scale(middle / distance, chord), (0.0, 0.0, 0.5 * n * weight))
     energy, gap, step = _complementary(chord, force, length, stiffness, weight, n)
+    # Newton's method; a step that does not lower the energy is halved.
     for _ in range(50):
         if norm(gap) < 1e-14 * distance:
             break
@@ -68,6 +70,7 @@ def hang(chord, opening, length, stiffness, weight, links):
             fraction *= 0.5
         force = trial
         energy, gap, step = found
+    # Where it did not converge (or gave NaN), the chain is straight, or an arc if that would compress it.
     straight = not norm(gap) < 1e-9 * distance
     for j in range(n):
         put(links[j, 4:], scale(1.0 / n, opening))

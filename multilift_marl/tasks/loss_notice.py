@@ -1,0 +1,133 @@
+"""How the drones of task `loss` come to know that one of them is lost.
+
+Where it is not broadcast, by how the payload tilts; and drones that do not know its tilt, by their own cable. Its
+tension leaps when another drone's cable goes slack: that of a neighbour rises, that of the drone opposite falls. By how
+much follows from rigid cables, drones that are point masses with unchanged thrust, and the payload's inertia
+(`tension_leaps`). Two drones whose loss has the same effect are told apart by where the payload swings: away from the
+lost one, whose cable no longer draws it there.
+"""
+
+from __future__ import annotations
+
+from math import cos, hypot, sin
+
+import numpy as np
+
+from multilift_marl._jit import inlined
+from multilift_marl.math3d import add, mat, mul, put, scale, sub, vec
+from multilift_marl.rig.system import System
+from multilift_marl.tasks.view import load_row
+
+LEAD = 0.1  # [s] by which a tilt is foreseen: 4 drones notice a loss 0.13 s after it, 6 after 0.17 s
+LEAP_SECONDS = 0.04  # [s] in which a tension leaps, by motors of 0.05 s
+LEAP_SHARE = 0.7  # of the leap that a loss brings, from which on it is noticed
+LEAST_LEAP = 0.15  # [-] over the resting tension; noise of its second difference is 0.025
+ALIKE = 0.05  # [-] leaps that differ by less tell nothing apart
+SETTLED = 1.5  # [s] payloads that start tilted swing, and tensions with them; no leap is looked for until then
+SIDE_SECONDS = 0.4  # [s] after a leap: the payload has swung by 5 to 20 cm
+
+
+def tension_leaps(system: System, drone_mass: np.ndarray) -> np.ndarray:
+    """Return the leap of each drone's tension when another is lost, (N lost, N), over its resting tension [-].
+
+    With s the changes of tension, G the cables' directions as wrenches on the payload, M its inertia, m the drones'
+    masses and w the wrench that is lost, (Gᵀ M⁻¹ G + diag(1/m)) s = Gᵀ M⁻¹ w: along each remaining cable its two ends
+    accelerate alike.
+
+    Args:
+        system: of the team.
+        drone_mass: (N,) [kg].
+    """
+    n, force = system.num_drones, system.formation_force
+    size = np.linalg.norm(force, axis=1)
+    wrench = np.hstack([force, np.cross(system.anchors, force)])
+    inertia = np.zeros((6, 6))
+    inertia[:3, :3] = system.payload_mass * np.eye(3)
+    inertia[3:, 3:] = np.reshape(system.inertia_matrix, (3, 3))
+    leaps = np.zeros((n, n))
+    for lost in range(n):
+        keep = np.delete(np.arange(n), lost)
+        directions = (wrench[keep] / size[keep, None]).T
+        effect = directions.T @ np.linalg.solve(inertia, np.column_stack([directions, wrench[lost]]))
+        change = np.linalg.solve(effect[:, :-1] + np.diag(1.0 / drone_mass[keep]), effect[:, -1])
+        leaps[lost, keep] = change / size[keep]
+    return leaps
+
+
+@inlined
+def coming_tilt(e, n, v):
+    """Return the level part of the rotation vector to which the payload turns in `LEAD` as drone n knows it [rad]."""
+    k = load_row(n, v)
+    spin = mul(mat(v.load.rotation, e, k), vec(v.load.body_rates, e, k))
+    return add(vec(v.seen_errors.rotation, e, k), scale(LEAD, spin))[:2]
+
+
+@inlined
+def lowest_corner(e, tilt, v):
+    """Return the drone whose corner of the payload sinks most by a tilt."""
+    lowest, who = 1e9, 0
+    for k in range(v.rig.azimuth.shape[0]):
+        azimuth = v.goal.yaw[e] + v.rig.azimuth[k]
+        height = tilt[0] * sin(azimuth) - tilt[1] * cos(azimuth)  # of tilt x corner
+        if height < lowest:
+            lowest, who = height, k
+    return who
+
+
+@inlined
+def notice_loss(e, v):
+    """Let drones know of a loss: when it is broadcast, when the payload tilts as it does then, or by their cables.
+
+    What they know of the payload is that of the last policy step where sensors measure it.
+    """
+    lost = v.mask.lost[e, v.own.who[e]]
+    for n in range(v.own.known.shape[1]):
+        if v.settings.by_cable:
+            feel_leap(e, n, v)
+            continue
+        tilt = coming_tilt(e, n, v)
+        noticed = hypot(tilt[0], tilt[1]) > v.settings.noticed_angle
+        if not v.own.known[e, n] and (lost if v.settings.broadcast else noticed):
+            v.own.known[e, n] = True
+            v.own.known_who[e, n] = v.own.who[e] if v.settings.broadcast else lowest_corner(e, tilt, v)
+            v.own.known_when[e, n] = v.own.when[e] if v.settings.broadcast else v.time[e]
+
+
+@inlined
+def feel_leap(e, n, v):
+    """Let drone n know of a loss by a leap of its own cable's tension, and who it is by how the payload swings then."""
+    # 1. How the tension leaps: its second difference, which a steady swing does not move.
+    past = v.own.past_tension[e, n]
+    lag, tension = past.shape[0] // 2, v.load.tension[e, n] / v.resting_tension[n]
+    leap = tension - 2.0 * past[lag] + past[0]
+    for i in range(past.shape[0] - 1):
+        past[i] = past[i + 1]
+    past[past.shape[0] - 1] = tension
+
+    # 2. The drone whose loss brings the leap nearest to it. It may be one of several.
+    here = vec(v.load.position, e, n)
+    if not v.own.known[e, n]:
+        if v.time[e] < SETTLED:
+            return
+        who, nearest = -1, 1e9
+        for k in range(v.settings.leaps.shape[0]):
+            expected = v.settings.leaps[k, n]
+            if k != n and leap * expected >= LEAP_SHARE * expected * expected and abs(leap - expected) < nearest:
+                who, nearest = k, abs(leap - expected)
+        if who >= 0:
+            v.own.known[e, n], v.own.known_who[e, n], v.own.known_when[e, n] = True, who, v.time[e]
+            v.own.unsure[e, n] = True
+            put(v.own.noticed_at[e, n], here)
+        return
+
+    # 3. Of these the one from which the payload has swung away most.
+    if v.own.unsure[e, n] and v.time[e] >= v.own.known_when[e, n] + SIDE_SECONDS:
+        moved = sub(here, vec(v.own.noticed_at, e, n))
+        first, least = v.own.known_who[e, n], 1e9
+        for k in range(v.settings.leaps.shape[0]):
+            azimuth = v.goal.yaw[e] + v.rig.azimuth[k]
+            toward = moved[0] * cos(azimuth) + moved[1] * sin(azimuth)
+            alike = abs(v.settings.leaps[k, n] - v.settings.leaps[first, n]) < ALIKE
+            if k != n and alike and toward < least:
+                v.own.known_who[e, n], least = k, toward
+        v.own.unsure[e, n] = False
