@@ -1,6 +1,6 @@
 """The best linear scripts that `search_gains.py` found for flights, by name: baselines, and scripts to learn from.
 Those by accelerations and tilt rates are in `searched_acc_rates.py`, those of paths in `searched_track.py`, those for
-several rigs in `searched_rigs.py`.
+several rigs in `searched_rigs.py`, those of losses in `searched_loss.py`.
 
 Each is a policy of one's own, `results/searched.py:HoverRealistic`. Gains are those that the search printed.
 """
@@ -10,10 +10,11 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from searched_acc_rates import HoverAccRates, PoseTudelft, TrackAgile
+from searched_loss import LossOnboard, LossRealistic
 from searched_rigs import TrackRigs
 from searched_track import TrackFollow, TrackFollowGentle, TrackRealistic, TrackRealisticFast
 
-from multilift_marl.control.scripted_formation import Formation, FormationNarrow, FormationRedistributed
+from multilift_marl.control.scripted_formation import Formation, FormationNarrow
 from multilift_marl.control.scripted_hold import HoldCtbr
 
 Gains = tuple[tuple[str, int, int, float], ...]
@@ -315,42 +316,6 @@ class RecoverSuccess(Formation):
     )
 
 
-class LossRealistic(FormationRedistributed):
-    """Of `loss_realistic`, and the best of `loss` and `loss_snap`: three searches of 30 minutes in all from
-    `formation_redistributed` by success, 96 episodes a candidate. What gains most: the slots are 0.66 m farther out
-    from the start."""
-
-    GAINS: ClassVar[Gains] = (
-        ("payload_error_integral", 0, 0, -0.820),
-        ("payload_error_integral", 1, 1, -0.820),
-        ("payload_error_integral", 2, 2, -0.610),
-        ("planned_offset", 0, 0, 0.961),
-        ("planned_offset", 1, 1, 0.961),
-        ("planned_offset", 2, 2, 0.961),
-        ("payload_error", 0, 0, 0.187),
-        ("payload_error", 1, 1, 0.187),
-        ("payload_error", 2, 2, -0.122),
-        ("payload_velocity", 0, 0, -0.161),
-        ("payload_velocity", 1, 1, -0.161),
-        ("payload_velocity", 2, 2, 0.106),
-        ("tracking_error", 0, 0, -0.142),
-        ("tracking_error", 1, 1, -0.142),
-        ("tracking_error", 2, 2, 0.509),
-        ("rotation_error_integral", 1, 2, 0.049),
-        ("payload_rotation_error", 1, 2, -0.135),
-        ("payload_angular_velocity", 1, 2, -0.082),
-        ("rotation_error_integral", 2, 1, 0.256),
-        ("payload_rotation_error", 2, 1, -0.466),
-        ("payload_angular_velocity", 2, 1, 0.035),
-        ("payload_rotation_error", 1, 0, 0.124),
-        ("payload_angular_velocity", 1, 0, -0.017),
-        ("heading", 0, 0, 0.663),
-        ("lost_direction", 0, 0, 0.167),
-        ("lost_direction", 1, 1, 0.167),
-        ("team_lost", 0, 2, -0.042),
-    )
-
-
 SEARCHED: dict[str, type[Formation]] = {
     "hover": HoverRigs,
     "hover_acc_rates": HoverAccRates,
@@ -369,6 +334,7 @@ SEARCHED: dict[str, type[Formation]] = {
     "loss": LossRealistic,
     "loss_snap": LossRealistic,
     "loss_realistic": LossRealistic,
+    "loss_onboard": LossOnboard,
     "recover_crazymarl_rates": RecoverRatesSuccess,
     "track_generalist": TrackRigs,
     "track_follow_2_2": TrackFollowGentle,

@@ -267,10 +267,11 @@ def test_every_line_of_the_training_plot_is_its_column(tmp_path, monkeypatch):
 
     drawn = []
     monkeypatch.setattr(plots, "_save", lambda figure, path: drawn.append(figure))
-    rows = [{"frames": "100", "success": "0.5", "eval/payload_position_error_m": ""}]
+    rows = [{"frames": "100", "success": "0.5", "return": "7", "eval/payload_position_error_m": ""}]
     rows += [{"frames": 200.0, "eval/success_rate": 1.0, "eval/payload_position_error_m": 0.03, "eval/return": 9.0}]
     plots.plot_training(tmp_path / "training.png", rows)
-    success, error, total = drawn[0].axes
+    success, error, total, paid = drawn[0].axes
     assert [line.get_xydata().tolist() for line in success.lines] == [[[100, 50]], [[200, 100]]]
     assert [line.get_xydata().tolist() for line in error.lines] == [[[200, 3]]]
-    assert [line.get_xydata().tolist() for line in total.lines] == [[], [[200, 9]]]
+    assert [line.get_xydata().tolist() for line in total.lines] == [[[200, 9]]]
+    assert [line.get_xydata().tolist() for line in paid.lines] == [[[100, 7]]]

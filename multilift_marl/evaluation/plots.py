@@ -86,22 +86,25 @@ def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
     Args:
         path: of the PNG; its folder is made.
         rows: lines of metrics.csv, numbers or their text; an empty or missing value is left out. Thin lines are
-            episodes with exploration, dots the evaluations of the deterministic policy.
+            episodes with exploration, dots the evaluations of the deterministic policy. Their returns have a panel
+            each, as training may pay by other weights.
     """
     rows = list(rows)
-    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    success, error, total = figure.subplots(3, 1, sharex=True)
+    figure = Figure(figsize=(6.4, 8.0), layout="constrained")
+    success, error, total, paid = figure.subplots(4, 1, sharex=True)
     panels = (
         (success, "success", "eval/success_rate", 100, "success [%]"),
         (error, None, "eval/payload_position_error_m", 100, "position error [cm]"),
-        (total, "return", "eval/return", 1, "return"),
+        (total, None, "eval/return", 1, "return"),
+        (paid, "return", None, 1, "return in training"),
     )
     for axes, explored, evaluated, factor, label in panels:
         if explored is not None:
             frames, values = _column(rows, explored)
             axes.plot(frames, factor * values, color=POLICY_COLOURS[0], linewidth=0.9, alpha=0.6, label="exploring")
-        frames, values = _column(rows, evaluated)
-        axes.plot(frames, factor * values, "o-", color=POLICY_COLOURS[1], markersize=4, label="evaluation")
+        if evaluated is not None:
+            frames, values = _column(rows, evaluated)
+            axes.plot(frames, factor * values, "o-", color=POLICY_COLOURS[1], markersize=4, label="evaluation")
         _label(axes, None, label)
     success.set_ylim(-3, 103)
     if len(_column(rows, "eval/payload_position_error_m")[0]):
@@ -109,8 +112,8 @@ def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
         error.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         error.yaxis.set_major_formatter("{x:g}")
         error.yaxis.set_minor_formatter(NullFormatter())
-    total.set_xlabel("environment steps")
-    total.xaxis.set_major_formatter(EngFormatter(sep=""))
+    paid.set_xlabel("environment steps")
+    paid.xaxis.set_major_formatter(EngFormatter(sep=""))
     _legend(figure, success)
     _save(figure, path)
 
