@@ -122,6 +122,13 @@ FLIGHTS: dict[str, Flight] = {
         "loss, realistic",
         scripts=("formation_redistributed", "searched"),
     ),
+    "loss_onboard": Flight(
+        "loss",
+        {"env.sensing": "onboard"},
+        "loss_onboard",
+        "loss, own cable and position alone, nobody talks",
+        scripts=("formation_redistributed", "searched"),
+    ),
     "loss_6": Flight("loss_6", {}, "loss_6", "loss, 6 drones"),
     "loss_snap": Flight("loss_snap", {}, "loss", "loss with its cable"),
 }

@@ -15,7 +15,7 @@ from multilift_marl.control.redistribution import RAMP, WAIT, plan_offset, redis
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import scale
 from multilift_marl.tasks.base import Kernels, Task
-from multilift_marl.tasks.loss_notice import LEAP_SECONDS, LEAST_LEAP, notice_loss, tension_leaps
+from multilift_marl.tasks.loss_notice import LEAST_CHANGE, SETTLED, WINDOW, expect_changes, notice_loss
 from multilift_marl.tasks.observations import Component
 from multilift_marl.tasks.rewards import (
     RestBounds,
@@ -75,8 +75,8 @@ class LossArrays(NamedTuple):
     """(E, N) bool, drones that do not know on which side it is yet."""
     noticed_at: np.ndarray
     """(E, N, 3) where they took the payload to be when they noticed it by their cables [m]."""
-    past_tension: np.ndarray
-    """(E, N, K) of their cables in the last K policy steps, over that at rest, the oldest first [-]."""
+    past: np.ndarray
+    """(E, N, K, 2) tension of their cables over that at rest [-] and climb of its end [m/s], in K past policy steps."""
 
 
 class LossSettings(NamedTuple):
@@ -92,8 +92,8 @@ class LossSettings(NamedTuple):
     """Whether drones notice a loss by their own cables alone."""
     noticed_angle: float
     """[rad]"""
-    leaps: np.ndarray
-    """(N lost, N) of the tensions when a drone is lost, see `tension_leaps` [-]."""
+    changes: np.ndarray
+    """(N lost, N, 2) of their cables when a drone is lost, see `expect_changes` [-], [m/s]."""
     offsets: np.ndarray
     """(N lost, N, 3) by how much slots are to move after a loss, see `redistributed_slots` [m]."""
 
@@ -213,15 +213,15 @@ class Loss(Task):
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
         e, n, gains = world.num_envs, world.num_drones, make_gains(control, world.system)
-        leaps = tension_leaps(world.system, gains.mass)
-        by_cable = self._notice_by_cable(leaps)
+        changes = expect_changes(world.system, gains.mass)
+        by_cable = self._notice_by_cable(changes)
         self._ranges = make_ranges(option)
         world.breakable = world.breakable or option.snap
         offsets = redistributed_slots(world.system, gains, not option.snap, control.max_offset)
         self.own = LossArrays(
             np.zeros(e), np.zeros(e, np.int64), np.zeros(e), np.zeros(e), np.zeros((e, n), bool),
             np.zeros((e, n), np.int64), np.zeros((e, n)), np.zeros((e, n), bool), np.zeros((e, n, 3)),
-            np.ones((e, n, 2 * max(1, round(LEAP_SECONDS / self.dt)))),
+            np.zeros((e, n, max(1, round(WINDOW / self.dt)), 2)),
         )  # fmt: skip
         self.settings = LossSettings(
             RestBounds.of(option),
@@ -230,23 +230,30 @@ class Loss(Task):
             option.broadcast,
             by_cable,
             radians(option.noticed_angle),
-            leaps,
+            changes,
             offsets,
         )
 
-    def _notice_by_cable(self, leaps: np.ndarray) -> bool:
+    def _notice_by_cable(self, changes: np.ndarray) -> bool:
         """Return whether drones notice a loss by their own cables alone.
 
         Raises:
-            ConfigError: they have to, but measure nothing of them, or some loss hardly changes a tension.
+            ConfigError: they have to, but measure nothing of them, or would not feel each loss.
         """
-        known = self.config.env
+        known, early = self.config.env, self.options.loss_time[0]
         if self.options.broadcast or known.sensing not in ("onboard", "blind") or known.communication != "none":
             return False
-        felt = (np.abs(leaps) >= LEAST_LEAP) | np.eye(len(leaps), dtype=bool)
-        if known.sensing == "onboard" and felt.all():
-            return True
-        why = "" if known.sensing == "blind" else f", and some of {len(leaps)} drones would not feel it by their cables"
+        why = ""
+        if known.sensing == "onboard":
+            felt = (np.linalg.norm(changes, axis=2) >= LEAST_CHANGE) | np.eye(len(changes), dtype=bool)
+            if felt.all() and early >= SETTLED:
+                return True
+            if felt.all():
+                raise ConfigError(
+                    f"task_options.loss_time={self.options.loss_time} is too early for drones that notice a loss by "
+                    f"their own cables, which swing for {SETTLED:g} s; raise it, or set task_options.broadcast=true"
+                )
+            why = f", and some of {len(changes)} drones would not feel it by their cables"
         raise ConfigError(
             f"env.sensing={known.sensing} does not show the payload's tilt, by which drones notice a loss{why}; set "
             "task_options.broadcast=true, or env.sensing=onboard and env.communication=neighbours or all"
@@ -259,7 +266,7 @@ class Loss(Task):
         self.own.when[env] = rng.uniform(*self.options.loss_time)
         self.mask.lost[env], self.own.peak_tension[env], self.own.counted_tension[env] = False, 0.0, 0.0
         self.own.known[env], self.own.known_who[env], self.own.known_when[env] = False, 0, 0.0
-        self.own.unsure[env], self.own.past_tension[env] = False, 1.0
+        self.own.unsure[env], self.own.past[env] = False, 0.0
 
     def succeeded(self) -> np.ndarray:
         """At rest throughout the last seconds, with a drone less, and never too large a tension."""

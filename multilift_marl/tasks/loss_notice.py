@@ -1,10 +1,10 @@
 """How the drones of task `loss` come to know that one of them is lost.
 
-Where it is not broadcast, by how the payload tilts; and drones that do not know its tilt, by their own cable. Its
-tension leaps when another drone's cable goes slack: that of a neighbour rises, that of the drone opposite falls. By how
-much follows from rigid cables, drones that are point masses with unchanged thrust, and the payload's inertia
-(`tension_leaps`). Two drones whose loss has the same effect are told apart by where the payload swings: away from the
-lost one, whose cable no longer draws it there.
+Where it is not broadcast, by how the payload tilts; and drones that do not know its tilt, by their own cable. When
+another drone's cable goes slack, the tension of a neighbour's rises and its end sinks; the tension of the one opposite
+falls and its end rises. By how much follows from rigid cables, drones that are point masses with unchanged thrust, and
+the payload's inertia (`expect_changes`). Two drones whose loss has the same effect are told apart by where the payload
+swings: away from the lost one, whose cable no longer draws it there.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from multilift_marl.rig.system import System
 from multilift_marl.tasks.view import load_row
 
 LEAD = 0.1  # [s] by which a tilt is foreseen: 4 drones notice a loss 0.13 s after it, 6 after 0.17 s
-LEAP_SECONDS = 0.04  # [s] in which a tension leaps, by motors of 0.05 s
-LEAP_SHARE = 0.7  # of the leap that a loss brings, from which on it is noticed
-LEAST_LEAP = 0.15  # [-] over the resting tension; noise of its second difference is 0.025
-ALIKE = 0.05  # [-] leaps that differ by less tell nothing apart
-SETTLED = 1.5  # [s] payloads that start tilted swing, and tensions with them; no leap is looked for until then
-SIDE_SECONDS = 0.4  # [s] after a leap: the payload has swung by 5 to 20 cm
+WINDOW = 0.1  # [s] in which tension and climb change, by motors of 0.05 s
+MATCH = 0.55  # [-] of the change that a loss brings, from which on it is noticed
+LEAST_CHANGE = 0.2  # [-] that can be told from swings: after two seconds these match up to 0.5 of 0.3
+ALIKE = 0.05  # [-] changes that differ by less tell nothing apart
+SETTLED = 2.0  # [s] payloads that start tilted swing, and tensions with them; nothing is looked for until then
+SIDE_SECONDS = 0.4  # [s] after a loss was noticed: the payload has swung by 5 to 20 cm
 
 
-def tension_leaps(system: System, drone_mass: np.ndarray) -> np.ndarray:
-    """Return the leap of each drone's tension when another is lost, (N lost, N), over its resting tension [-].
+def expect_changes(system: System, drone_mass: np.ndarray) -> np.ndarray:
+    """Return what each drone's cable does within `WINDOW` when another drone is lost, (N lost, N, 2).
 
     With s the changes of tension, G the cables' directions as wrenches on the payload, M its inertia, m the drones'
     masses and w the wrench that is lost, (Gᵀ M⁻¹ G + diag(1/m)) s = Gᵀ M⁻¹ w: along each remaining cable its two ends
@@ -37,6 +37,10 @@ def tension_leaps(system: System, drone_mass: np.ndarray) -> np.ndarray:
     Args:
         system: of the team.
         drone_mass: (N,) [kg].
+
+    Returns:
+        Change of the tension over that at rest [-], and of the vertical velocity of the cable's end at the payload
+        [m/s], half of what the first acceleration makes of it, as the drones pull it back.
     """
     n, force = system.num_drones, system.formation_force
     size = np.linalg.norm(force, axis=1)
@@ -44,14 +48,16 @@ def tension_leaps(system: System, drone_mass: np.ndarray) -> np.ndarray:
     inertia = np.zeros((6, 6))
     inertia[:3, :3] = system.payload_mass * np.eye(3)
     inertia[3:, 3:] = np.reshape(system.inertia_matrix, (3, 3))
-    leaps = np.zeros((n, n))
+    changes = np.zeros((n, n, 2))
     for lost in range(n):
         keep = np.delete(np.arange(n), lost)
         directions = (wrench[keep] / size[keep, None]).T
         effect = directions.T @ np.linalg.solve(inertia, np.column_stack([directions, wrench[lost]]))
-        change = np.linalg.solve(effect[:, :-1] + np.diag(1.0 / drone_mass[keep]), effect[:, -1])
-        leaps[lost, keep] = change / size[keep]
-    return leaps
+        tension = np.linalg.solve(effect[:, :-1] + np.diag(1.0 / drone_mass[keep]), effect[:, -1])
+        linear, angular = np.split(np.linalg.solve(inertia, directions @ tension - wrench[lost]), 2)
+        climb = (linear + np.cross(angular, system.anchors[keep]))[:, 2]
+        changes[lost, keep] = np.column_stack([tension / size[keep], 0.5 * WINDOW * climb])
+    return changes
 
 
 @inlined
@@ -83,7 +89,7 @@ def notice_loss(e, v):
     lost = v.mask.lost[e, v.own.who[e]]
     for n in range(v.own.known.shape[1]):
         if v.settings.by_cable:
-            feel_leap(e, n, v)
+            feel_loss(e, n, v)
             continue
         tilt = coming_tilt(e, n, v)
         noticed = hypot(tilt[0], tilt[1]) > v.settings.noticed_angle
@@ -94,40 +100,39 @@ def notice_loss(e, v):
 
 
 @inlined
-def feel_leap(e, n, v):
-    """Let drone n know of a loss by a leap of its own cable's tension, and who it is by how the payload swings then."""
-    # 1. How the tension leaps: its second difference, which a steady swing does not move.
-    past = v.own.past_tension[e, n]
-    lag, tension = past.shape[0] // 2, v.load.tension[e, n] / v.resting_tension[n]
-    leap = tension - 2.0 * past[lag] + past[0]
+def feel_loss(e, n, v):
+    """Let drone n know of a loss by its own cable, and who it is by how the payload swings then."""
+    # 1. How tension and climb of the cable's end have changed.
+    past, here = v.own.past[e, n], vec(v.load.position, e, n)
+    tension, climb = v.load.tension[e, n] / v.resting_tension[n], v.load.velocity[e, n, 2]
+    more_tension, more_climb = tension - past[0, 0], climb - past[0, 1]
     for i in range(past.shape[0] - 1):
-        past[i] = past[i + 1]
-    past[past.shape[0] - 1] = tension
+        past[i, 0], past[i, 1] = past[i + 1, 0], past[i + 1, 1]
+    past[past.shape[0] - 1, 0], past[past.shape[0] - 1, 1] = tension, climb
 
-    # 2. The drone whose loss brings the leap nearest to it. It may be one of several.
-    here = vec(v.load.position, e, n)
+    # 2. The drone whose loss brings the change nearest to it, where it is large enough along that. It may be one of
+    # several. A change of 0.1 in tension weighs as much as one of 0.1 m/s: both vary by that.
     if not v.own.known[e, n]:
-        if v.time[e] < SETTLED:
-            return
-        who, nearest = -1, 1e9
-        for k in range(v.settings.leaps.shape[0]):
-            expected = v.settings.leaps[k, n]
-            if k != n and leap * expected >= LEAP_SHARE * expected * expected and abs(leap - expected) < nearest:
-                who, nearest = k, abs(leap - expected)
-        if who >= 0:
-            v.own.known[e, n], v.own.known_who[e, n], v.own.known_when[e, n] = True, who, v.time[e]
-            v.own.unsure[e, n] = True
-            put(v.own.noticed_at[e, n], here)
+        nearest = 1e9
+        for k in range(v.own.known.shape[1]):
+            first, second = v.settings.changes[k, n, 0], v.settings.changes[k, n, 1]
+            matched = first * more_tension + second * more_climb > MATCH * (first * first + second * second)
+            gap = hypot(more_tension - first, more_climb - second)
+            if k != n and matched and gap < nearest and v.time[e] > SETTLED:
+                nearest = gap
+                v.own.known[e, n], v.own.known_who[e, n], v.own.known_when[e, n] = True, k, v.time[e]
+                v.own.unsure[e, n] = True
+                put(v.own.noticed_at[e, n], here)
         return
 
     # 3. Of these the one from which the payload has swung away most.
     if v.own.unsure[e, n] and v.time[e] >= v.own.known_when[e, n] + SIDE_SECONDS:
         moved = sub(here, vec(v.own.noticed_at, e, n))
-        first, least = v.own.known_who[e, n], 1e9
-        for k in range(v.settings.leaps.shape[0]):
+        found, least = v.own.known_who[e, n], 1e9
+        for k in range(v.own.known.shape[1]):
             azimuth = v.goal.yaw[e] + v.rig.azimuth[k]
             toward = moved[0] * cos(azimuth) + moved[1] * sin(azimuth)
-            alike = abs(v.settings.leaps[k, n] - v.settings.leaps[first, n]) < ALIKE
+            alike = abs(v.settings.changes[k, n, 0] - v.settings.changes[found, n, 0]) < ALIKE
             if k != n and alike and toward < least:
                 v.own.known_who[e, n], least = k, toward
         v.own.unsure[e, n] = False
