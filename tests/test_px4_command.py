@@ -108,7 +108,7 @@ def test_a_command_that_is_ended_leaves_nothing_behind(number, twice, tmp_path):
         process.send_signal(number)
         if twice:
             process.send_signal(number)
-        status = process.wait(30)
+        status = process.wait(240)
     finally:
         process.kill()
     running = [int(pid) for pid in pids.read_text().split()]

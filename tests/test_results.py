@@ -58,6 +58,7 @@ def test_tables_are_written_between_their_marks(tmp_path, monkeypatch):
         assert (tmp_path / document).read_text(encoding="utf-8") == text
 
 
+@pytest.mark.slow
 def test_flights_are_flown_a_thousand_times_by_shipped_teams_and_scripts():
     assert {flight.config for flight in reproduce.FLIGHTS.values()} >= set(ml.list_tasks())
     compared = 0

@@ -69,6 +69,7 @@ def wait_until_gone(pid: int) -> bool:
     return False
 
 
+@pytest.mark.slow
 @needs_two
 def test_cold_starts_at_the_same_time_step_as_a_warm_one_does(tmp_path):
     cold = [begin(tmp_path), begin(tmp_path)]
