@@ -81,17 +81,21 @@ def main(flights: list[str]) -> None:
 
     torch.set_num_threads(1)
     for flight in flights:
-        policy, best = load_policy(HERE / FLIGHTS[flight].recipe / "seed0" / "policy.pt"), best_script(flight)
-        script: Callable[[MultiliftVec], Any] = partial(make_scripted, best)
-        keys: dict[str, Any] = SCRIPTED
+        best, weights = best_script(flight), HERE / FLIGHTS[flight].recipe / "seed0" / "policy.pt"
+        teams: list[tuple[str, dict[str, Any], Callable[[MultiliftVec], Any]]] = []
+        if weights.is_file():  # of some flights there is a script alone
+            policy = load_policy(weights)
+            scales = {f"control.{key}": getattr(policy.config.control, key) for key in ("max_offset", "max_yaw")}
+            teams.append(("learned", scales, policy.bind))
         if best == "searched":
-            script, keys = SEARCHED[flight], settings_of(flight)
-        scales = {f"control.{key}": getattr(policy.config.control, key) for key in ("max_offset", "max_yaw")}
+            teams.append((best, settings_of(flight), SEARCHED[flight]))
+        else:
+            teams.append((best, SCRIPTED, partial(make_scripted, best)))
         rows = []
         drones = load_config(FLIGHTS[flight].config, FLIGHTS[flight].overrides).env.num_drones
         for shift in list_shifts(drones):
             row: dict[str, Any] = {"shift": shift.title}
-            for team, own, maker in (("learned", scales, policy.bind), (best, keys, script)):
+            for team, own, maker in teams:
                 try:
                     row[team] = fly(flight, shift, own, maker)
                 except (ConfigError, ValueError) as error:  # a team that cannot lift so much, for example
