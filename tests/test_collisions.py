@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import load, make_system, without_drag
 
+from multilift_marl.math3d import axis_angle
 from multilift_marl.rig.vehicles import PRESETS
 from multilift_marl.sim import World
-from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.sim.contact import APART, drone_half_size
 
 
 def collide(preset: str, axis: int, speed: float, phase: float, model: str = "massless") -> tuple[float, np.ndarray]:
@@ -124,3 +126,52 @@ def test_nothing_bounces():
         highest = max(highest, world.state.drone_velocity[0, 0, 2] if landed else 0.0)
     assert landed and highest < 0.7  # from 6.2 m/s
     assert world.state.drone_position[0, 0, 2] == pytest.approx(drone_half_size(world.system.vehicle)[2], abs=2e-3)
+
+
+LEVER = "v 0 0 0\nv 0.5 0 0\nv 0 0.3 0\nv 0 0 0.2\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder", "point", "mesh"])
+@pytest.mark.parametrize("preset", ["x500", "crazyflie"])
+def test_no_contact_is_where_none_is_searched(shape, preset, write):
+    values = {"payload.shape": shape, "vehicle.preset": preset, "payload.mass": 0.02}
+    if shape == "mesh":
+        anchors = [[0.0, -0.05, 0.1], [-0.2, -0.05, 0.1], [0.0, -0.2, 0.1]]
+        values |= {"payload.mesh": str(write(LEVER, "lever.obj")), "payload.anchors": anchors}
+    world, rng = World(make_system(3, **values), 400, 1), np.random.default_rng(4)
+    state, reach = world.state, 2 * world.system.payload_size.max() + 2 * drone_half_size(world.system.vehicle).max()
+    state.payload_position[:] = rng.uniform(0, reach, (400, 3))
+    state.drone_position[:] = state.payload_position[:, None] + rng.uniform(-reach, reach, (400, 3, 3))
+    for rotation in (*state.payload_rotation, *state.drone_rotation.reshape(-1, 3, 3)):
+        axis = rng.standard_normal(3)
+        rotation[:] = np.reshape(axis_angle(axis / np.linalg.norm(axis), rng.uniform(0, np.pi)), (3, 3))
+    state.payload_velocity[:], state.drone_velocity[:] = rng.uniform(-1, 1, (400, 3)), 0.0
+    load(world)
+    (shard,), data, touching = world.shards, mujoco.MjData(world.model), np.zeros(400, bool)
+    shard.find_close()
+    for e in range(400):
+        data.qpos[:] = world.qpos(e)
+        mujoco.mj_fwdPosition(world.model, data)
+        touching[e] = data.ncon > 0
+    assert 20 < touching.sum() and 20 < (shard.close == APART).sum()
+    assert not touching[shard.close == APART].any()
+
+
+def test_searching_everywhere_changes_no_bit():
+    states = []
+    for everywhere in (False, True):
+        world, rng = World(make_system(3, **{"payload.mass": 0.3}), 8, 2), np.random.default_rng(5)
+        world.state.payload_position[:, 2] -= 1.2
+        slack = rng.uniform(0.6, 1.0, (8, 3, 1))
+        world.state.drone_position[:] = world.state.payload_position[:, None] + slack * world.system.slots
+        load(world)
+        for shard in world.shards if everywhere else ():
+            shard.find_close = lambda: False  # MuJoCo searches from the start
+        hover, landed, apart = 9.81 * (world.system.vehicle.mass + 0.1) / 4, np.zeros(8, bool), np.zeros(8, bool)
+        for step in range(400):
+            world.step(np.full((8, 3, 4), (0.95 if step < 200 else 1.1) * hover))
+            close = np.concatenate([shard.close for shard in world.shards])
+            landed, apart = landed | (close != APART), apart | (close == APART)
+        assert everywhere or (landed.any() and apart.any())
+        states.append(np.concatenate([shard.batch.state for shard in world.shards]))
+    assert not world.diverged.any() and np.array_equal(*states)

@@ -1,4 +1,4 @@
-"""Contact of ground, payload and drones: where they touch, how stiffly, and which of them are fast."""
+"""Contact of ground, payload and drones: where they touch, how stiffly, and when they might."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ STIFFNESS = 6e4  # [1/s²] over the effective mass; with DAMPING a penetration f
 DAMPING = 5e3  # [1/s] over the effective mass: stops an approach within a step, without bouncing or passing through
 _FAST = 2.0  # [m/s] bodies that approach each other no faster meet before they can pass each other
 _SPECULATIVE = int(mujoco.mjtEnableBit.mjENBL_SPECULATIVE)
+_NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+APART, NEAR, FAST = range(3)
 
 
 def drone_half_size(vehicle: Vehicle) -> np.ndarray:
@@ -43,53 +45,65 @@ def body_radii(system: System) -> np.ndarray:
 
 
 @kernel
-def find_fast(lo, state, fast, radii, timestep):
-    """Find the environments in which bodies approach each other fast and might meet within a step.
+def find_close(lo, state, close, radii, timestep):
+    """Find the environments in which bodies might touch: APART, NEAR, or FAST.
+
+    Contacts need not be searched where the spheres about bodies are apart from each other and above the ground, as in
+    most steps: that search is a twelfth of a step's time. FAST are bodies that would be behind each other within a
+    step before a contact is found.
 
     Args:
         lo: the first of the environments.
         state: SystemState.
-        fast: (environments,) bool, written.
+        close: (environments,) int8, written.
         radii: `body_radii` (1 + N,) [m].
         timestep: [s].
 
     Returns:
-        Whether any of `fast` has changed.
+        Whether any of `close` has changed.
     """
     count = radii.shape[0]
     changed = False
-    for i in range(fast.shape[0]):
+    for i in range(close.shape[0]):
         e = lo + i
         # Where all are slower than half of the limit, as in most steps, no two approach each other fast.
-        velocity = row(state.payload_velocity, e)
-        quickest = dot(velocity, velocity)
+        pace = row(state.payload_velocity, e)
+        quickest = dot(pace, pace)
         for n in range(count - 1):
-            velocity = vec(state.drone_velocity, e, n)
-            quickest = max(quickest, dot(velocity, velocity))
+            pace = vec(state.drone_velocity, e, n)
+            quickest = max(quickest, dot(pace, pace))
+        quick = 4.0 * quickest > _FAST * _FAST
 
-        # Pairs of a drone with the payload and with the drones before it.
-        found = False
-        for b in range(1, count if 4.0 * quickest > _FAST * _FAST else 1):
+        # The ground, then pairs of a drone with the payload and with the drones before it.
+        found = NEAR if state.payload_position[e, 2] < radii[0] else APART
+        for b in range(1, count):
             place = vec(state.drone_position, e, b - 1)
-            velocity = vec(state.drone_velocity, e, b - 1)
+            if place[2] < radii[b]:
+                found = max(found, NEAR)
             for j in range(b):
                 other = row(state.payload_position, e) if j == 0 else vec(state.drone_position, e, j - 1)
-                pace = row(state.payload_velocity, e) if j == 0 else vec(state.drone_velocity, e, j - 1)
                 away = sub(place, other)
-                opening = sub(velocity, pace)
-                if dot(away, opening) < 0.0:
+                gap, reach = dot(away, away), radii[b] + radii[j]
+                if gap < reach * reach:
+                    found = max(found, NEAR)
+                if quick:
+                    velocity = vec(state.drone_velocity, e, b - 1)
+                    pace = row(state.payload_velocity, e) if j == 0 else vec(state.drone_velocity, e, j - 1)
+                    opening = sub(velocity, pace)
                     speed = norm(opening)
-                    reach = radii[b] + radii[j] + 2.0 * timestep * speed
-                    found = found or (speed > _FAST and dot(away, away) < reach * reach)
-        changed = changed or fast[i] != found
-        fast[i] = found
+                    reach += 2.0 * timestep * speed
+                    if dot(away, opening) < 0.0 and speed > _FAST and gap < reach * reach:
+                        found = FAST
+        changed = changed or close[i] != found
+        close[i] = found
     return changed
 
 
-def set_speculative(batch: Batch, fast: np.ndarray) -> None:
-    """Let MuJoCo search for contacts of the step to come in the simulations in `fast` (n,) bool.
+def search_contacts(batch: Batch, close: np.ndarray) -> None:
+    """Let MuJoCo search for contacts where bodies might touch, `close` (n,) of `find_close`.
 
-    In all of them it would cost a seventh of a step's time.
+    Where they are FAST, it also searches for those of the step to come, which takes a seventh of a step's time.
     """
-    flags = batch.expand("opt.enableflags")
-    flags.reshape(len(fast), -1)[:, 0] = np.where(fast, flags.reshape(len(fast), -1)[:, 0] | _SPECULATIVE, 0)
+    for name, bit, wanted in (("disable", _NO_CONTACT, close == APART), ("enable", _SPECULATIVE, close == FAST)):
+        flags = batch.expand(f"opt.{name}flags").reshape(len(close), -1)[:, 0]
+        flags[:] = np.where(wanted, flags | bit, flags & ~bit)

@@ -141,8 +141,6 @@ def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> N
         rgba=[*colour[:3], 0.0 if visuals else 1.0],
     )  # fmt: skip
     body.add_site(name=f"{name}/hook", pos=system.hooks[i], size=[0.008, 0, 0], rgba=[0.2, 0.2, 0.2, 1])
-    for r, position in enumerate(vehicle.rotor_positions):
-        body.add_site(name=f"{name}/rotor_{r}", pos=position, size=[0.008, 0, 0], group=4)
     if visuals:
         _add_rotorcraft(body, vehicle, colour)
 

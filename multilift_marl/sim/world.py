@@ -20,7 +20,7 @@ from multilift_marl.rig.system import System
 from multilift_marl.sim.air import make_air
 from multilift_marl.sim.cables import CABLE_MODELS
 from multilift_marl.sim.cables.chain_arrays import Nodes
-from multilift_marl.sim.contact import body_radii, find_fast, set_speculative
+from multilift_marl.sim.contact import NEAR, body_radii, find_close, search_contacts
 from multilift_marl.sim.dynamics import apply_loads
 from multilift_marl.sim.gusts import start_turbulence
 from multilift_marl.sim.parameters import (
@@ -61,10 +61,10 @@ class Shard:
     """`read_state` of the cable model."""
     broken: np.ndarray
     """(hi - lo, N) bool, broken cables that the batch's models have."""
-    find_fast: Callable[[], Any]
-    """`contact.find_fast` of these environments."""
-    fast: np.ndarray
-    """(hi - lo,) bool, environments in which bodies approach each other fast."""
+    find_close: Callable[[], Any]
+    """`contact.find_close` of these environments."""
+    close: np.ndarray
+    """(hi - lo,) int8, whether bodies might touch."""
     find_warnings: Callable[[], None]
     """`find_warnings` of these environments."""
 
@@ -185,8 +185,8 @@ class World:
             shard.apply()
             if shard.push is not None:
                 shard.push()
-            if shard.find_fast():
-                set_speculative(shard.batch, shard.fast)
+            if shard.find_close():
+                search_contacts(shard.batch, shard.close)
             if shard.advance_cables is not None:
                 shard.advance_cables()
             try:
@@ -350,11 +350,11 @@ class World:
             apply = bind(apply_loads, rows, *loads, self._data, air_constants.rig, air, self._varied)
             push = None if self._pushing is None else bind(apply_pushes, rows, *self._pushing)
             advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
-            fast = np.zeros(hi - lo, bool)
-            find = bind(find_fast, lo, self.state, fast, radii, self.system.timestep)
+            close = np.full(hi - lo, NEAR, np.int8)
+            find = bind(find_close, lo, self.state, close, radii, self.system.timestep)
             broken = np.zeros((hi - lo, self.num_drones), bool)
             warnings = bind(find_warnings, lo, batch.warning, self.diverged)
-            shards.append(Shard(lo, hi, batch, rows, apply, push, advance, read, broken, find, fast, warnings))
+            shards.append(Shard(lo, hi, batch, rows, apply, push, advance, read, broken, find, close, warnings))
         return shards
 
 
