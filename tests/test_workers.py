@@ -58,7 +58,8 @@ def test_one_worker_learns_what_one_process_does(tmp_path, local_ray, overrides)
     assert_equal(alone, one)
 
 
-@pytest.mark.parametrize("workers", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [2, 4])
 def test_workers_replay_bit_for_bit_also_where_one_dies(tmp_path, local_ray, workers):
     whole, wounded = (learn(make_trainer(tmp_path, **{"train.workers": workers}), kill=kill) for kill in (False, True))
     assert_equal(whole, wounded)
