@@ -289,6 +289,7 @@ def test_scripts_for_several_rigs_fly_each_of_them(name):
         assert (fly_episodes(rig, script, 1, 3, TRAINING_EVALUATION)["failure_cause"] == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flight", sorted(searched.SEARCHED))
 def test_searched_scripts_fit_their_flights(flight):
     script = searched.SEARCHED[flight]
