@@ -153,8 +153,8 @@ def test_no_contact_is_where_none_is_searched(shape, preset, write):
         data.qpos[:] = world.qpos(e)
         mujoco.mj_fwdPosition(world.model, data)
         touching[e] = data.ncon > 0
-    assert 20 < touching.sum() and 20 < (shard.close == APART).sum()
-    assert not touching[shard.close == APART].any()
+    assert 20 < touching.sum() and 20 < (shard.proximity == APART).sum()
+    assert not touching[shard.proximity == APART].any()
 
 
 def test_searching_everywhere_changes_no_bit():
@@ -170,7 +170,7 @@ def test_searching_everywhere_changes_no_bit():
         hover, landed, apart = 9.81 * (world.system.vehicle.mass + 0.1) / 4, np.zeros(8, bool), np.zeros(8, bool)
         for step in range(400):
             world.step(np.full((8, 3, 4), (0.95 if step < 200 else 1.1) * hover))
-            close = np.concatenate([shard.close for shard in world.shards])
+            close = np.concatenate([shard.proximity for shard in world.shards])
             landed, apart = landed | (close != APART), apart | (close == APART)
         assert everywhere or (landed.any() and apart.any())
         states.append(np.concatenate([shard.batch.state for shard in world.shards]))

@@ -45,65 +45,67 @@ def body_radii(system: System) -> np.ndarray:
 
 
 @kernel
-def find_close(lo, state, close, radii, timestep):
+def find_close(lo, state, proximity, radii, timestep):
     """Find the environments in which bodies might touch: APART, NEAR, or FAST.
 
     Contacts need not be searched where the spheres about bodies are apart from each other and above the ground, as in
-    most steps: that search is a twelfth of a step's time. FAST are bodies that would be behind each other within a
-    step before a contact is found.
+    most steps. FAST are bodies that would be behind each other within a step before a contact is found.
 
     Args:
         lo: the first of the environments.
         state: SystemState.
-        close: (environments,) int8, written.
+        proximity: (environments,) int8, written.
         radii: `body_radii` (1 + N,) [m].
         timestep: [s].
 
     Returns:
-        Whether any of `close` has changed.
+        Whether any of `proximity` has changed.
     """
     count = radii.shape[0]
     changed = False
-    for i in range(close.shape[0]):
+    for i in range(proximity.shape[0]):
         e = lo + i
         # Where all are slower than half of the limit, as in most steps, no two approach each other fast.
-        pace = row(state.payload_velocity, e)
-        quickest = dot(pace, pace)
+        velocity = row(state.payload_velocity, e)
+        quickest = dot(velocity, velocity)
         for n in range(count - 1):
-            pace = vec(state.drone_velocity, e, n)
-            quickest = max(quickest, dot(pace, pace))
+            velocity = vec(state.drone_velocity, e, n)
+            quickest = max(quickest, dot(velocity, velocity))
         quick = 4.0 * quickest > _FAST * _FAST
 
         # The ground, then pairs of a drone with the payload and with the drones before it.
         found = NEAR if state.payload_position[e, 2] < radii[0] else APART
         for b in range(1, count):
-            place = vec(state.drone_position, e, b - 1)
-            if place[2] < radii[b]:
+            position = vec(state.drone_position, e, b - 1)
+            velocity = vec(state.drone_velocity, e, b - 1)
+            if position[2] < radii[b]:
                 found = max(found, NEAR)
             for j in range(b):
                 other = row(state.payload_position, e) if j == 0 else vec(state.drone_position, e, j - 1)
-                away = sub(place, other)
-                gap, reach = dot(away, away), radii[b] + radii[j]
-                if gap < reach * reach:
+                offset = sub(position, other)
+                square, reach = dot(offset, offset), radii[b] + radii[j]
+                if square < reach * reach:
                     found = max(found, NEAR)
                 if quick:
-                    velocity = vec(state.drone_velocity, e, b - 1)
-                    pace = row(state.payload_velocity, e) if j == 0 else vec(state.drone_velocity, e, j - 1)
-                    opening = sub(velocity, pace)
-                    speed = norm(opening)
+                    other = row(state.payload_velocity, e) if j == 0 else vec(state.drone_velocity, e, j - 1)
+                    relative = sub(velocity, other)
+                    speed = norm(relative)
                     reach += 2.0 * timestep * speed
-                    if dot(away, opening) < 0.0 and speed > _FAST and gap < reach * reach:
+                    if dot(offset, relative) < 0.0 and speed > _FAST and square < reach * reach:
                         found = FAST
-        changed = changed or close[i] != found
-        close[i] = found
+        changed = changed or proximity[i] != found
+        proximity[i] = found
     return changed
 
 
-def search_contacts(batch: Batch, close: np.ndarray) -> None:
-    """Let MuJoCo search for contacts where bodies might touch, `close` (n,) of `find_close`.
+def search_contacts(batch: Batch, proximity: np.ndarray) -> None:
+    """Let MuJoCo search for contacts where bodies might touch, by `proximity` (n,) of `find_close`.
 
     Where they are FAST, it also searches for those of the step to come, which takes a seventh of a step's time.
     """
-    for name, bit, wanted in (("disable", _NO_CONTACT, close == APART), ("enable", _SPECULATIVE, close == FAST)):
-        flags = batch.expand(f"opt.{name}flags").reshape(len(close), -1)[:, 0]
+    for name, bit, wanted in (
+        ("disable", _NO_CONTACT, proximity == APART),
+        ("enable", _SPECULATIVE, proximity == FAST),
+    ):
+        flags = batch.expand(f"opt.{name}flags").reshape(len(proximity), -1)[:, 0]
         flags[:] = np.where(wanted, flags | bit, flags & ~bit)

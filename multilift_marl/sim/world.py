@@ -63,7 +63,7 @@ class Shard:
     """(hi - lo, N) bool, broken cables that the batch's models have."""
     find_close: Callable[[], Any]
     """`contact.find_close` of these environments."""
-    close: np.ndarray
+    proximity: np.ndarray
     """(hi - lo,) int8, whether bodies might touch."""
     find_warnings: Callable[[], None]
     """`find_warnings` of these environments."""
@@ -186,7 +186,7 @@ class World:
             if shard.push is not None:
                 shard.push()
             if shard.find_close():
-                search_contacts(shard.batch, shard.close)
+                search_contacts(shard.batch, shard.proximity)
             if shard.advance_cables is not None:
                 shard.advance_cables()
             try:
@@ -350,11 +350,11 @@ class World:
             apply = bind(apply_loads, rows, *loads, self._data, air_constants.rig, air, self._varied)
             push = None if self._pushing is None else bind(apply_pushes, rows, *self._pushing)
             advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
-            close = np.full(hi - lo, NEAR, np.int8)
-            find = bind(find_close, lo, self.state, close, radii, self.system.timestep)
+            proximity = np.full(hi - lo, NEAR, np.int8)
+            find = bind(find_close, lo, self.state, proximity, radii, self.system.timestep)
             broken = np.zeros((hi - lo, self.num_drones), bool)
             warnings = bind(find_warnings, lo, batch.warning, self.diverged)
-            shards.append(Shard(lo, hi, batch, rows, apply, push, advance, read, broken, find, close, warnings))
+            shards.append(Shard(lo, hi, batch, rows, apply, push, advance, read, broken, find, proximity, warnings))
         return shards
 
 

@@ -112,8 +112,8 @@ class Drift(NamedTuple):
 def without_contact(world: World) -> World:
     """Let the bodies of a world pass through each other, which takes no energy."""
     for shard in world.shards:
-        shard.close[:] = APART
-        search_contacts(shard.batch, shard.close)
+        shard.proximity[:] = APART
+        search_contacts(shard.batch, shard.proximity)
         shard.find_close = lambda: False
     return world
 
