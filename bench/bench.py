@@ -4,8 +4,8 @@
 
 MuJoCo alone is `Batch.step(nstep=control interval)` of the compiled model, with contacts, on the same threads, with
 the drones' hover thrust applied. All are measured alternately in one run, and the medians reported: on a noisy machine
-ratios compare, times do not; what other processes do counts least with `clock=processor env.num_threads=1`. The APIs are
-stepped in the shipped configuration, with resets, by actions that were drawn at random before.
+ratios compare, times do not; what other processes do counts least with `clock=processor env.num_threads=1`. The APIs
+are stepped in the shipped configuration, with resets, by actions that were drawn at random before.
 """
 
 from __future__ import annotations
