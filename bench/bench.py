@@ -120,7 +120,10 @@ def settings(defaults: dict, arguments: list[str]) -> tuple[dict, int, float]:
 def main(arguments: list[str]) -> dict:
     """Measure, print a table, and return the numbers."""
     values, repeats, seconds = settings({"env.num_envs": 256}, arguments)
-    clock = CLOCKS[values.pop("clock", "wall")]
+    name = values.pop("clock", "wall")
+    if name not in CLOCKS:
+        raise SystemExit(f"clock={name} must be {' or '.join(CLOCKS)}")
+    clock = CLOCKS[name]
     config = load_config("hover", values)
     vec = ml.make_vec(config)
     threads = len(vec.world.shards)
