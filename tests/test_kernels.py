@@ -17,11 +17,12 @@ from multilift_marl import _kernel_cache
 WEIGHTS = """
 from multilift_marl.rig.vehicles import GRAVITY
 import numpy as np
-from multilift_marl.rig.constants import Drones
+from multilift_marl.rig.constants import RigConstants
 from multilift_marl.sim.state import SystemState, hover_drone
 state = SystemState.zeros(1, 1)
 one = np.ones(1)
-hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, Drones(one, one, np.ones((1, 4, 4)), np.zeros((1, 3)), False))
+constants = RigConstants(0.0, 0.0, one, np.zeros((1, 3)), False, np.ones((1, 4, 4)), *[one] * 8)
+hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, constants)
 print((state.rotor_speed**2).sum() / GRAVITY)
 """
 COMPILING = "compiling kernels of the simulation for the first time, which takes up to a minute\n"

@@ -251,5 +251,5 @@ def test_a_mixed_team_opens_every_task(task, cables):
     vec = make(task, num_envs=1, **{"vehicle.preset": MIX}, **cables)
     vec.reset(seed=0)
     vec.step(zeros(vec))
-    assert floats(vec.task.rig.drones.mass) == floats([PRESETS[name].mass for name in MIX])
+    assert floats(vec.task.rig.constants.mass) == floats([PRESETS[name].mass for name in MIX])
     assert ml.load_config(task, {"vehicle.preset": MIX}).system.num_drones == 4

@@ -14,7 +14,7 @@ from multilift_marl._jit import kernel
 from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.gains import Gains, limited
 from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale, sub, tmul, vec
-from multilift_marl.rig.constants import make_drones
+from multilift_marl.rig.constants import make_constants
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 
@@ -65,7 +65,7 @@ def make_rejection(control: ControlConfig, system: System, g: Gains, dt: float) 
         share=np.array([1 - exp(-each * dt) for each in frequency]),
         gain=g.mass * g.k_p * frequency,
         largest=control.disturbance_limit * g.mass * GRAVITY,
-        thrust_coefficient=make_drones(system).thrust_coefficient,
+        thrust_coefficient=make_constants(system).thrust_coefficient,
     )
 
 

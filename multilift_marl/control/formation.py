@@ -24,7 +24,7 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
-from multilift_marl.rig.constants import Drones, make_drones
+from multilift_marl.rig.constants import RigConstants, make_constants
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 
@@ -89,7 +89,7 @@ class Rig(NamedTuple):
     """(N,) of each drone, from the team's [rad]."""
     force: np.ndarray
     """(N, 3) [N]."""
-    drones: Drones
+    constants: RigConstants
     is_point: bool
     """Whether all cables end at the payload's centre of mass: it has no attitude to speak of."""
 
@@ -98,7 +98,13 @@ def make_rig(system: System) -> Rig:
     """Return the formation of `system`."""
     point = not system.anchors.any()
     return Rig(
-        system.anchors, system.slots, system.slot_azimuth, system.heading, system.hook_force, make_drones(system), point
+        system.anchors,
+        system.slots,
+        system.slot_azimuth,
+        system.heading,
+        system.hook_force,
+        make_constants(system),
+        point,
     )
 
 
@@ -162,10 +168,10 @@ def goal_arm(e, n, goal, rig, yaw):
 @kernel
 def hook_arm(n, cable_force, yaw, rig):
     """Return the hook of drone n from its centre, at rest with a cable force [N] in a team of heading `yaw` [m]."""
-    if not rig.drones.hooked:
+    if not rig.constants.hooked:
         return (0.0, 0.0, 0.0)
-    force = add(cable_force, (0.0, 0.0, rig.drones.mass[n] * GRAVITY))
-    return mul(thrust_frame(force, yaw + rig.heading[n]), row(rig.drones.hooks, n))
+    force = add(cable_force, (0.0, 0.0, rig.constants.mass[n] * GRAVITY))
+    return mul(thrust_frame(force, yaw + rig.heading[n]), row(rig.constants.hooks, n))
 
 
 @kernel
@@ -177,7 +183,7 @@ def goal_hook(e, n, goal, rig):
 @kernel
 def set_heading(e, yaw, goal, rig):
     """Give the team of environment e another heading than the target's; its hooks stay where they are."""
-    if rig.drones.hooked:
+    if rig.constants.hooked:
         for n in range(rig.slots.shape[0]):
             turned = sub(goal_arm(e, n, goal, rig, goal.drone_yaw[e]), goal_arm(e, n, goal, rig, yaw))
             put(goal.slots[e, n], add(vec(goal.slots, e, n), turned))

@@ -124,7 +124,7 @@ def check_stretch(world: World, e: int, length: np.ndarray, stiffness: np.ndarra
         if state.cable_broken[e, n]:
             continue
         foot = add(row(state.payload_position, e), mul(matrow(state.payload_rotation, e), tuple(anchor)))
-        span = float(np.linalg.norm(sub(hook_position(e, n, state, world.drones.hooks), foot)))
+        span = float(np.linalg.norm(sub(hook_position(e, n, state, world.constants.hooks), foot)))
         most = max(MOST_STRETCH * length[n], MOST_TENSION * system.resting_tension[n] / stiffness[n])
         if span > length[n] + most:
             raise ValueError(

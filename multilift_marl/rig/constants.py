@@ -11,28 +11,21 @@ from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import AIR_DENSITY, Vehicle
 
 
-class Drones(NamedTuple):
-    """Each drone as a body that hovers under a cable force."""
-
-    mass: np.ndarray
-    """(N,) [kg]."""
-    thrust_coefficient: np.ndarray
-    """(N,) [N s²]."""
-    allocation: np.ndarray
-    """(N, 4, 4) inverse allocation matrices."""
-    hooks: np.ndarray
-    """(N, 3) where the cable is tied, from the centre of mass, body frame [m]."""
-    hooked: bool
-    """Whether any hook is off its centre of mass."""
-
-
 class RigConstants(NamedTuple):
-    """Rotors and drag of the drones, and drag of the payload, all nominal."""
+    """The drones with their rotors and drag, and drag of the payload, all nominal."""
 
     timestep: float
     """[s]."""
     payload_drag: float
     """½ ρ C_d A [kg/m]."""
+    mass: np.ndarray
+    """(N,) of each drone [kg]."""
+    hooks: np.ndarray
+    """(N, 3) where the cable is tied, from the centre of mass, body frame [m]."""
+    hooked: bool
+    """Whether any hook is off its centre of mass."""
+    allocation: np.ndarray
+    """(N, 4, 4) inverse allocation matrices."""
     rotor_positions: np.ndarray
     """(N, 4, 3) [m]."""
     rotor_spin: np.ndarray
@@ -51,19 +44,8 @@ class RigConstants(NamedTuple):
     """(N, 3) linear drag of a drone along its axes [kg/s]."""
 
 
-def make_drones(system: System) -> Drones:
-    """Return the drones of `system`."""
-    return Drones(
-        mass=system.drone_mass,
-        thrust_coefficient=np.array([vehicle.thrust_coefficient for vehicle in system.vehicles]),
-        allocation=np.stack([np.linalg.inv(vehicle.allocation) for vehicle in system.vehicles]),
-        hooks=np.ascontiguousarray(system.hooks),
-        hooked=bool(system.hooks.any()),
-    )
-
-
 def make_constants(system: System) -> RigConstants:
-    """Return rotors and drag of `system`."""
+    """Return the constants of `system`."""
 
     def column(field: str) -> np.ndarray:
         return np.array([getattr(vehicle, field) for vehicle in system.vehicles], float)
@@ -71,6 +53,10 @@ def make_constants(system: System) -> RigConstants:
     return RigConstants(
         timestep=system.timestep,
         payload_drag=0.5 * AIR_DENSITY * system.payload_drag_area,
+        mass=system.drone_mass,
+        hooks=np.ascontiguousarray(system.hooks),
+        hooked=bool(system.hooks.any()),
+        allocation=np.stack([np.linalg.inv(vehicle.allocation) for vehicle in system.vehicles]),
         rotor_positions=column("rotor_positions"),
         rotor_spin=column("rotor_spin"),
         thrust_coefficient=column("thrust_coefficient"),

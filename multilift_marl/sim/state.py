@@ -138,7 +138,7 @@ def hover_drone(e, n, state, cable_force, yaw, drones):
         state: SystemState, written.
         cable_force: that the drone exerts on its cable, world frame [N].
         yaw: heading [rad].
-        drones: `rig.constants.Drones`.
+        drones: `rig.constants.RigConstants`.
     """
     force = add(cable_force, (0.0, 0.0, drones.mass[n] * GRAVITY))
     attitude = thrust_frame(force, yaw)

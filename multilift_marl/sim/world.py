@@ -15,7 +15,7 @@ from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._jit import bind, kernel
 from multilift_marl._platform import cpu_count
-from multilift_marl.rig.constants import make_drones
+from multilift_marl.rig.constants import make_constants
 from multilift_marl.rig.system import System
 from multilift_marl.sim.air import make_air
 from multilift_marl.sim.cables import CABLE_MODELS
@@ -107,7 +107,7 @@ class World:
         self.num_drones = system.num_drones
         self.seed = seed
         self.model, self.layout = build_model(system)
-        self.drones = make_drones(system)
+        self.constants = make_constants(system)
         self.thrust = np.zeros((num_envs, self.num_drones, 4))
         self.state = SystemState.zeros(num_envs, self.num_drones)
         self.parameters = nominal_parameters(system, num_envs)
@@ -143,7 +143,7 @@ class World:
         state.drone_velocity[mask] = state.drone_body_rates[mask] = 0
         for e in np.flatnonzero(mask).tolist():
             for n, force in enumerate(system.hook_force):
-                hover_drone(e, n, state, tuple(force), float(self.system.heading[n]), self.drones)
+                hover_drone(e, n, state, tuple(force), float(self.system.heading[n]), self.constants)
         self.set_parameters(mask, **nominal_parameters(system, self.num_envs)._asdict())
         self.hidden_loads.payload_force[mask] = 0
         self.hidden_loads.wind[mask] = system.wind

@@ -207,7 +207,7 @@ def least_room(e, v):
             drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
             room = min(room, _room(e, g, drone, frame, bodies.drone[n], v))
             anchor = add(payload, mul(attitude, row(rig.anchors, n)))
-            room = min(room, _cable_room(e, g, anchor, add(drone, mul(frame, row(rig.drones.hooks, n))), v))
+            room = min(room, _cable_room(e, g, anchor, add(drone, mul(frame, row(rig.constants.hooks, n))), v))
     return room
 
 

@@ -82,7 +82,7 @@ def cable_length(e, n, v):
 @inlined
 def vehicle_mass(e, n, v):
     """Mass over the nominal one, minus 1."""
-    return v.parameters.vehicle_mass[e, n] / v.nominal.drones.mass[n] - 1.0
+    return v.parameters.vehicle_mass[e, n] / v.nominal.constants.mass[n] - 1.0
 
 
 @inlined

@@ -257,7 +257,7 @@ def see_cable(lo, hi, scene, load, first):
         payload, payload_attitude = row(true.payload_position, e), matrow(true.payload_rotation, e)
         for n in range(load.tension.shape[1]):
             # Direction from hook to anchor in the body frame, and the tension.
-            attitude, hook = mat(true.drone_rotation, e, n), row(rig.drones.hooks, n)
+            attitude, hook = mat(true.drone_rotation, e, n), row(rig.constants.hooks, n)
             anchor = add(payload, mul(payload_attitude, row(rig.anchors, n)))
             along = unit(sub(tmul(attitude, sub(anchor, vec(true.drone_position, e, n))), hook))
             off = add(vec(memory.offset, e, n), scale(sensor.direction, normal_vector(e, memory)))
@@ -279,7 +279,7 @@ def suppose_cable(lo, hi, scene, load, first):
     for e in range(lo, hi):
         for n in range(load.tension.shape[1]):
             load.tension[e, n] = scene.resting_tension[n]
-            hook = mul(mat(own.drone_rotation, e, n), row(rig.drones.hooks, n))
+            hook = mul(mat(own.drone_rotation, e, n), row(rig.constants.hooks, n))
             arm = sub(hook, _planned_cable(e, n, scene))
             put(scene.anchor[e, n], add(vec(own.drone_position, e, n), arm))
 

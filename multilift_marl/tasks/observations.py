@@ -123,7 +123,7 @@ def anchor_error(e, n, v):
 @inlined
 def cable_vector(e, n, v):
     """From own anchor to own hook."""
-    hook = mul(mat(v.seen.drone_rotation, e, n), row(v.rig.drones.hooks, n))
+    hook = mul(mat(v.seen.drone_rotation, e, n), row(v.rig.constants.hooks, n))
     return sub(add(vec(v.seen.drone_position, e, n), hook), anchor_position(e, n, v))
 
 

@@ -83,12 +83,12 @@ def _throw(e, rng, state, goal, rig, hanging, throw):
         span = hanging.length[n] * rng.uniform(throw.slack, throw.taut)
         put(state.drone_velocity[e, n], in_ball(rng, throw.speed))
         putmat(state.drone_rotation[e, n], _tilted(rng, throw.tilt, goal.drone_yaw[e] + rig.heading[n]))
-        place_at_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.drones.hooks)
+        place_at_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.constants.hooks)
         state.drone_body_rates[e, n] = 0.0
 
 
 @drawing
-def _throw_as_crazymarl(e, rng, state, goal, drones, hanging):
+def _throw_as_crazymarl(e, rng, state, goal, hooks, hanging):
     """Write a team as CrazyMARL's sampler draws it (viktorlorentz/crazyMARL, crazymarl/utils/multi_quad_sampling.py,
     commit 8723b9a, and the reset of crazymarl/envs/multi_quad_env.py, commit 02d5761).
 
@@ -125,7 +125,7 @@ def _throw_as_crazymarl(e, rng, state, goal, drones, hanging):
             roll, pitch = 0.0, 0.0
         level = matmul(axis_angle((0.0, 1.0, 0.0), pitch), axis_angle((1.0, 0.0, 0.0), roll))
         putmat(state.drone_rotation[e, n], matmul(rot_z(rng.uniform(-pi, pi)), level))
-        place_at_hook(e, n, state, vec(state.drone_position, e, n), drones.hooks)
+        place_at_hook(e, n, state, vec(state.drone_position, e, n), hooks)
         for k in range(3):
             state.drone_velocity[e, n, k] = rng.normal(0.0, 0.2)
             state.drone_body_rates[e, n, k] = rng.normal(0.0, radians(20.0))
@@ -217,10 +217,10 @@ class Recover(Task):
         if option.start == "slack":
             _throw(env, rng, state, goal, self.rig, self.hanging, throw)
         else:
-            _throw_as_crazymarl(env, rng, state, goal, self.rig.drones, self.hanging)
+            _throw_as_crazymarl(env, rng, state, goal, self.rig.constants.hooks, self.hanging)
         if not self.rig.anchors.any():
             _turn_formation(env, state, goal, self.rig)
-        drones = self.hanging.drones
-        carried = drones.mass + mass / self.world.num_drones
-        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / drones.thrust_coefficient)[:, None]
+        constants = self.hanging.constants
+        carried = constants.mass + mass / self.world.num_drones
+        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / constants.thrust_coefficient)[:, None]
         state.payload_body_rates[env] = 0.0

@@ -13,7 +13,7 @@ from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
-from multilift_marl.rig.constants import Drones, make_drones
+from multilift_marl.rig.constants import RigConstants, make_constants
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables.catenary import cable_end
@@ -33,7 +33,7 @@ class CableEquilibrium(NamedTuple):
     """Nominal [kg]."""
     load: float
     """True mass of the payload over the nominal one."""
-    drones: Drones
+    constants: RigConstants
 
 
 def make_hanging(system: System) -> CableEquilibrium:
@@ -45,21 +45,21 @@ def make_hanging(system: System) -> CableEquilibrium:
         segments=system.cable_segments,
         payload_mass=system.payload_mass,
         load=1.0,
-        drones=make_drones(system),
+        constants=make_constants(system),
     )
 
 
 def true_hanging(nominal: CableEquilibrium, parameters: Parameters, e: int) -> CableEquilibrium:
     """Return the numbers of the team in environment e."""
-    p, drones = parameters, nominal.drones
+    p, constants = parameters, nominal.constants
     return nominal._replace(
         load=float(p.payload_mass[e] / nominal.payload_mass),
         length=p.cable_length[e],
         stiffness=p.cable_stiffness[e],
         weight=nominal.weight * (p.cable_length[e] / nominal.length),
-        drones=drones._replace(
+        constants=constants._replace(
             mass=p.vehicle_mass[e],
-            thrust_coefficient=drones.thrust_coefficient * p.vehicle_thrust_coefficient[e],
+            thrust_coefficient=constants.thrust_coefficient * p.vehicle_thrust_coefficient[e],
         ),
     )
 
@@ -107,8 +107,8 @@ def hang_team(e, v, goal, hanging, pose, velocity, moved):
         put(state.drone_velocity[e, n], velocity)
         state.drone_body_rates[e, n] = 0.0
         cable_force = add(scale(tension, direction), half)
-        hover_drone(e, n, state, cable_force, goal.drone_yaw[e] + rig.heading[n], hanging.drones)
-        place_at_hook(e, n, state, add(anchor, end), hanging.drones.hooks)
+        hover_drone(e, n, state, cable_force, goal.drone_yaw[e] + rig.heading[n], hanging.constants)
+        place_at_hook(e, n, state, add(anchor, end), hanging.constants.hooks)
 
 
 class TargetOptions(Section):

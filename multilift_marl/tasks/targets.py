@@ -114,7 +114,7 @@ def _within(e, goal, rig, hanging, bounds):
     for n in range(rig.slots.shape[0]):
         slot, cable_weight = vec(goal.slots, e, n), (0.0, 0.0, hanging.weight[n])
         cable_force = sub(vec(goal.cable_force, e, n), cable_weight)
-        carried = add(scale(bounds.load, cable_force), add(cable_weight, (0.0, 0.0, rig.drones.mass[n] * GRAVITY)))
+        carried = add(scale(bounds.load, cable_force), add(cable_weight, (0.0, 0.0, rig.constants.mass[n] * GRAVITY)))
         if norm(carried) > bounds.thrust[n]:
             return False
         if slot[2] - position[2] < ABOVE * hanging.length[n]:
