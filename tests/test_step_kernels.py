@@ -7,7 +7,7 @@ import pytest
 from conftest import bold_actions, make, mask, mixed_actions, same, zeros
 
 from multilift_marl.envs.step_kernels import ENDED, NOT_FINITE, TAKEN, Outcome, end_step, take_actions
-from multilift_marl.sim.parameters import make_inertias, nominal_parameters, update_inertias
+from multilift_marl.sim.parameters import MASSES, make_inertias, nominal_parameters, update_inertias
 from multilift_marl.sim.world import find_warnings
 from multilift_marl.tasks.failures import DIVERGED
 
@@ -91,8 +91,21 @@ def test_inertias_of_an_environment_do_not_depend_on_which_others_change():
     before = inertias.inverse[0].copy()
     parameters.payload_mass[:] *= [1.5, 0.7, 1.3]
     parameters.vehicle_mass[:] *= 1.1
-    update_inertias(inertias, system, parameters, mask(3, 1, 2))
-    update_inertias(whole, system, parameters, np.ones(3, bool))
+    update_inertias(inertias, system, parameters, mask(3, 1, 2), MASSES)
+    update_inertias(whole, system, parameters, np.ones(3, bool), MASSES)
     for part, full in zip(inertias, whole, strict=True):
         assert same(part[1:], full[1:])
     assert same(inertias.inverse[0], before) and not same(whole.inverse[0], before)
+
+
+@pytest.mark.parametrize("name", sorted(MASSES))
+def test_a_parameter_that_changes_alone_brings_all_that_depends_on_it(name):
+    system = make("hover").world.system
+    parameters = nominal_parameters(system, 2)
+    inertias = make_inertias(system, parameters)
+    before = [part.copy() for part in inertias]
+    getattr(parameters, name)[:] += 0.05
+    update_inertias(inertias, system, parameters, np.ones(2, bool), {name})
+    assert any(not same(part, old) for part, old in zip(inertias, before, strict=True))
+    for part, full in zip(inertias, make_inertias(system, parameters), strict=True):
+        assert same(part, full)

@@ -5,6 +5,7 @@ They are absolute, or factors on what the configuration says: setting them twice
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -126,26 +127,30 @@ def make_inertias(system: System, parameters: Parameters) -> Inertias:
     e, n = parameters.vehicle_mass.shape
     b = 1 + n
     inertias = Inertias(np.zeros((e, b)), np.zeros((e, b, 3, 3)), np.zeros((e, b, 3, 3)), np.zeros((e, b, 3)))
-    update_inertias(inertias, system, parameters, np.ones(e, bool))
+    update_inertias(inertias, system, parameters, np.ones(e, bool), MASSES)
     return inertias
 
 
-def update_inertias(inertias: Inertias, system: System, parameters: Parameters, mask: np.ndarray) -> None:
-    """Bring the inertias of the environments in `mask` (E,) into line with their parameters."""
-    payload_mass, vehicle_mass = parameters.payload_mass[mask], parameters.vehicle_mass[mask]
-    inertias.mass[mask, 0] = payload_mass
-    inertias.mass[mask, 1:] = vehicle_mass
-    inertias.center[mask, 0] = parameters.payload_center_of_mass[mask]
-    axes = np.reshape(quat_to_mat(*system.payload_axes.tolist()), (3, 3))
-    scale = payload_mass / system.payload_mass * parameters.payload_inertia[mask]
-    payload = scale[:, None, None] * (axes * system.payload_inertia @ axes.T)
-    own = vehicle_mass / np.array([vehicle.mass for vehicle in system.vehicles])
-    drones = own[:, :, None, None] * np.array([np.diag(vehicle.inertia) for vehicle in system.vehicles])
-    inertias.inertia[mask, 0] = payload
-    inertias.inertia[mask, 1:] = drones
-    inertias.inverse[mask, 1:] = np.linalg.inv(drones)
-    if system.payload_shape != "point":
-        inertias.inverse[mask, 0] = np.linalg.inv(payload)
+def update_inertias(
+    inertias: Inertias, system: System, parameters: Parameters, mask: np.ndarray, names: Collection[str]
+) -> None:
+    """Bring the inertias of the environments in `mask` (E,) into line with their parameters `names`, which changed."""
+    if "payload_center_of_mass" in names:
+        inertias.center[mask, 0] = parameters.payload_center_of_mass[mask]
+    if "payload_mass" in names or "payload_inertia" in names:
+        mass = parameters.payload_mass[mask]
+        axes = np.reshape(quat_to_mat(*system.payload_axes.tolist()), (3, 3))
+        scale = mass / system.payload_mass * parameters.payload_inertia[mask]
+        payload = scale[:, None, None] * (axes * system.payload_inertia @ axes.T)
+        inertias.mass[mask, 0], inertias.inertia[mask, 0] = mass, payload
+        if system.payload_shape != "point":
+            inertias.inverse[mask, 0] = np.linalg.inv(payload)
+    if "vehicle_mass" in names:
+        mass = parameters.vehicle_mass[mask]
+        own = mass / np.array([vehicle.mass for vehicle in system.vehicles])
+        drones = own[:, :, None, None] * np.array([np.diag(vehicle.inertia) for vehicle in system.vehicles])
+        inertias.mass[mask, 1:], inertias.inertia[mask, 1:] = mass, drones
+        inertias.inverse[mask, 1:] = np.linalg.inv(drones)
 
 
 def check_parameters(system: System, old: Parameters, mask: np.ndarray, values: dict[str, np.ndarray]) -> None:

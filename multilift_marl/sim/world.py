@@ -225,7 +225,7 @@ class World:
             return
         if self._varied is not None and "vehicle_rotor_time_constant" in names:
             write_lags(self._varied, self.system, self.parameters, changed)
-        update_inertias(self._inertias, self.system, self.parameters, changed)
+        update_inertias(self._inertias, self.system, self.parameters, changed, names)
         self.cable_model.update_cables(self.cables, self.system, self.parameters)
         for shard in self.shards:
             mask = changed[shard.lo : shard.hi]
