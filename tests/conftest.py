@@ -53,6 +53,14 @@ TIMESTEPS = (5e-4, 1e-3, 2e-3, 4e-3)
 OFF_CENTRE = [[0.25, 0.2, 0.08], [-0.3, 0.2, 0.08], [-0.3, -0.2, 0.08], [0.25, -0.2, 0.08]]
 INFO = {"success", "failure", "diverged", "failure_cause", "reward_terms", "randomization"}
 JARGON = ("Input ", "Value error", "Field required", "Tuple ", "instance of", "\n", ". ", "  ", "Errno")
+SHARES = {  # key of `randomization`: width
+    "payload_mass": 0.2, "payload_inertia": 0.3, "payload_drag": 0.5, "cable_length": 0.05, "cable_stiffness": 0.4,
+    "vehicle_mass": 0.1, "vehicle_thrust_coefficient": 0.08, "vehicle_rotor_time_constant": 0.25, "vehicle_drag": 0.6,
+}  # fmt: skip
+# all hidden parameters; one set for all tests, since what is hidden is compiled into the global state
+ALL = {f"randomization.{key}": width for key, width in SHARES.items()} | {
+    "randomization.payload_center_of_mass": (0.03, 0.02, 0.01), "randomization.wind": 4.0, "env.episode_seconds": 4.0,
+}  # fmt: skip
 SMALL = {
     "env.num_envs": 8, "env.num_threads": 1, "env.episode_seconds": 0.5, "train.horizon": 16, "train.frames": 1280,
     "train.minibatches": 4, "train.warmup": 0, "train.checkpoint_every": 5, "eval.every": 4, "eval.episodes": 3,

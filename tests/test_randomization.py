@@ -5,7 +5,9 @@ from math import exp
 import numpy as np
 import pytest
 from conftest import (
+    ALL,
     GRAVITY,
+    SHARES,
     bold_actions,
     free_world,
     hover_thrust,
@@ -22,13 +24,6 @@ from multilift_marl.math3d import axis_angle
 from multilift_marl.sim import World
 from multilift_marl.sim.parameters import nominal_parameters
 
-SHARES = {  # key of `randomization`: width
-    "payload_mass": 0.2, "payload_inertia": 0.3, "payload_drag": 0.5, "cable_length": 0.05, "cable_stiffness": 0.4,
-    "vehicle_mass": 0.1, "vehicle_thrust_coefficient": 0.08, "vehicle_rotor_time_constant": 0.25, "vehicle_drag": 0.6,
-}  # fmt: skip
-ALL = {f"randomization.{key}": width for key, width in SHARES.items()} | {
-    "randomization.payload_center_of_mass": (0.03, 0.02, 0.01), "randomization.wind": 4.0, "env.episode_seconds": 4.0,
-}  # fmt: skip
 MODELS = pytest.mark.parametrize("model", ["massless", "chain"])
 EVERYONE = np.ones(2, bool)
 
@@ -87,7 +82,7 @@ def test_other_draws_stay_what_they_are_without(draws):
 
 
 def test_info_holds_the_draw_at_reset_and_at_every_step(task, cables):
-    vec = make(task, **{"randomization.vehicle_mass": 0.1}, **cables)
+    vec = make(task, **ALL, **cables)
     drawn = vec.reset()[1]["randomization"]
     info = vec.step(zeros(vec))[4]
     assert same(drawn, info["randomization"])
@@ -101,8 +96,7 @@ def test_info_holds_the_draw_at_reset_and_at_every_step(task, cables):
 
 
 def test_nothing_of_the_parameters_is_shown_to_the_drones(task, cables):
-    settings = {key: value for key, value in ALL.items() if "second" not in key}
-    vec = make(task, num_drones=3, **settings, **cables)
+    vec = make(task, num_drones=3, **ALL, **cables)
     observation, _ = vec.reset(seed=1)
     for array in vec.world.parameters:
         array[:] = 2.0 * array + 0.1

@@ -18,7 +18,16 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import matmul, matrow, rotation_vector, row, sub, transpose
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, failure, stillness
+from multilift_marl.tasks.rewards import (
+    RestBounds,
+    Term,
+    action_rate,
+    attitude,
+    closeness,
+    distance,
+    failure,
+    stillness,
+)
 from multilift_marl.tasks.starts import hang_team
 from multilift_marl.tasks.targets import Bounds, draw_plan, make_bounds
 from multilift_marl.tasks.trajectory import (
@@ -143,6 +152,7 @@ class Pose(Task):
         "attitude": Term(0.2, attitude, 20.0, "deg"),
         "alignment": Term(0.15, attitude, 2.0, "deg"),
         "stillness": Term(0.1, stillness, (0.2, 0.3), "m/s, rad/s"),
+        "closeness": Term(0.0, closeness, 0.5, "m"),
         "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }

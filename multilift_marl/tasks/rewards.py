@@ -10,7 +10,7 @@ import numpy as np
 
 from multilift_marl._jit import compose, inlined
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import norm, row, sub
+from multilift_marl.math3d import norm, row, sub, vec
 
 
 class Term(NamedTuple):
@@ -131,6 +131,22 @@ def body_rate(e, v, margin):
 def steadiness(e, v, speed, rate):
     """Payload as fast as its target, and turning slowly."""
     return velocity(e, v, speed) * body_rate(e, v, rate)
+
+
+@inlined
+def closeness(e, v, margin):
+    """Drones near each other, or hardly above the payload: each 0 at `margin` from what fails, 1 there."""
+    total = 0.0
+    for n in range(v.state.drone_position.shape[1]):
+        if v.mask.lost[e, n]:
+            continue
+        drone = vec(v.state.drone_position, e, n)
+        total += max(0.0, 1.0 - (drone[2] - v.state.payload_position[e, 2]) / margin) ** 2
+        for m in range(n):
+            if not v.mask.lost[e, m]:
+                apart = norm(sub(drone, vec(v.state.drone_position, e, m))) - v.limits.separation[n, m]
+                total += max(0.0, 1.0 - apart / margin) ** 2
+    return total
 
 
 @inlined
