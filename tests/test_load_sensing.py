@@ -15,6 +15,7 @@ from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks.load_filter import alpha_beta
 
 LEVELS = ("mocap", "onboard", "blind")
+REST = ("gate", "pose", "recover", "loss", "land", "takeoff")
 
 
 def observe(vec):
@@ -172,7 +173,7 @@ def test_noise_on_top_of_sensors_is_refused():
 
 
 @pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("task", ["hover", "track", "gate", "pose", "recover", "loss", "land", "takeoff"])
+@pytest.mark.parametrize("task", ["hover", "track", *(pytest.param(name, marks=pytest.mark.slow) for name in REST)])
 def test_every_task_flies_by_sensors(level, task):
     told = {"task_options.broadcast": True} if task == "loss" else {}
     vec = make(task=task, num_envs=4, **{"env.sensing": level, **told})

@@ -51,6 +51,7 @@ def test_a_push_changes_the_velocity_in_any_direction(settings):
     assert np.abs(np.mean(apart[:, 0] * apart[:, 1], axis=0)).max() < 0.01  # each drone's own
 
 
+@pytest.mark.slow
 def test_pushes_come_as_a_poisson_process():
     world = World(make_system(2, **PUSHES), 1500, 1)
     thrust, count, before = hover_thrust(world), np.zeros((1500, 3)), world.pushes.left.copy()

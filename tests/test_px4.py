@@ -126,6 +126,7 @@ def test_every_message_is_answered_in_step():
     assert are_free()
 
 
+@pytest.mark.slow
 def test_a_team_flies_from_the_ground_through_a_task_and_back():
     config, said = config_of("hover", **{"randomization.payload_force": 0.0, "env.episode_seconds": 4.0}), []
     with Airfield(config.system) as field:

@@ -213,7 +213,7 @@ def test_what_is_drawn_has_the_same_physics(num_drones):
     assert same(*states)
 
 
-@pytest.mark.parametrize("size", [(90, 160), (91, 161)])
+@pytest.mark.parametrize("size", [pytest.param((90, 160), marks=pytest.mark.slow), (91, 161)])
 def test_a_video_holds_the_frames(tmp_path, size):
     iio, av = pytest.importorskip("imageio.v3"), pytest.importorskip("av")
     ramp = np.linspace(0, 200, size[1])[None, :, None] * np.ones((*size, 3))

@@ -57,6 +57,7 @@ def until(condition, seconds: float = 60.0) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_another_process_hears_the_flight_as_it_was():
     node = Node(domain=DOMAIN)
     take, clock = node.subscription(ODOMETRY), node.subscription(CLOCK)

@@ -18,6 +18,7 @@ def test_growth_is_counted_after_the_warm_up():
     assert watch.new_threads() == 2
 
 
+@pytest.mark.slow
 def test_memory_that_is_held_is_seen():
     watch, held = soak.Watch(), []
     for steps in range(8):

@@ -44,6 +44,7 @@ def test_teams_of_different_sizes_learn_together(tmp_path):
     assert np.isfinite(list(values.values())).all()
 
 
+@pytest.mark.slow
 def test_rigs_resume_bit_for_bit(tmp_path):
     whole = make_trainer(tmp_path, **TWO)
     for _ in range(4):

@@ -113,7 +113,9 @@ def test_a_full_action_is_as_large_as_the_cables():
     )
 
 
-@pytest.mark.parametrize("task", ["track", "gate", "loss", "takeoff", "pose"])
+@pytest.mark.parametrize(
+    "task", ["loss", *(pytest.param(name, marks=pytest.mark.slow) for name in ("track", "gate", "takeoff", "pose"))]
+)
 def test_every_task_has_them(task):
     vec = make(task, num_envs=2, num_drones=4, **CABLE)
     observation, _ = vec.reset(seed=0)

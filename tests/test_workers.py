@@ -52,7 +52,7 @@ def assert_equal(one, other):
     assert [key for key in one if not torch.equal(one[key], other[key])] == []
 
 
-@pytest.mark.parametrize("overrides", [{}, GRU], ids=["mlp", "gru"])
+@pytest.mark.parametrize("overrides", [{}, pytest.param(GRU, marks=pytest.mark.slow)], ids=["mlp", "gru"])
 def test_one_worker_learns_what_one_process_does(tmp_path, local_ray, overrides):
     alone, one = (learn(make_trainer(tmp_path, **overrides, **{"train.workers": k})) for k in (0, 1))
     assert_equal(alone, one)
@@ -85,7 +85,8 @@ def test_noise_is_of_environment_and_iteration_alone():
     assert np.abs(np.corrcoef(many.transpose(1, 0, 2, 3).reshape(64, -1)) - np.eye(64)).max() < 0.2
 
 
-@pytest.mark.parametrize(("before", "after"), [pytest.param(2, 0, marks=pytest.mark.slow), (0, 2)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("before", "after"), [(2, 0), (0, 2)])
 def test_a_run_goes_on_with_other_workers(tmp_path, local_ray, before, after):
     trainer = make_trainer(tmp_path, **{"train.workers": before})
     for _ in range(2):
