@@ -176,19 +176,19 @@ def test_pose_pays_every_positive_weight_in_full_at_rest_at_the_goal():
     assert paid == pytest.approx({name: max(term.weight, 0.0) for name, term in vec.task.REWARD.items()})
 
 
-def test_closeness_grows_from_the_margin_on_to_one_where_teams_fail():
-    vec = make("pose", num_envs=64, **{"reward.closeness": {"weight": -2.0, "margin": 0.6}})
+def test_closeness_grows_from_its_margins_on_to_one_where_teams_fail():
+    vec = make("pose", num_envs=64, **{"reward.closeness": {"weight": -2.0, "margin": [0.6, 0.9]}})
     limit = vec.task.limits.separation
     vec.reset(seed=0)
     seen = 0.0
     for step in range(150):
         *_, terminated, truncated, info = vec.step(bold_actions(vec, step, hold=20))
         drones, height = vec.world.state.drone_position, vec.world.state.payload_position[:, None, 2]
-        expected = (np.maximum(0, 1 - (drones[..., 2] - height) / 0.6) ** 2).sum(axis=1)
+        expected = (np.maximum(0, 1 - (drones[..., 2] - height) / 0.9) ** 2).sum(axis=1)
         for n in range(vec.num_drones):
             for m in range(n):
-                apart = np.linalg.norm(drones[:, n] - drones[:, m], axis=1) - limit[n, m]
-                expected += np.maximum(0, 1 - apart / 0.6) ** 2
+                gap = np.linalg.norm(drones[:, n] - drones[:, m], axis=1) - limit[n, m]
+                expected += np.maximum(0, 1 - gap / 0.6) ** 2
         np.testing.assert_allclose(info["reward_terms"]["closeness"], -2.0 * expected, atol=1e-12)
         seen = max(seen, expected.max())
         if (over := terminated | truncated).any():

@@ -152,7 +152,7 @@ class Pose(Task):
         "attitude": Term(0.2, attitude, 20.0, "deg"),
         "alignment": Term(0.15, attitude, 2.0, "deg"),
         "stillness": Term(0.1, stillness, (0.2, 0.3), "m/s, rad/s"),
-        "closeness": Term(0.0, closeness, 0.5, "m"),
+        "closeness": Term(0.0, closeness, (0.5, 0.15), "m"),
         "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }

@@ -21,7 +21,7 @@ class Term(NamedTuple):
     value: Callable[..., Any]
     """Inlined kernel of (environment, View, *margins) that returns a number."""
     margin: float | tuple[float, ...] = ()
-    """Errors at which the term is half its value; `reward.<name>.margin` overrides them."""
+    """Errors at which a tolerance is half its value; `reward.<name>.margin` overrides them."""
     unit: str = ""
     """Of the margins; with "deg" the function gets radians."""
 
@@ -134,18 +134,18 @@ def steadiness(e, v, speed, rate):
 
 
 @inlined
-def closeness(e, v, margin):
-    """Drones near each other, or hardly above the payload: each 0 at `margin` from what fails, 1 there."""
+def closeness(e, v, apart, above):
+    """Drones near each other, or hardly above the payload: each 0 at its margin from what fails, 1 there."""
     total = 0.0
     for n in range(v.state.drone_position.shape[1]):
         if v.mask.lost[e, n]:
             continue
         drone = vec(v.state.drone_position, e, n)
-        total += max(0.0, 1.0 - (drone[2] - v.state.payload_position[e, 2]) / margin) ** 2
+        total += max(0.0, 1.0 - (drone[2] - v.state.payload_position[e, 2]) / above) ** 2
         for m in range(n):
             if not v.mask.lost[e, m]:
-                apart = norm(sub(drone, vec(v.state.drone_position, e, m))) - v.limits.separation[n, m]
-                total += max(0.0, 1.0 - apart / margin) ** 2
+                gap = norm(sub(drone, vec(v.state.drone_position, e, m))) - v.limits.separation[n, m]
+                total += max(0.0, 1.0 - gap / apart) ** 2
     return total
 
 
