@@ -26,6 +26,7 @@ from multilift_marl.tasks.rewards import (
     closeness,
     distance,
     failure,
+    spin,
     stillness,
 )
 from multilift_marl.tasks.starts import hang_team
@@ -152,7 +153,8 @@ class Pose(Task):
         "attitude": Term(0.2, attitude, 20.0, "deg"),
         "alignment": Term(0.15, attitude, 2.0, "deg"),
         "stillness": Term(0.1, stillness, (0.2, 0.3), "m/s, rad/s"),
-        "closeness": Term(0.0, closeness, (0.5, 0.15), "m"),
+        "closeness": Term(0.0, closeness, (0.5, 0.3), "m"),
+        "spin": Term(0.0, spin, 2.0, "rad/s"),
         "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }

@@ -128,6 +128,12 @@ def body_rate(e, v, margin):
 
 
 @inlined
+def spin(e, v, limit):
+    """Payload turning faster than the margin: the square of the excess over it, in margins."""
+    return max(0.0, norm(row(v.state.payload_body_rates, e)) / limit - 1.0) ** 2
+
+
+@inlined
 def steadiness(e, v, speed, rate):
     """Payload as fast as its target, and turning slowly."""
     return velocity(e, v, speed) * body_rate(e, v, rate)
