@@ -196,6 +196,16 @@ def test_closeness_grows_from_its_margins_on_to_one_where_teams_fail():
     assert seen > 0.5
 
 
+@pytest.mark.parametrize(("rates", "excess"), [((0.0, 0.0, 2.0), 0.0), ((0.0, 4.0, 0.0), 1.0), ((3.0, 0.0, 4.0), 1.5)])
+def test_spin_is_the_square_of_the_rate_beyond_its_margin(rates, excess):
+    vec = make("pose", num_envs=1, **{"reward.spin": {"weight": -3.0, "margin": 2.0}})
+    vec.reset(seed=0)
+    vec.world.state.payload_body_rates[:] = rates
+    vec.task.stages["reward"](0, 1)
+    paid = dict(zip(vec.reward_terms, vec.task.terms[0], strict=True))
+    assert paid["spin"] == pytest.approx(-3.0 * excess**2)
+
+
 @pytest.mark.slow
 def test_returns_rank_motors_off_holding_the_start_and_the_scripts():
     def score(script="formation", off=False, **options):
