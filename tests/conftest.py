@@ -8,6 +8,7 @@ marked `slow`; tests so marked are left out unless asked for by `-m slow`.
 from __future__ import annotations
 
 import importlib.util
+import os
 import signal
 import sys
 from dataclasses import replace
@@ -19,7 +20,8 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
-from multilift_marl import plugins, tasks
+from multilift_marl import _precompile, plugins, tasks
+from multilift_marl._platform import cpu_count
 from multilift_marl.config.load import CONFIGS
 from multilift_marl.control.formation import place_formation
 from multilift_marl.control.gains import DroneGains, Gains
@@ -35,6 +37,10 @@ from multilift_marl.validation.cables import hover_thrust  # noqa: F401 (for the
 collect_ignore = ["test_model_cards.py", "test_results.py"]  # of recorded results, which an sdist does not hold
 if (Path(__file__).parents[1] / "results").is_dir():
     collect_ignore = []
+
+# Where as many processes test as there are CPUs, none is left for processes that compile beside them.
+if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) >= cpu_count():
+    _precompile.be_helper()
 
 # A run in the background, or below nohup, begins with these ignored, as do its children; tests send them.
 for _number, _handler in (

@@ -13,7 +13,7 @@ import pytest
 from conftest import make, zeros
 
 import multilift_marl as ml
-from multilift_marl import _compile_helper, _compiler, _precompile
+from multilift_marl import _compile_helper, _compiler, _kernel_cache, _precompile
 from multilift_marl._jit import bind, kernel, kernel_name
 from multilift_marl.config.load import load_config
 
@@ -126,37 +126,45 @@ def test_a_helper_knows_all_kernels_of_an_environment(task):
     assert not missing and not inner
 
 
-@kernel
-def _doubled(x):
-    return 2.0 * x
+@pytest.fixture
+def shifted_doubled(monkeypatch):
+    """Two kernels, compiled anew by each test: one that is read from a file has not been merged here."""
+    monkeypatch.setattr(_kernel_cache, "cache_folder", lambda module: None)
+
+    @kernel
+    def doubled(x):
+        return 2.0 * x
+
+    @kernel
+    def shifted(values, by):
+        values[0] = doubled(values[0]) + by
+
+    return shifted, doubled
 
 
-@kernel
-def _shifted(values, by):
-    values[0] = _doubled(values[0]) + by
-
-
-def test_a_kernel_that_others_merge_can_be_called_by_python_too():
+def test_a_kernel_that_others_merge_can_be_called_by_python_too(shifted_doubled):
+    shifted, doubled = shifted_doubled
     values = np.array([3.0])
-    bind(_shifted, values, 1.0)()
+    bind(shifted, values, 1.0)()
     assert values[0] == 7.0
-    types = _doubled.signatures[0]
-    assert isinstance(_doubled.overloads[types].entry_point, _compiler._Inner)
-    assert _doubled(5.0) == 10.0
-    assert not isinstance(_doubled.overloads[types].entry_point, _compiler._Inner)
+    types = doubled.signatures[0]
+    assert isinstance(doubled.overloads[types].entry_point, _compiler._Inner)
+    assert doubled(5.0) == 10.0
+    assert not isinstance(doubled.overloads[types].entry_point, _compiler._Inner)
 
 
-def test_recorded_calls_are_those_that_would_be_compiled():
+def test_recorded_calls_are_those_that_would_be_compiled(shifted_doubled):
+    shifted, doubled = shifted_doubled
     values = np.array([3.0])
     with _compiler.recorded() as calls:
-        call = bind(_shifted, values, 1.0)
+        call = bind(shifted, values, 1.0)
         call()
-        assert _doubled(1.0) == 2.0
+        assert doubled(1.0) == 2.0
     assert values[0] == 7.0  # ran as Python
-    assert [each.__name__ for each, _ in calls] == ["_shifted", "_doubled"]
-    assert kernel_name(call) == " shifted"
-    compiled = bind(_shifted, values, 1.0)
-    assert calls[0][1] in _shifted.overloads
+    assert [each.__name__ for each, _ in calls] == ["shifted", "doubled"]
+    assert kernel_name(call) == "shifted"
+    compiled = bind(shifted, values, 1.0)
+    assert calls[0][1] in shifted.overloads
     compiled()
     assert values[0] == 15.0
 
