@@ -13,13 +13,13 @@ from typing import Any
 
 from multilift_marl._compiler import recorded
 from multilift_marl._platform import handles_signals
-from multilift_marl._precompile import BEGIN, END, TOTAL, be_helper
+from multilift_marl._precompile import BEGIN, END, TOTAL, disable_helper
 from multilift_marl.envs.core import MultiliftVec
 
 
 def run() -> None:
     """Compile what the process that started this one asks for, and end with it."""
-    be_helper()
+    disable_helper()
     if handles_signals():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other process; this one ends with it
     parent, _, request = sys.stdin.readline().partition(" ")

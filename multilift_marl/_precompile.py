@@ -116,7 +116,7 @@ class _Progress:
 
 _helper: Helper | None = None
 _offer: Any = None  # configuration of the environments that are being built
-_helps = False  # whether this process is the helper
+_disabled = False  # whether this process starts no helper
 _progress = _Progress()
 
 
@@ -146,10 +146,10 @@ def end() -> None:
     _progress.end()
 
 
-def be_helper() -> None:
-    """State that this process is the helper, which starts none."""
-    global _helps
-    _helps = True
+def disable_helper() -> None:
+    """Start no helper from this process, as in the helper itself."""
+    global _disabled
+    _disabled = True
 
 
 def _start_helper() -> None:
@@ -157,7 +157,7 @@ def _start_helper() -> None:
     global _helper
     config, running = _offer, _helper is not None and _helper.process.poll() is None
     offer(None)
-    several = _helps or multiprocessing.parent_process() is not None
+    several = _disabled or multiprocessing.parent_process() is not None
     if running or several or cpu_count() < 2 or not sys.executable or getattr(sys, "frozen", False):
         return
     with contextlib.suppress(Exception):  # no memory, no processes; a configuration with what cannot be pickled

@@ -40,7 +40,7 @@ if (Path(__file__).parents[1] / "results").is_dir():
 
 # Where as many processes test as there are CPUs, none is left for processes that compile beside them.
 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) >= cpu_count():
-    _precompile.be_helper()
+    _precompile.disable_helper()
 
 # A run in the background, or below nohup, begins with these ignored, as do its children; tests send them.
 for _number, _handler in (
