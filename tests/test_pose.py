@@ -176,6 +176,18 @@ def test_pose_pays_every_positive_weight_in_full_at_rest_at_the_goal():
     assert paid == pytest.approx({name: max(term.weight, 0.0) for name, term in vec.task.REWARD.items()})
 
 
+def test_formation_pays_the_mean_of_what_drones_off_their_slots_get():
+    vec = make("pose", num_envs=16, **{"reward.formation": {"weight": 2.0, "margin": 0.4}})
+    vec.reset(seed=0)
+    for step in range(50):
+        *_, terminated, truncated, info = vec.step(bold_actions(vec, step, hold=20))
+        off = np.linalg.norm(vec.world.state.drone_position - vec.task.goal.slots, axis=2)
+        expected = (2.0 / (1.0 + (off / 0.4) ** 2)).mean(axis=1)
+        np.testing.assert_allclose(info["reward_terms"]["formation"], expected, atol=1e-12)
+        if (over := terminated | truncated).any():
+            vec.reset(mask=over)
+
+
 def test_closeness_grows_from_its_margins_on_to_one_where_teams_fail():
     vec = make("pose", num_envs=64, **{"reward.closeness": {"weight": -2.0, "margin": [0.6, 0.9]}})
     limit = vec.task.limits.separation

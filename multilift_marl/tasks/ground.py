@@ -9,7 +9,7 @@ import numpy as np
 
 from multilift_marl._jit import inlined, kernel
 from multilift_marl.errors import ConfigError
-from multilift_marl.math3d import add, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
+from multilift_marl.math3d import add, matrow, mul, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.rig.resolve import MIN_SEPARATION
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicles import GRAVITY
@@ -138,15 +138,6 @@ def scale_cable_force(e, n, v, fraction, cable_weight):
 
 
 @inlined
-def slot_tolerance(e, v, margin):
-    """Return how well the drones of environment e keep their slots: the mean `tolerance` of their distances."""
-    total, count = 0.0, v.goal.slots.shape[1]
-    for n in range(count):
-        total += tolerance(norm(sub(vec(v.state.drone_position, e, n), vec(v.goal.slots, e, n))), margin)
-    return total / count
-
-
-@inlined
 def carried(e, v):
     """Return by how much the payload's pose counts: as its weight is carried, and little if it lies elsewhere."""
     return v.own.pull_fraction[e] * tolerance(v.errors.distance[e], FAR)
@@ -173,7 +164,7 @@ def steadiness(e, v, speed, rate):
 @inlined
 def readiness(e, v, margin):
     """Drones in their slots, while the payload is not carried."""
-    return (1.0 - v.own.pull_fraction[e]) * slot_tolerance(e, v, margin)
+    return (1.0 - v.own.pull_fraction[e]) * rewards.formation(e, v, margin)
 
 
 @inlined

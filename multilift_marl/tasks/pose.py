@@ -26,6 +26,7 @@ from multilift_marl.tasks.rewards import (
     closeness,
     distance,
     failure,
+    formation,
     spin,
     stillness,
 )
@@ -153,6 +154,7 @@ class Pose(Task):
         "attitude": Term(0.2, attitude, 20.0, "deg"),
         "alignment": Term(0.15, attitude, 2.0, "deg"),
         "stillness": Term(0.1, stillness, (0.2, 0.3), "m/s, rad/s"),
+        "formation": Term(0.0, formation, 0.3, "m"),
         "closeness": Term(0.0, closeness, (0.5, 0.3), "m"),
         "spin": Term(0.0, spin, 2.0, "rad/s"),
         "failure": Term(0.0, failure),

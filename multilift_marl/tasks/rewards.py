@@ -156,6 +156,17 @@ def closeness(e, v, apart, above):
 
 
 @inlined
+def formation(e, v, margin):
+    """Drones close to their slots, the mean over those that are left."""
+    total, count = 0.0, 0
+    for n in range(v.state.drone_position.shape[1]):
+        if not v.mask.lost[e, n]:
+            off = norm(sub(vec(v.state.drone_position, e, n), vec(v.goal.slots, e, n)))
+            total, count = total + tolerance(off, margin), count + 1
+    return total / max(count, 1)
+
+
+@inlined
 def action_rate(e, v):
     """Mean square of how the action differs from the last one."""
     change, count = 0.0, v.action.shape[1] * v.action.shape[2]
