@@ -21,7 +21,8 @@ PARTS = {
     "wind": WIND,
     "wind, turbulence": WIND | {"wind.turbulence": True},
     "gust": {"wind.gust": [2.0, 0.0, 0.0]},
-    "wash": {"wind.wash": True},
+    "wash": {"wind.wash": True, "wind.inflow": False},
+    "inflow": {"wind.inflow": True},
     "ground effect": {"wind.ground_effect": True},
     "moments": {"wind.roll_moment": 0.01, "vehicle.rolling_moment": 1e-6},
 }

@@ -70,7 +70,7 @@ class Flight:
     def reject(self) -> None:
         """Update the estimates."""
         known = self.world.state, self.reference, self.cable_force
-        REJECTIONS[self.kind](0, self.world.num_envs, *known, self.disturbance, self.gains, self.rejection)
+        REJECTIONS[self.kind](0, self.world.num_envs, *known, self.disturbance, self.rejection)
 
     def step(self) -> None:
         """Simulate one control step."""

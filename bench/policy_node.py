@@ -16,12 +16,12 @@ import numpy as np
 
 from multilift_marl.agents.policy import find_policy
 from multilift_marl.config.load import build_config, load_config, parse_overrides
+from multilift_marl.deploy.ros.dds import Node
+from multilift_marl.deploy.ros.live import LiveFlight
+from multilift_marl.deploy.ros.messages import NAMES, setpoint_topics
+from multilift_marl.deploy.ros.types import px4_namespace, stamp_ns
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.realtime import QUANTILES, RealTime
-from multilift_marl.ros.dds import Node
-from multilift_marl.ros.live import LiveFlight
-from multilift_marl.ros.messages import NAMES, setpoint_topics
-from multilift_marl.ros.types import px4_namespace, stamp_ns
 
 DOMAIN = 91
 

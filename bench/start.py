@@ -4,7 +4,7 @@
 
 Each start is a fresh process: import, `make_vec`, `reset` and a step. A first start has an empty folder of its own as
 `NUMBA_CACHE_DIR`; the later one finds the kernels there. Stated are medians, the least and the largest, and the
-CPU time of all processes of a start, which depends less on what else runs on the machine. With `install=true` each
+CPU time of a start, which depends less on what else runs on the machine. With `install=true` each
 repeat begins with a new virtual environment: pip installs the package from this clone, its dependencies from pip's
 cache or the network, then the first step is made; `install=train` installs the extra for training, too.
 """
@@ -38,15 +38,12 @@ import os, time
 begin = time.perf_counter()
 {code}
 print(time.perf_counter() - begin)
-from multilift_marl import _precompile
-if _precompile._helper is not None:
-    _precompile._helper.process.wait()  # else its CPU time would not count
 print(sum(os.times()[:4]))
 """
 
 
 def start(code: str, folder: str, python: str = sys.executable) -> tuple[float, float]:
-    """Return how long a fresh process took to its last step [s], and the CPU time of it and its helper [s]."""
+    """Return how long a fresh process took to its last step [s], and its CPU time [s]."""
     package = str(Path(ml.__file__).parents[1])
     environment = os.environ | {"NUMBA_CACHE_DIR": folder}
     if python == sys.executable:

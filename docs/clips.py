@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 import multilift_marl as ml
-from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.policies.baselines import SCRIPTED, make_scripted
 from multilift_marl.rendering import Renderer
 
 COLOURS = 128  # of a palette that all frames share, so that what stands still takes no space
@@ -21,7 +21,7 @@ TRAIL = 1.0  # [s]
 
 
 class Clip(NamedTuple):
-    """What a clip shows; the policy is a shipped one or a script."""
+    """What a clip shows; the policy is a shipped one or a baseline."""
 
     config: str
     policy: str

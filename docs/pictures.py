@@ -12,7 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 
 import multilift_marl as ml
-from multilift_marl.control.scripted import SCRIPTED, make_scripted
+from multilift_marl.policies.baselines import SCRIPTED, make_scripted
 from multilift_marl.rendering import Renderer
 
 WIDTH, HEIGHT, GAP = 480, 360, 6  # [pixels]

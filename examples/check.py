@@ -76,7 +76,7 @@ def run(command: list[str | Path], folder: Path) -> str:
 
 
 def check(name: str, parent: str | None) -> bool:
-    """Install and try out one example in a temporary folder in `parent`; print its line of the table."""
+    """Install and try out one example in a temporary folder in `parent`; print its line of checked.csv."""
     with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=parent) as folder:
         start = time.perf_counter()
         try:
@@ -84,11 +84,11 @@ def check(name: str, parent: str | None) -> bool:
             installed = time.perf_counter()
             result = try_out(python, name, Path(folder))
         except RuntimeError as error:
-            print(f"| {name} | failed | | | |\n{error}", flush=True)
+            print(f"{name},failed,,,,\n{error}", flush=True)
             return False
-        seconds = f"{installed - start:.0f} | {time.perf_counter() - installed:.0f}"
+        seconds = f"{installed - start:.0f},{time.perf_counter() - installed:.0f}"
     versions = ", ".join(f"{package} {version}" for package, version in result["versions"].items())
-    print(f"| {name} | {result['weights']:,} moved by {result['moved']:.2f} | {seconds} | {versions} |", flush=True)
+    print(f'{name},{result["weights"]},{result["moved"]:.2f},{seconds},"{versions}"', flush=True)
     return True
 
 
@@ -100,7 +100,7 @@ def main(arguments: list[str]) -> int:
         if name not in NAMES:
             print(f"error: no example '{name}'; known: {', '.join(NAMES)}", file=sys.stderr)
             return 2
-    print("| example | weights | installing [s] | training [s] | versions |\n|---|---|---|---|---|", flush=True)
+    print("example,weights,norm_of_change,installing_s,training_s,versions", flush=True)
     return 0 if all([check(name, parent) for name in names]) else 1
 
 

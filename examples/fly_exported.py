@@ -17,7 +17,7 @@ import onnxruntime
 
 from multilift_marl.config.load import build_config
 from multilift_marl.evaluation.metrics import summarize
-from multilift_marl.evaluation.rollout import fly_episodes
+from multilift_marl.evaluation.rollout import run_episodes
 
 
 class Team:
@@ -72,7 +72,7 @@ def main(folder, episodes=20):
         check(team.contract, vec)
         return team
 
-    metrics = summarize(fly_episodes(config, make_policy, int(episodes), seed=1000))
+    metrics = summarize(run_episodes(config, make_policy, int(episodes), seed=1000))
     success = metrics["success_rate"]["mean"]
     error = metrics["payload_position_error_m"]["mean"]
     print(f"{team.contract['task']}: {episodes} episodes, success {success:.0%}, position error {100 * error:.2f} cm")

@@ -7,11 +7,11 @@ Run: python examples/new_task.py, or python train.py import=examples/new_task.py
 from pydantic import Field
 
 import multilift_marl as ml
-from multilift_marl.config.values import Float
-from multilift_marl.control.scripted import make_scripted
+from multilift_marl.mdp.initial_states import StartOptions, make_ranges, start_near_target
+from multilift_marl.mdp.rewards import Term, action_rate, distance, stillness
+from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.schema.values import Float
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.rewards import Term, action_rate, distance, stillness
-from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
 
 
 class LiftOptions(StartOptions):
@@ -37,7 +37,7 @@ class Lift(Task):
 
     def start(self, env, rng, mass):
         """Hang the team near a target, then put the target higher."""
-        start_near_target(env, rng, self.view_for(start_near_target), make_ranges(self.options), self.hanging)
+        start_near_target(env, rng, self.view_for(start_near_target), make_ranges(self.options), self.equilibrium)
         self.place_goal(env, self.goal.position[env] + [0.0, 0.0, self.options.rise])
 
 

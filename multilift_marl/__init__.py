@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-from multilift_marl import _interrupt, sim  # noqa: F401 (_interrupt first: Ctrl-C may come while the rest is imported)
+from multilift_marl import _interrupt, _renamed, sim  # noqa: F401 (_interrupt first: Ctrl-C may come while the rest is imported)
 from multilift_marl.config.load import load_config, register_config
 from multilift_marl.envs.core import make_vec
 from multilift_marl.envs.gymnasium_env import register as _register_with_gymnasium
@@ -54,5 +54,6 @@ __all__ = [
     "torchrl_env",
 ]
 
+_renamed.install()
 _register_with_gymnasium()
 _register_with_pettingzoo()

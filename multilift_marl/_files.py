@@ -1,8 +1,9 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, and folders for them."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +22,7 @@ def write_whole(path: Path, content: bytes | memoryview, flush: bool = True) -> 
     Raises:
         OSError: it cannot be written.
     """
+    # In the same folder: a rename replaces a file at once within one file system only.
     aside = path.with_name(f"{path.stem}-{os.getpid()}-{threading.get_ident()}.tmp")  # no other writer's
     try:
         with open(aside, "wb") as file:
@@ -33,3 +35,15 @@ def write_whole(path: Path, content: bytes | memoryview, flush: bool = True) -> 
         with suppress(OSError):
             aside.unlink(missing_ok=True)
         raise
+
+
+def check_writable(folder: Path) -> None:
+    """Find out, before long work, whether a folder can be written to, or made where there is none; make nothing.
+
+    Raises:
+        OSError, ValueError: it cannot.
+    """
+    place = folder.absolute()
+    while not os.path.lexists(place) and place != place.parent:
+        place = place.parent
+    tempfile.TemporaryFile(dir=place).close()

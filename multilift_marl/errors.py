@@ -11,13 +11,36 @@ _ELSEWHERE = {
     "steps": "frames", "timesteps": "frames", "total_timesteps": "frames", "num_steps": "frames", "lr": "learning_rate",
     "max_steps": "episode_seconds", "episode_steps": "episode_seconds", "agents": "num_drones",
     "num_agents": "num_drones", "n_agents": "num_drones", "std": "initial_std", "hidden_sizes": "hidden",
-    "rollout_length": "horizon",
+    "rollout_length": "horizon", "n_drones": "num_drones", "num_quadrotors": "num_drones", "nr_drones": "num_drones",
+    "max_cycles": "episode_seconds", "max_episode_steps": "episode_seconds", "episode_len_sec": "episode_seconds",
+    "max_episode_length": "episode_seconds", "max_duration_seconds": "episode_seconds", "time_limit": "episode_seconds",
+    "episode_length": "episode_seconds", "agent_hz": "policy_hz", "ctrl_freq": "policy_hz", "control_freq": "policy_hz",
+    "decimation": "policy_hz", "frame_skip": "policy_hz", "pyb_freq": "timestep", "physics_hz": "timestep",
+    "sim_freq": "timestep", "dt": "timestep", "time_step": "timestep", "drone_model": "preset", "drone_type": "preset",
+    "n_envs": "num_envs", "n_worlds": "num_envs", "num_worlds": "num_envs", "num_environments": "num_envs",
+    "flight_mode": "action", "action_type": "action", "act": "action", "frame_stack": "history",
+    "n_steps": "horizon", "n_epochs": "epochs", "clip_range": "clip", "clip_coef": "clip", "ent_coef": "entropy",
+    "vf_coef": "value_weight", "anneal_lr": "final_learning_rate", "total_frames": "frames",
 }  # fmt: skip
 """What other libraries call a key, and what it is called here."""
 
 
 class ConfigError(ValueError):
     """A configuration, an override or a physical system that cannot be."""
+
+
+class RigError(ConfigError):
+    """A rig that cannot be because of some of its parts.
+
+    Args:
+        message: one sentence.
+        drones, anchors: numbers of the parts that conflict.
+    """
+
+    def __init__(self, message: str, drones: Iterable[int] = (), anchors: Iterable[int] = ()):
+        super().__init__(message)
+        self.drones = tuple(int(i) for i in drones)
+        self.anchors = tuple(int(i) for i in anchors)
 
 
 class UnknownKeywordError(ConfigError, TypeError):
@@ -34,6 +57,11 @@ class RenderingError(RuntimeError):
 
 class FlightError(RuntimeError):
     """Flight software that does not start, answer or do as it is told."""
+
+
+def called_elsewhere(name: str) -> str | None:
+    """Return what a key of another library is called here; None if it is none that is known."""
+    return _ELSEWHERE.get(name)
 
 
 def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str, otherwise: str = "") -> str:
@@ -69,8 +97,8 @@ def warn_once(part: str, message: str) -> None:
 
 
 def pip_install(extra: str) -> str:
-    """Return the command that installs an extra of this package, from an index or in a clone."""
-    return f'pip install "multilift_marl[{extra}]" (in a clone: pip install -e ".[{extra}]")'
+    """Return how to install an extra of this package, which is on no package index."""
+    return f'pip install -e ".[{extra}]" in a clone of its repository'
 
 
 def reason(error: BaseException) -> str:

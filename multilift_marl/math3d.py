@@ -10,7 +10,7 @@ from math import atan2, cos, sin, sqrt
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -193,6 +193,7 @@ def quat_to_mat(w, x, y, z):
 @kernel
 def mat_to_quat(m):
     """Return the unit quaternion (w, x, y, z) of a rotation matrix (Shepperd 1978)."""
+    # The largest of w, x, y, z first: the others follow by what cannot be near 0.
     trace = m[0] + m[4] + m[8]
     if trace >= m[0] and trace >= m[4] and trace >= m[8]:
         w = 1.0 + trace
@@ -229,6 +230,7 @@ def turn_by(rotation, m):
 def rotation_vector(m):
     """Return axis times angle of M, angle in [0, π]."""
     w, x, y, z = mat_to_quat(m)
+    # q and -q are one rotation; of the two, that by at most half a turn.
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     s = sqrt(x * x + y * y + z * z)
@@ -249,6 +251,7 @@ def thrust_frame(force, yaw):
     Where the force points along the heading, eq 29 has no answer; the body y axis then stays horizontal.
     """
     b3 = unit(force)
+    # b2 across thrust and heading, b1 = b2 × b3: the heading bends, the thrust's direction does not.
     side = cross(b3, (cos(yaw), sin(yaw), 0.0))
     if norm(side) < 1e-6:
         side = (-sin(yaw), cos(yaw), 0.0)
@@ -263,6 +266,7 @@ def segment_distance(p1, q1, p2, q2):
     a, e, f = dot(d1, d1), dot(d2, d2), dot(d2, r)
     b, c = dot(d1, d2), dot(d1, r)
     denominator = a * e - b * b
+    # Parallel segments have no nearest pair of their own: any point of the first will do.
     s = clip((b * f - c * e) / denominator, 0.0, 1.0) if denominator > 1e-12 * a * e else 0.0
     t = (b * s + f) / e
     if t < 0.0:
@@ -279,6 +283,7 @@ def ease(t, begin, seconds):
     The polynomial of degree seven whose first three derivatives are zero at both ends.
     """
     s = min(max((t - begin) / seconds, 0.0), 1.0)
+    # d/ds of the fraction is 140 u³; the rest follows by the chain rule.
     u = s * (1.0 - s)
     fraction = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
     second = 420.0 * u**2 * (1.0 - 2.0 * s) / seconds**2

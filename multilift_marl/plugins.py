@@ -18,7 +18,12 @@ from multilift_marl.errors import ConfigError, nearest
 
 _PACKAGE = str(Path(__file__).parent)
 GROUP = "multilift_marl.tasks"  # entry points of installed packages
+registers: list[Callable[[Any], object]] = []  # what takes the tasks of entry points, see `tasks/__init__.py`
 _imported: dict[str, ModuleType] = {}  # by the last part of their name
+named: set[str] = set()
+"""Modules, see `identify`, and clusters that the user has named or trusts; others that files name wait (`trust.py`)."""
+refused: dict[str, str] = {}
+"""Classes and clusters that only a file names, with the sentence that says so."""
 
 
 def import_module(reference: str, key: str = "import") -> tuple[ModuleType, str]:
@@ -38,10 +43,11 @@ def import_module(reference: str, key: str = "import") -> tuple[ModuleType, str]
     Raises:
         ConfigError: it is missing, fails, or has the name of another module.
     """
-    path, is_path = _find_file(reference), reference.endswith(".py") or "/" in reference
-    if path is None and is_path:
+    named.add(identify(reference))
+    path = find_file(reference)
+    if path is None and is_path(reference):
         return _stand_in(reference, key)
-    name = reference if path is None else _module_name(path)[1]
+    name = reference if path is None else module_name(path)[1]
     try:
         module = importlib.import_module(name) if path is None else _import_file(path)
     except (Exception, SystemExit) as error:  # a user's code may raise anything
@@ -52,7 +58,7 @@ def import_module(reference: str, key: str = "import") -> tuple[ModuleType, str]
                 "its .py file"
             ) from error
         raise ConfigError(f"{key}={reference} cannot be imported: {describe_error(error)}") from error
-    if path is not None and not _is_from(module, path):
+    if path is not None and not is_from(module, path):
         raise ConfigError(
             f"{key}={reference} has the name of another module, {getattr(module, '__file__', None) or name}; rename it"
         )
@@ -76,8 +82,10 @@ def find_callable(reference: str, key: str) -> Callable[..., Any]:
     """Return what module:name refers to, a class or a function; `key` is for messages.
 
     Raises:
-        ConfigError: see `import_module`; or the module holds no such class.
+        ConfigError: see `import_module`; the module holds no such class; or only a file names it, see `trust.review`.
     """
+    if key == "train.residual" and reference in refused:
+        raise ConfigError(refused[reference])
     place, _, name = reference.rpartition(":")
     if not place or not name:
         raise ConfigError(f"{key}={reference} is not of the form module:Class, such as my_policies:Hold")
@@ -119,10 +127,9 @@ def describe_error(error: BaseException) -> str:
 
 
 def _register(found: Any) -> None:
-    from multilift_marl.tasks import register_task  # which imports this module's users
-
     if not isinstance(found, ModuleType):
-        register_task(found)
+        for register in registers:
+            register(found)
 
 
 def _origin(point: EntryPoint) -> str:
@@ -130,20 +137,34 @@ def _origin(point: EntryPoint) -> str:
     return f"the task '{point.name}' of {package} ({point.value})"
 
 
-def _find_file(reference: str) -> Path | None:
+def identify(reference: str) -> str:
+    """Return what a module is known by, however it is spelled: its file, links followed, or its name."""
+    path = find_file(reference)
+    return reference if path is None else os.path.realpath(path)
+
+
+def is_path(reference: str) -> bool:
+    """Return whether a reference is a path rather than the name of a module."""
+    return reference.endswith(".py") or "/" in reference
+
+
+def find_file(reference: str) -> Path | None:
     """Return the file of a module in the current folder or by path; None if there is none."""
-    if reference.endswith(".py") or "/" in reference:
-        path = Path(os.path.abspath(Path(reference).expanduser()))
-        path = path / "__init__.py" if path.is_dir() else path
-        return path if path.is_file() else None
+    if is_path(reference):
+        try:
+            path = Path(os.path.abspath(os.path.expanduser(reference)))
+        except ValueError:  # of a user's name with a NUL
+            return None
+        path = path / "__init__.py" if os.path.isdir(path) else path
+        return path if os.path.isfile(path) else None
     base = Path.cwd().joinpath(*reference.split("."))
     for path in (base / "__init__.py", base.parent / f"{base.name}.py"):
-        if path.is_file() and _module_name(path)[1] == reference:
+        if os.path.isfile(path) and module_name(path)[1] == reference:
             return path
     return None
 
 
-def _module_name(path: Path) -> tuple[Path, str]:
+def module_name(path: Path) -> tuple[Path, str]:
     """Return the folder from which a file is imported, and the name of its module there."""
     folder, parts = path.parent, [] if path.stem == "__init__" else [path.stem]
     while (folder / "__init__.py").is_file():
@@ -153,7 +174,7 @@ def _module_name(path: Path) -> tuple[Path, str]:
 
 def _import_file(path: Path) -> ModuleType:
     """Import a file, whose folder goes first meanwhile, and last on Python's path from then on."""
-    folder, name = _module_name(path)
+    folder, name = module_name(path)
     importlib.invalidate_caches()  # the file may be new
     sys.path.insert(0, str(folder))
     try:
@@ -164,7 +185,8 @@ def _import_file(path: Path) -> ModuleType:
             sys.path.append(str(folder))
 
 
-def _is_from(module: ModuleType, path: Path) -> bool:
+def is_from(module: ModuleType, path: Path) -> bool:
+    """Return whether a module was imported from a file."""
     file = getattr(module, "__file__", None)
     return file is not None and os.path.exists(file) and os.path.samefile(file, path)
 

@@ -26,10 +26,10 @@ from matplotlib.figure import Figure
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
-from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.evaluation.plots import POLICY_COLOURS
-from multilift_marl.evaluation.rollout import Trace, fly_episodes, trace_episode
+from multilift_marl.evaluation.rollout import Trace, run_episodes, trace_episode
+from multilift_marl.policies.baselines import fitting_scripts, make_scripted
 
 HERE = Path(__file__).parent
 ROOT = Path(__file__).parents[1]
@@ -63,7 +63,7 @@ def fly(config: Config, episodes: int) -> dict[str, dict[str, float]]:
     """Return {team: {metric: mean}} over some episodes, and the largest distance of the first one [m]."""
     results = {}
     for team, make in make_teams(config).items():
-        measured = fly_episodes(config, make, episodes, SEED)
+        measured = run_episodes(config, make, episodes, SEED)
         means = {axis: float(measured[f"payload_rmse_{axis}"].mean()) for axis in AXES}
         largest = float(trace_episode(config, make, 0, SEED).distance.max())
         results[team] = means | {"distance_m": float(measured["payload_rmse_m"].mean()), "largest_m": largest}

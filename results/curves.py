@@ -1,6 +1,6 @@
-"""Draw what teams learn from nothing: return and error of the evaluations during training, beside those of scripts.
+"""Draw learning curves without a base policy: evaluations during training, the band and the median of the seeds.
 
-python results/curves.py [docs/images/from_nothing.png]
+python results/curves.py [folder]      quickstart.png and from_nothing.png, in docs/images unless a folder is given
 """
 
 from __future__ import annotations
@@ -9,44 +9,83 @@ import csv
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
+import numpy as np
 from flights import HERE, ROOT
+from matplotlib.axes import Axes
+from tables import title
 
-RECIPES = {
-    "hover_acc_rates": "accelerations and tilt rates", "hover_ctbr": "thrust and body rates",
-    "hover_ctbm": "thrust and moments", "hover_rotor": "rotor thrusts",
+BASELINES = {"formation_integral": "--", "payload_geometric": ":", "searched": "-."}
+
+
+class Panel(NamedTuple):
+    """One axis of a picture."""
+
+    column: str
+    """Of the curves."""
+    label: str
+    factor: float = 1.0
+    metric: str = ""
+    """Of the baselines, which are drawn if it is given."""
+    logarithmic: bool = False
+
+
+SUCCESS = Panel("eval/success_rate", "success [%]", 100.0)
+ERROR = Panel("eval/payload_position_error_m", "position error [cm]", 100.0, logarithmic=True)
+PICTURES = {  # file: recipes and their labels, panels
+    "quickstart": ({"quickstart": "hover by thrust and body rates"}, (SUCCESS, ERROR)),
+    "from_nothing": (
+        {
+            "hover_acc_rates": "accelerations and tilt rates", "hover_ctbr": "thrust and body rates",
+            "hover_ctbm": "thrust and moments", "hover_rotor": "rotor thrusts",
+        },
+        (Panel("eval/return", "return of an episode", metric="return"),
+         ERROR._replace(metric="payload_position_error_m")),
+    ),
 }  # fmt: skip
-SCRIPTS = {"formation_integral": "--", "payload_geometric": ":", "searched": "-."}
-PANELS = (  # column of the curves, metric of the scripts, factor, label
-    ("eval/return", "return", 1.0, "return of an episode"),
-    ("eval/payload_position_error_m", "payload_position_error_m", 100.0, "position error [cm]"),
-)
 
 
-def draw(path: Path) -> None:
-    """Write the picture."""
-    figure, axes = plt.subplots(1, len(PANELS), figsize=(10, 3.6), layout="constrained")
-    for panel, (column, metric, factor, label) in zip(axes, PANELS, strict=True):
-        for colour, (recipe, title) in enumerate(RECIPES.items()):
-            for seed, curve in enumerate(sorted((HERE / recipe).glob("seed*/curve.csv"))):
-                rows = list(csv.DictReader(curve.open(encoding="utf-8")))
-                frames = [float(row["frames"]) / 1e6 for row in rows]
-                values = [factor * float(row[column]) for row in rows]
-                panel.plot(frames, values, f"C{colour}", lw=1.2, label=None if seed else title)
-        for script, style in SCRIPTS.items():
-            file = HERE / "hover_acc_rates" / f"{script}.json"
-            report: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-            level = factor * report["metrics"][metric]["mean"]
-            panel.axhline(level, color="0.4", ls=style, lw=1, label=f"script {script}")
-        panel.set_xlabel("environment steps [millions]")
-        panel.set_ylabel(label)
-        panel.grid(alpha=0.3)
-    axes[1].set_yscale("log")
-    axes[0].legend(fontsize="small", loc="lower right")
-    figure.savefig(path, dpi=110)
+def read_curves(recipe: str, column: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return steps (K,) in millions and the values (S, K) of each seed's evaluations."""
+    curves = []
+    for path in sorted((HERE / recipe).glob("seed*/curve.csv")):
+        with path.open(encoding="utf-8") as file:
+            found = [(float(row["frames"]) / 1e6, float(row[column])) for row in csv.DictReader(file) if row[column]]
+        curves.append(np.array(found))
+    return curves[0][:, 0], np.stack([curve[:, 1] for curve in curves])
+
+
+def draw_panel(axes: Axes, panel: Panel, recipes: dict[str, str]) -> None:
+    """Draw the recipes' curves, and the levels of the baselines."""
+    for colour, (recipe, label) in enumerate(recipes.items()):
+        steps, values = read_curves(recipe, panel.column)
+        values = panel.factor * values
+        axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=f"C{colour}", alpha=0.25, lw=0)
+        axes.plot(steps, np.median(values, axis=0), f"C{colour}", lw=1.8, label=label)
+    for baseline, style in BASELINES.items() if panel.metric else ():
+        file = HERE / "hover_acc_rates" / f"{baseline}.json"
+        report: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        level = panel.factor * report["metrics"][panel.metric]["mean"]
+        axes.axhline(level, color="0.4", ls=style, lw=1, label=title(baseline).strip("`"))
+    axes.set_xlabel("environment steps [millions]")
+    axes.set_ylabel(panel.label)
+    axes.grid(alpha=0.3)
+    if panel.logarithmic:
+        axes.set_yscale("log")
+
+
+def main(folder: Path) -> None:
+    """Write the pictures."""
+    for name, (recipes, panels) in PICTURES.items():
+        figure, all_axes = plt.subplots(1, len(panels), figsize=(10, 3.6), layout="constrained")
+        for axes, panel in zip(all_axes, panels, strict=True):
+            draw_panel(axes, panel, recipes)
+        if len(recipes) > 1:
+            all_axes[0].legend(fontsize="small", loc="lower right")
+        figure.savefig(folder / f"{name}.png", dpi=110)
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images" / "from_nothing.png")
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images")

@@ -1,4 +1,4 @@
-"""The flights on which teams are evaluated: rows of the tables, and the recipe whose policies are used."""
+"""The flights on which policies are evaluated: rows of the tables, and the recipe whose policies are used."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ FASTER = {"task_options.speed": 2.0, "task_options.acceleration": 2.0}
 AGILE = {"task_options.speed": 2.0, "task_options.acceleration": 4.0}
 FASTEST = {"task_options.speed": 5.0, "task_options.acceleration": 8.0}
 UNSEEN_RIG = {"env.num_drones": 5, "vehicle.preset": "falcon", "cable.length": 0.6, "payload.mass": 2.16}
-"""Of docs/learning.md, "Several rigs at once"."""
+"""A held-out rig of docs/learning.md."""
 
-ESTIMATED = "load without sensor"  # the largest difference from the published figures; docs/track.md, docs/recover.md
+ESTIMATED = "payload not measured"  # the largest difference from the published figures; docs/track.md, docs/recover.md
 AUTO = "41 cm: path of 2.8 m/s², start included; MPC, no motor lag, no drag"
 CRAZYMARL = "79.7 %: motor commands, no motor lag"
 
@@ -33,28 +33,28 @@ class Flight(NamedTuple):
     title: str
     published: str = ""
     scripts: tuple[str, ...] = ()
-    """That are evaluated; none: all that fit."""
+    """Baselines that are evaluated; none: all that fit."""
 
 
 FLIGHTS: dict[str, Flight] = {
     "hover": Flight("hover", {}, "hover", "hover"),
     "hover_acc_rates": Flight(
-        "hover_acc_rates", {}, "hover_acc_rates", "hover by accelerations and tilt rates, from nothing"
+        "hover_acc_rates", {}, "hover_acc_rates", "hover, acceleration and tilt-rate actions, no base policy"
     ),
-    "hover_ctbr": Flight("hover_ctbr", {}, "hover_ctbr", "hover by thrust and body rates, from nothing"),
-    "hover_ctbm": Flight("hover_ctbm", {}, "hover_ctbm", "hover by thrust and moments, from nothing"),
-    "hover_rotor": Flight("hover_rotor", {}, "hover_rotor", "hover by rotor thrusts, from nothing"),
-    "hover_wind": Flight("hover_wind", {}, "hover_wind", "hover in wind of 5 m/s, noise, delay"),
+    "hover_ctbr": Flight("hover_ctbr", {}, "hover_ctbr", "hover, thrust and body-rate actions, no base policy"),
+    "hover_ctbm": Flight("hover_ctbm", {}, "hover_ctbm", "hover, thrust and moment actions, no base policy"),
+    "hover_rotor": Flight("hover_rotor", {}, "hover_rotor", "hover, rotor-thrust actions, no base policy"),
+    "hover_wind": Flight("hover_wind", {}, "hover_wind", "hover, 5 m/s wind, noise, delay"),
     "hover_realistic": Flight("hover_realistic", {}, "hover_realistic", "hover, realistic"),
     "pose_easy": Flight("pose_easy", {}, "pose", "pose, tilts to 20°"),
     "pose": Flight("pose", {}, "pose", "pose, tilts to 45°"),
     "pose_falcon3": Flight("pose_falcon3", {}, "pose_falcon3", "pose, three drones, tilts to 45°"),
-    "pose_wind": Flight("pose_wind", {}, "pose_wind", "pose, tilts to 45°, in wind of 5 m/s, noise, delay"),
+    "pose_wind": Flight("pose_wind", {}, "pose_wind", "pose, tilts to 45°, 5 m/s wind, noise, delay"),
     "pose_tudelft": Flight(
         "pose_tudelft",
         {},
         "pose_tudelft",
-        "pose without a plan, tilts to 45°, TU Delft's protocol",
+        "pose, tilts to 45°, no planned trajectory (TU Delft's protocol)",
         scripts=("searched",),
     ),
     "circle_slow": Flight("track_circle", {}, "track_circle", "circle, 0.2 rad/s"),
@@ -66,10 +66,18 @@ FLIGHTS: dict[str, Flight] = {
         "track", FASTEST, "track", "figure-eight, 5 m/s, 8 m/s²", f"19.7 cm: 10 Hz planner, {ESTIMATED}"
     ),
     "track_rates_2_4": Flight(
-        "track_rates", AGILE, "track_rates", "figure-eight, 2 m/s, 4 m/s², tilt rates", scripts=("searched",)
+        "track_rates",
+        AGILE,
+        "track_rates",
+        "figure-eight, 2 m/s, 4 m/s², acceleration and tilt-rate actions",
+        scripts=("searched",),
     ),
     "track_rates_5_8": Flight(
-        "track_rates", FASTEST, "track_rates", "figure-eight, 5 m/s, 8 m/s², tilt rates", scripts=("searched",)
+        "track_rates",
+        FASTEST,
+        "track_rates",
+        "figure-eight, 5 m/s, 8 m/s², acceleration and tilt-rate actions",
+        scripts=("searched",),
     ),
     "track_realistic_2_4": Flight(
         "track_realistic", {}, "track_realistic", "figure-eight, 2 m/s, 4 m/s², realistic", scripts=FOLLOWING
@@ -88,7 +96,7 @@ FLIGHTS: dict[str, Flight] = {
         "track_generalist",
         UNSEEN_RIG,
         "track_generalist",
-        "figure-eight, 2 m/s, 2 m/s², one network for many rigs, on another one",
+        "figure-eight, 2 m/s, 2 m/s², one policy for twelve rigs, on a held-out rig",
         scripts=("formation_lead", "searched"),
     ),
     "takeoff": Flight("takeoff", {}, "takeoff", "takeoff"),
@@ -98,10 +106,14 @@ FLIGHTS: dict[str, Flight] = {
         "gate_realistic", {}, "gate_realistic", "gate, realistic", scripts=("formation_narrow", "searched")
     ),
     "gate_two": Flight(
-        "gate_two", {}, "gate_two", "two gates, 0.8 to 1.2 m wide", scripts=("formation_narrow", "searched")
+        "gate_two", {}, "gate_two", "gate, two walls, gaps of 0.8 to 1.2 m", scripts=("formation_narrow", "searched")
     ),
     "gate_three": Flight(
-        "gate_three", {}, "gate_three", "three gates, 0.8 to 1.2 m wide", scripts=("formation_narrow", "searched")
+        "gate_three",
+        {},
+        "gate_three",
+        "gate, three walls, gaps of 0.8 to 1.2 m",
+        scripts=("formation_narrow", "searched"),
     ),
     "recover": Flight("recover", {}, "recover", "recover"),
     "recover_realistic": Flight("recover_realistic", {}, "recover_realistic", "recover, realistic", scripts=FOLLOWING),
@@ -110,7 +122,7 @@ FLIGHTS: dict[str, Flight] = {
         "recover_crazymarl_rates",
         {},
         "recover_crazymarl_rates",
-        "recover, CrazyMARL's starts, body rates at 250 Hz",
+        "recover, CrazyMARL's starts, thrust and body-rate actions at 250 Hz",
         "79.7 %: motor commands, no noise, no motor lag",
         ("searched",),
     ),
@@ -126,16 +138,16 @@ FLIGHTS: dict[str, Flight] = {
         "loss",
         {"env.sensing": "onboard"},
         "loss_onboard",
-        "loss, own cable and position alone, nobody talks",
+        "loss, onboard sensing, no communication",
         scripts=("formation_redistributed", "searched"),
     ),
     "loss_6": Flight("loss_6", {}, "loss_6", "loss, 6 drones"),
-    "loss_snap": Flight("loss_snap", {}, "loss", "loss with its cable"),
+    "loss_snap": Flight("loss_snap", {}, "loss", "loss, 4 drones, cable breaks too"),
 }
 
 
 SCRIPTED = {"control.action": "reference"}
-"""What scripts act by, whatever the interface of the learned teams that they are compared with."""
+"""Actions of the baselines, whatever those of the learned policies that they are compared with."""
 
 
 def error_metric(flight: Flight) -> str:

@@ -1,14 +1,14 @@
-"""Train the recipes, evaluate learned and scripted teams on the same episodes, and rebuild the tables from the results.
+"""Train the recipes, evaluate learned policies and baselines on the same episodes, and rebuild the tables.
 
   python results/reproduce.py train gate [seed ...]     train configs/gate.yaml; keep curve and weights in results/gate/
   python results/reproduce.py keep gate runs/<run>      the same for an existing run
-  python results/reproduce.py evaluate [flight ...]     the same 1000 episodes of every learned team and every script
+  python results/reproduce.py evaluate [flight ...]     the same 1000 episodes of every learned policy and baseline
                                                         -> results/<flight>/<team>.json, .npz; also <flight>/<team>
                                                         for one team, workers=<processes> (as many as there are CPUs)
   ... ray=local|<address>                               train or evaluate in processes of Ray, also of a cluster whose
                                                         nodes share this folder (docs/ray.md)
   python results/reproduce.py ship [recipe ...]         put the weights of seed 0 into the package
-  python results/reproduce.py table                     the tables of docs/
+  python results/reproduce.py table                     docs/results.md, docs/data/results.csv, shifts.csv
 
 Every number in those tables comes from these files. `evaluate` skips teams whose files exist, so it can be stopped
 and started again; delete the files of what has changed.
@@ -22,6 +22,7 @@ import json
 import multiprocessing
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
@@ -37,10 +38,10 @@ from multilift_marl._files import write_whole
 from multilift_marl._platform import cpu_count
 from multilift_marl._ray import connect, disconnect
 from multilift_marl.config.load import build_config, load_config
-from multilift_marl.control.scripted import fitting_scripts, make_scripted
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.evaluation.metrics import summarize
-from multilift_marl.evaluation.rollout import fly_episodes
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.policies.baselines import fitting_scripts, make_scripted
 
 
 def train(recipe: str, seeds: list[int], workers: int, address: str = "") -> None:
@@ -92,12 +93,12 @@ def keep(recipe: str, run: Path) -> None:
 
 
 class Job(NamedTuple):
-    """A team and the row of the table that it is evaluated for."""
+    """A policy and the row of the table that it is evaluated for."""
 
     flight: str
     team: str
     weights: str
-    """Path of a learned team's; "" for a script."""
+    """Path of a learned policy's; "" for a baseline."""
 
     @property
     def files(self) -> tuple[Path, Path]:
@@ -113,16 +114,29 @@ class Job(NamedTuple):
 
 
 def evaluate(flights: list[str], workers: int, address: str = "") -> None:
-    """Evaluate the teams without results, one in each process at a time."""
+    """Evaluate the policies without results, one in each process at a time."""
     jobs = [job for each in flights for job in list_jobs(*each.split("/", 1)) if not job.done]
     jobs = list(dict.fromkeys(jobs))
     if address:
         for line in spread_by_ray(fly, jobs, workers, address):
             print(line, flush=True)
         return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=end_with_parent) as pool:
         for done in as_completed([pool.submit(fly, job) for job in jobs]):
             print(done.result(), flush=True)
+
+
+def end_with_parent() -> None:
+    """Let this process end as soon as the one that has started it is gone, however that ended."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def spread_by_ray(function: Callable[[Any], str], jobs: list[Any], workers: int, address: str) -> Iterator[str]:
@@ -160,7 +174,7 @@ def _call_here(content: bytes, root: str, scripts: str) -> str:
 
 
 def list_jobs(flight: str, only: str = "") -> list[Job]:
-    """Return the teams of a flight, or the one called `only`."""
+    """Return the policies of a flight, or the one called `only`."""
     config = load_config(FLIGHTS[flight].config, FLIGHTS[flight].overrides)
     scripts = fitting_scripts(MultiliftVec(build_config(config.model_dump(), SCRIPTED | {"env.num_envs": 1})))
     weights = sorted((HERE / FLIGHTS[flight].recipe).glob("seed*/policy.pt"))
@@ -171,7 +185,7 @@ def list_jobs(flight: str, only: str = "") -> list[Job]:
 
 
 def fly(job: Job) -> str:
-    """Simulate a team's episodes, write the results, and return a line about them."""
+    """Simulate a policy's episodes, write the results, and return a line about them."""
     import torch
 
     from multilift_marl.agents.policy import load_policy
@@ -190,7 +204,7 @@ def fly(job: Job) -> str:
         overrides = overrides | scales
     else:
         overrides = overrides | (settings_of(job.flight) if job.team == "searched" else SCRIPTED)
-    results = fly_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
+    results = run_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
     metrics = summarize(results)
     error = results[error_metric(flight)]
     content = {"episodes": EPISODES, "seed": SEED, "config": flight.config, "overrides": flight.overrides}

@@ -1,4 +1,4 @@
-"""Search the gains of a script by the evolution strategy CMA-ES (Hansen, arXiv 1604.00772): `pip install cma`.
+"""Tune the gains of a linear policy by CMA-ES (Hansen, arXiv 1604.00772): `pip install cma`.
 
   python results/search_gains.py config=pose_wind [minutes=30] [script=formation_feedback] [spread=0.3] [cost=errors]
                                  [rigs=6] [key=value ...]
@@ -7,8 +7,8 @@ It starts from the gains of `script`, with candidates `spread` times the scales 
 simulates the same `env.num_envs` episodes with all candidates of a generation, and prints the final gains and their
 results in episodes that are not part of the search. `cost=errors` are lost episodes and errors at the end,
 `cost=success` lost episodes, failures and errors above all, where payloads cannot be level, and `cost=return` is the
-return, what a learned team is paid. Any configuration key changes the task; where it has
-`train.rigs`, one script is searched for all of them, `rigs` of them in each generation, in turn (by default all).
+return. Any configuration key changes the task; where it has `train.rigs`, one policy is tuned for all of them, `rigs`
+of them in each generation, in turn (by default all).
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl.agents.rigs import evaluated_rigs
-from multilift_marl.cli.common import run_command, split_options
+from multilift_marl.command import run_command, split_options
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
-from multilift_marl.config.values import Positive, Section
-from multilift_marl.control.scripted import LINEAR
-from multilift_marl.control.scripted_formation import Formation
-from multilift_marl.control.scripted_hold import STIFFNESS
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.evaluation.rollout import fly_episodes
+from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.plugins import find_callable
+from multilift_marl.policies.baselines import LINEAR
+from multilift_marl.policies.formation import Formation
+from multilift_marl.policies.hold import STIFFNESS
+from multilift_marl.schema.values import Positive, Section
 
 LEVEL = ((0, 0), (1, 1))
 TANGENT = ((2, 1),)
@@ -82,7 +82,7 @@ Cost = Literal["errors", "success", "return"]
 
 
 class Score(NamedTuple):
-    """Results of a script, means over episodes."""
+    """Results of a policy, means over episodes."""
 
     cost: float
     success: float
@@ -111,7 +111,7 @@ def find_script(name: str) -> type[Formation]:
 
 
 def make_script(script: str, free: Free, changes: np.ndarray) -> type[Formation]:
-    """Return a script with `changes` of the gains `free`."""
+    """Return a policy with `changes` of the gains `free`."""
     base = find_script(script)
     rows = tuple(
         (name, axis, moved, float(gain))
@@ -125,7 +125,7 @@ def fly(config: Config, script: type[Formation], seed: int, cost: Cost = "errors
     """Simulate one episode in every environment of `config`, an equal share of them with each of `train.rigs`."""
     rigs = evaluated_rigs(config)
     each = max(1, config.env.num_envs // len(rigs))
-    parts = [fly_episodes(rig, script, each, seed, TRAINING_EVALUATION) for rig in rigs]
+    parts = [run_episodes(rig, script, each, seed, TRAINING_EVALUATION) for rig in rigs]
     flown = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tracks = config.task == "track"
     error, success = flown["payload_rmse_m" if tracks else "payload_position_error_m"], flown["success_rate"].mean()
@@ -199,7 +199,7 @@ class Options(Section):
     minutes: Positive = Field(30.0, description="[min] that the search takes")
     script: str = Field("formation_feedback", description="whose gains it begins with, a name or module:Class")
     spread: Positive = Field(0.3, description="[-] of the first candidates, over the scales of `SLOTS` or `HELD`")
-    cost: Cost = Field("errors", description="what a script is searched for, see above")
+    cost: Cost = Field("errors", description="what gains are tuned for, see above")
     rigs: Annotated[int, Field(ge=1)] | None = Field(
         None, description="of `train.rigs` that a generation flies, in turn"
     )
@@ -213,7 +213,7 @@ def main(values: dict[str, Any]) -> int:
     config = load_config(options.config, {"env.num_envs": 48, **overrides})
     if begun.INTERFACE != config.control.action:
         raise ConfigError(
-            f"the script '{script}' acts by control.action={begun.INTERFACE} and cannot fly "
+            f"the baseline '{script}' acts by control.action={begun.INTERFACE} and cannot fly "
             f"control.action={config.control.action}; set control.action={begun.INTERFACE}"
         )
     if options.rigs and not config.train.rigs:

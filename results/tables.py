@@ -1,10 +1,12 @@
-"""The tables of the documents, from the files that `reproduce.py evaluate` writes for each flight."""
+"""The tables of docs/results.md and the files beside it, from what `reproduce.py evaluate` and `shifts.py` recorded."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import comb
 from pathlib import Path
 from typing import Any
@@ -12,69 +14,90 @@ from typing import Any
 import numpy as np
 from flights import FLIGHTS, HERE, ROOT, error_metric
 
-from multilift_marl.control.scripted import SCRIPTED
-from multilift_marl.evaluation.metrics import bootstrap, is_gain
+from multilift_marl.config.load import load_config
+from multilift_marl.evaluation.metrics import bootstrap
+from multilift_marl.policies.baselines import SCRIPTED
 
-TEAMS = (*(name for name, script in SCRIPTED.items() if script.INTERFACE == "reference"), "searched")
-"""Scripts of the tables: those that move slots, and the best one of a search for a flight (searched.py)."""
-_DETAILS = (  # of each team: metric, title, factor, digits
-    ("success_rate", "success [%]", 100, 1),
-    ("payload_position_error_m", "position error [cm]", 100, 2),
-    ("payload_position_error_m_successful", "... successful [cm]", 100, 2),
-    ("payload_attitude_error_deg", "attitude error [deg]", 1, 2),
-    ("payload_attitude_error_deg_successful", "... successful [deg]", 1, 2),
-    ("settling_time_s", "settling time [s]", 1, 2),
-    ("return", "return", 1, 1),
+BASELINES = (*(name for name, script in SCRIPTED.items() if script.INTERFACE == "reference"), "searched")
+"""Baselines of the tables: those that move slots, and the linear policy tuned for a flight by CMA-ES (searched.py)."""
+TUNED = "CMA-ES-tuned linear"
+POINT, MILLIMETRE = 1.0, 0.1
+"""The smallest differences of a verdict: of success [points], of the error [cm]."""
+METRICS = (  # of each policy in results.csv: metric, column, factor
+    ("success_rate", "success_percent", 100),
+    ("payload_position_error_m", "position_error_cm", 100),
+    ("payload_position_error_m_successful", "position_error_successful_cm", 100),
+    ("payload_rmse_m", "rmse_cm", 100),
+    ("payload_attitude_error_deg", "attitude_error_deg", 1),
+    ("payload_attitude_error_deg_successful", "attitude_error_successful_deg", 1),
+    ("settling_time_s", "settling_time_s", 1),
+    ("return", "return", 1),
 )
 
 
-def table() -> str:
-    """Return all flights and all teams as a Markdown table: success and error, of learned ones the mean of seeds."""
-    rows = []
-    for name, flight in FLIGHTS.items():
-        scripts = [_cell([HERE / name / f"{script}.json"], error_metric(flight)) for script in TEAMS]
-        rows.append([flight.title, *_learned(name), gain(name), *scripts, flight.published])
-    return _markdown(["learned", "training seeds", "learned - best script", *TEAMS, "published"], rows)
+def flights_of(task: str) -> list[str]:
+    """Return the names of the flights of a task."""
+    return [name for name, flight in FLIGHTS.items() if load_config(flight.config).task == task]
 
 
-def summary() -> str:
-    """Return the same of the learned teams and the best script of each flight alone."""
-    rows = []
-    for name, flight in FLIGHTS.items():
-        best = best_script(name)
-        script = f"{best}: {_cell([HERE / name / f'{best}.json'], error_metric(flight))}" if best else "-"
-        difference = gain(name).replace(f", {best}", "")
-        rows.append([flight.title, *_learned(name), script, difference, flight.published])
-    return _markdown(["learned", "training seeds", "best script", "learned - best script", "published"], rows)
+def rows(names: str) -> str:
+    """Return flights, or those of a task, as a Markdown table: learned policies, the best baseline, learning's gain."""
+    task = "" if names.split()[0] in FLIGHTS and " " in names else names
+    chosen = flights_of(task) if task else names.split()
+    published = any(FLIGHTS[name].published for name in chosen)
+    lines = []
+    for name in chosen:
+        flight, baseline = FLIGHTS[name], best_baseline(name)
+        learned = learned_policies(name)
+        cell = _cell([HERE / name / f"{policy}.json" for policy in learned], error_metric(flight))
+        other = f"{title(baseline)}: {_cell([HERE / name / f'{baseline}.json'], error_metric(flight))}"
+        gain, verdict = compare(name) or ("-", "-")
+        lines.append(
+            [
+                flight.title.removeprefix(f"{task}, ") if task else _full_title(name),
+                cell,
+                other if baseline else "-",
+                gain,
+                verdict,
+                str(len(learned) or "-"),
+            ]
+        )
+        lines[-1] += [flight.published] * published
+    columns = ["conditions", "learned", "best baseline", "gain (95 % interval)", "verdict", "seeds"]
+    return _markdown(columns + ["published"] * published, lines)
 
 
-def _learned(flight: str) -> tuple[str, str]:
-    """Return success and error of the learned teams, and how many there are."""
-    teams = learned_teams(flight)
-    return _cell([HERE / flight / f"{team}.json" for team in teams], error_metric(FLIGHTS[flight])), str(len(teams))
+def _full_title(flight: str) -> str:
+    """Return the task of a flight, and its conditions."""
+    task, text = load_config(FLIGHTS[flight].config).task, FLIGHTS[flight].title
+    return f"`{task}`" if text == task else f"`{task}`: {text.removeprefix(f'{task}, ')}"
 
 
-def learned_teams(flight: str) -> list[str]:
-    """Return the names of the evaluated learned teams, one for each training seed."""
+def title(policy: str) -> str:
+    """Return how the tables call a baseline."""
+    return TUNED if policy == "searched" else f"`{policy}`"
+
+
+def learned_policies(flight: str) -> list[str]:
+    """Return the names of the evaluated learned policies, one for each training seed."""
     return sorted(path.stem for path in (HERE / flight).glob("seed*.npz"))
 
 
-def _markdown(columns: list[str], rows: list[list[str]]) -> str:
-    """Return a table of which the first column has no name."""
-    head = [f"| | {' | '.join(columns)} |", f"|---|{'---|' * len(columns)}"]
-    return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
+def _markdown(columns: list[str], lines: list[list[str]]) -> str:
+    head = [f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
+    return "\n".join(head + [f"| {' | '.join(line)} |" for line in lines])
 
 
-def best_script(flight: str) -> str:
-    """Return the script with the least error of those that succeed most often, within noise; "" if there is none.
+def best_baseline(flight: str) -> str:
+    """Return the baseline with the least error of those that succeed most often, within noise; "" if there is none.
 
     Within noise: `as_often`. Up to it error counts, not success.
     """
-    scripts = {name: np.load(path) for name in TEAMS if (path := HERE / flight / f"{name}.npz").is_file()}
-    success = {name: script["success"].astype(float) for name, script in scripts.items()}
+    found = {name: np.load(path) for name in BASELINES if (path := HERE / flight / f"{name}.npz").is_file()}
+    success = {name: each["success"].astype(float) for name, each in found.items()}
     most = max(success.values(), default=None, key=np.mean)
     good = [name for name, own in success.items() if as_often(own, most)]
-    return min(good, default="", key=lambda name: (scripts[name]["error"].mean(), -success[name].mean()))
+    return min(good, default="", key=lambda name: (found[name]["error"].mean(), -success[name].mean()))
 
 
 def as_often(own: np.ndarray, other: np.ndarray) -> bool:
@@ -87,91 +110,166 @@ def as_often(own: np.ndarray, other: np.ndarray) -> bool:
     return min(2 * tail, 1.0) >= 0.05
 
 
-def gain(flight: str) -> str:
-    """Return the gain of learned teams over the best script: success and error, paired by episode.
+def compare(flight: str) -> tuple[str, str] | None:
+    """Return the gain of learned policies over the best baseline, and the verdict; None where one of both is missing.
 
-    Of several training seeds each episode counts by its mean. Errors are compared in episodes that end alike for all;
-    `is_gain` decides whether learning gains; a team that succeeds less often within noise is judged by its error.
+    Of several training seeds each episode counts by its mean. Errors are compared in episodes of the same outcome.
     """
-    learned = [np.load(HERE / flight / f"{team}.npz") for team in learned_teams(flight)]
-    best = best_script(flight)
-    if not learned or not best:
-        return "-"
-    script = np.load(HERE / flight / f"{best}.npz")
+    differences = paired(flight)
+    if differences is None:
+        return None
+    success, error = differences
     parts = []
-    differences = []
-    for key, unit, digits in (("success", "points", 1), ("error", "cm", 2)):
-        mean = np.mean([each[key].astype(float) for each in learned], axis=0)
-        difference = 100 * (mean - script[key].astype(float))
-        differences.append(difference)
-        shown = difference if key == "success" else difference[differences[0] == 0]
-        if shown.size:
-            low, high = (f"{bound:+.{digits}f}" for bound in bootstrap(shown))
-            parts.append(f"{shown.mean():+.{digits}f} ({low} to {high}) {unit}")
-    verdict = "" if is_gain(*differences, strict=False) else "; **learning gains nothing**"
-    return f"{', '.join(parts)}, {best}{verdict}"
+    for values, unit, digits in ((success, "points", 1), (error, "cm", 2)):
+        if values.size and values.any():
+            low, high = (_signed(bound, digits) for bound in bootstrap(values))
+            mean = _signed(values.mean(), digits)
+            parts.append(f"{mean} {unit}" if low == mean == high else f"{mean} ({low}, {high}) {unit}")
+        elif values.size:
+            parts.append(f"0 {unit}")
+    return ", ".join(parts), judge(success, error)
+
+
+def paired(flight: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return learned minus best baseline: success [points] by episode, error [cm] of episodes of the same outcome."""
+    learned = [np.load(HERE / flight / f"{policy}.npz") for policy in learned_policies(flight)]
+    best = best_baseline(flight)
+    if not learned or not best:
+        return None
+    baseline = np.load(HERE / flight / f"{best}.npz")
+    success, error = (
+        100 * (np.mean([each[key].astype(float) for each in learned], axis=0) - baseline[key].astype(float))
+        for key in ("success", "error")
+    )
+    return success, error[success == 0]
+
+
+def judge(success: np.ndarray, error: np.ndarray) -> str:
+    """Return "better", "no significant difference" or "worse".
+
+    A difference counts if its 95 % interval leaves out zero and it is at least a point of success or a millimetre of
+    error. Success decides; error does where no difference of success counts, and none in the opposite direction is
+    significant.
+
+    Args:
+        success: (n,) learned minus baseline, in points.
+        error: (m,) the same of errors, in cm.
+    """
+    names = {1: "better", 0: "no significant difference", -1: "worse"}
+    often = _direction(success)
+    if often and abs(success.mean()) >= POINT:
+        return names[often]
+    exact = -_direction(error)
+    if exact and abs(error.mean()) >= MILLIMETRE and exact != -often:
+        return names[exact]
+    return names[0]
+
+
+def _direction(values: np.ndarray) -> int:
+    """Return the sign of the mean where its 95 % interval leaves out zero, else 0."""
+    if not values.size:
+        return 0
+    low, high = bootstrap(values)
+    return int(low > 0) - int(high < 0)
+
+
+def _signed(value: float, digits: int) -> str:
+    text = f"{value:+.{digits}f}"
+    return text.lstrip("+-") if float(text) == 0 else text.replace("-", "−")
 
 
 def _cell(paths: list[Path], error: str) -> str:
     """Return "success %, error cm", means of these results, with the smallest and the largest where they differ."""
-    teams = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in paths if path.is_file()]
-    if not teams:
+    found = [json.loads(path.read_text(encoding="utf-8"))["metrics"] for path in paths if path.is_file()]
+    if not found:
         return "-"
     parts = []
     for metric, unit, digits in (("success_rate", "%", 1), (error, "cm", 2)):
-        values = [100 * one[metric]["mean"] for one in teams]
+        values = [100 * one[metric]["mean"] for one in found]
         least, most = (f"{value:.{digits}f}" for value in (min(values), max(values)))
-        spread = f" ({least} - {most})" if least != most else ""
+        spread = f" [{least}–{most}]" if least != most else ""
         parts.append(f"{sum(values) / len(values):.{digits}f}{spread} {unit}")
     return ", ".join(parts)
 
 
-def details(flights: Sequence[str]) -> str:
-    """Return the metrics of every team of some flights as a Markdown table: means and 95 % intervals over episodes."""
-    rows = []
-    for flight in flights:
-        for team in (*TEAMS, *learned_teams(flight)):
-            if not (HERE / flight / f"{team}.npz").is_file():
-                continue
-            metrics = json.loads((HERE / flight / f"{team}.json").read_text(encoding="utf-8"))["metrics"]
-            named = team.replace("seed", "learned, seed ")
-            rows.append([f"{FLIGHTS[flight].title}: {named}" if len(flights) > 1 else named])
-            rows[-1] += [_interval(metrics.get(name), factor, digits) for name, _, factor, digits in _DETAILS]
-    return _markdown([title for _, title, _, _ in _DETAILS], rows)
-
-
 def shifts(flights: Sequence[str]) -> str:
-    """Return the learned team and the best script of some flights under each change that `shifts.py` made."""
-    rows = []
-    for flight in flights:
-        for row in json.loads((HERE / flight / "shifts.json").read_text(encoding="utf-8"))["rows"]:
-            change, *teams = row
-            cells = []
-            for team in teams:
-                found = row[team]
-                refused = "refused" in found
-                cells.append("refused" if refused else f"{100 * found['success']:.1f} %, {100 * found['error']:.2f} cm")
-            rows.append([f"{FLIGHTS[flight].title}: {row[change]}", *cells, teams[-1]])
-    return _markdown(["learned", "best script", "which"], rows)
+    """Return success under each change that `shifts.py` made, learned / best baseline, a column for each flight."""
+    found = {flight: _recorded_shifts(flight) for flight in flights}
+    lines = []
+    for index, row in enumerate(next(iter(found.values()))):
+        cells = []
+        for each in found.values():
+            assert each[index]["shift"] == row["shift"]
+            learned, baseline = each[index].get("learned"), list(each[index].values())[-1]
+            values = [None if found is None else found.get("success") for found in (learned, baseline)]
+            cells.append("/".join("-" if value is None else f"{100 * value:.1f}" for value in values))
+        lines.append([row["shift"], *cells])
+    return _markdown(["success [%]", *(f"`{flight}`" for flight in flights)], lines)
 
 
-def _interval(metric: dict[str, Any] | None, factor: float, digits: int) -> str:
-    if metric is None:
-        return "-"
-    mean, low, high = (f"{factor * value:.{digits}f}" for value in (metric["mean"], *metric["ci95"]))
-    return f"{mean} ({low} - {high})"
+def _recorded_shifts(flight: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads((HERE / flight / "shifts.json").read_text(encoding="utf-8"))["rows"]
+    return found
+
+
+def policies_csv() -> str:
+    """Return every policy of every flight: means and 95 % intervals over the episodes."""
+    head = ["task", "flight", "conditions", "policy", "training_seed", "episodes", "episode_seed"]
+    head += [f"{column}{part}" for _, column, _ in METRICS for part in ("", "_low", "_high")]
+    lines = []
+    for flight, entry in FLIGHTS.items():
+        for policy in (*BASELINES, *learned_policies(flight)):
+            path = HERE / flight / f"{policy}.json"
+            if not path.is_file():
+                continue
+            report = json.loads(path.read_text(encoding="utf-8"))
+            seed = policy.removeprefix("seed") if policy.startswith("seed") else ""
+            name = "learned" if seed else title(policy).strip("`")
+            task = load_config(entry.config).task
+            line = [task, flight, entry.title, name, seed, report["episodes"], report["seed"]]
+            for metric, _, factor in METRICS:
+                values = report["metrics"].get(metric)
+                parts = ("", "", "") if values is None else (values["mean"], *values["ci95"])
+                line += [part if part == "" else f"{factor * part:.6g}" for part in parts]
+            lines.append(line)
+    return _csv(head, lines)
+
+
+def shifts_csv() -> str:
+    """Return every policy of every flight that `shifts.py` evaluated, under each change."""
+    head = ["flight", "conditions", "shift", "policy", "success_percent", "error_cm", "attitude_error_deg", "refused"]
+    lines = []
+    for flight, entry in FLIGHTS.items():
+        if not (HERE / flight / "shifts.json").is_file():
+            continue
+        for row in _recorded_shifts(flight):
+            for policy in list(row)[1:]:
+                found, name = row[policy], policy if policy == "learned" else title(policy).strip("`")
+                factors = (("success", 100), ("error", 100), ("angle", 1))
+                values = ["" if key not in found else f"{factor * found[key]:.6g}" for key, factor in factors]
+                lines.append([flight, entry.title, row["shift"], name, *values, found.get("refused", "")])
+    return _csv(head, lines)
+
+
+def _csv(head: list[str], lines: list[list[Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([head, *lines])
+    return text.getvalue()
+
+
+def fill(text: str) -> str:
+    """Return a page with its tables, those of `<!-- results of <task or flights> -->` and `<!-- shifts of … -->`."""
+    makers = {"results": rows, "shifts": lambda named: shifts(named.split())}
+    marked = re.compile(r"(<!-- (results|shifts) of ([\w ]+) -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
+    return marked.sub(lambda found: f"{found[1]}{makers[found[2]](found[3])}\n{found[4]}", text)
 
 
 def write_tables() -> None:
-    """Replace the text between the markers in the documents."""
-    marked = re.compile(r"(<!-- (results|shifts)(?: of ([\w ]+))? -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
-    for path in sorted((ROOT / "docs").glob("*.md")):
-        whole = summary if path.name == "results.md" else table
-
-        def fill(found: re.Match[str], whole: Callable[[], str] = whole) -> str:
-            kind = shifts if found[2] == "shifts" else details
-            content = kind(found[3].split()) if found[3] else whole()
-            return f"{found[1]}{content}\n{found[4]}"
-
-        text = path.read_text(encoding="utf-8")
-        path.write_text(marked.sub(fill, text), encoding="utf-8")
+    """Write the tables of docs/results.md and README, and docs/data/results.csv and shifts.csv."""
+    docs = ROOT / "docs"
+    for page in (docs / "results.md", ROOT / "README.md"):
+        page.write_text(fill(page.read_text(encoding="utf-8")), encoding="utf-8")
+    (docs / "data").mkdir(exist_ok=True)
+    for name, content in (("results", policies_csv()), ("shifts", shifts_csv())):
+        (docs / "data" / f"{name}.csv").write_text(content, encoding="utf-8")

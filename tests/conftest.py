@@ -8,7 +8,6 @@ marked `slow`; tests so marked are left out unless asked for by `-m slow`.
 from __future__ import annotations
 
 import importlib.util
-import os
 import signal
 import sys
 from dataclasses import replace
@@ -20,27 +19,27 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
-from multilift_marl import _precompile, plugins, tasks
-from multilift_marl._platform import cpu_count
+from multilift_marl import plugins, tasks
 from multilift_marl.config.load import CONFIGS
 from multilift_marl.control.formation import place_formation
 from multilift_marl.control.gains import DroneGains, Gains
 from multilift_marl.control.gains import drone_gains as gains_of_a_drone
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
-from multilift_marl.rig import vehicles
+from multilift_marl.rig import presets
 from multilift_marl.rig.system import System
 from multilift_marl.sim import World
 from multilift_marl.tasks import find_task
 from multilift_marl.validation.cables import hover_thrust  # noqa: F401 (for the tests)
 
-collect_ignore = ["test_model_cards.py", "test_results.py"]  # of recorded results, which an sdist does not hold
+collect_ignore = [
+    "project/test_model_cards.py",
+    "project/test_results.py",
+]  # of recorded results, which an sdist does not hold
 if (Path(__file__).parents[1] / "results").is_dir():
     collect_ignore = []
 
-# Where as many processes test as there are CPUs, none is left for processes that compile beside them.
-if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) >= cpu_count():
-    _precompile.disable_helper()
+sys.path += [str(folder) for folder in Path(__file__).parent.iterdir() if folder.is_dir()]  # test files share functions
 
 # A run in the background, or below nohup, begins with these ignored, as do its children; tests send them.
 for _number, _handler in (
@@ -98,9 +97,11 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture
 def registries(tmp_path):
     """Forget what a test registers, and imports from its folder or from the examples."""
-    known = [tasks.TASKS, vehicles.PRESETS, CONFIGS, plugins._imported]
+    known = [tasks.TASKS, presets.PRESETS, CONFIGS, plugins._imported, plugins.refused]
     before, modules, path = [dict(registry) for registry in known], set(sys.modules), list(sys.path)
+    named = set(plugins.named)
     yield
+    plugins.named.intersection_update(named)
     for registry, content in zip(known, before, strict=True):
         registry.clear()
         registry.update(content)
@@ -145,7 +146,7 @@ def wide(task: str) -> dict[str, float]:
 
 def drone_gains(gains: Gains, n: int) -> DroneGains:
     """Return the gains of drone n; compiled, kernels hand no arrays to Python."""
-    return gains_of_a_drone.py_func(gains, n)
+    return getattr(gains_of_a_drone, "py_func", gains_of_a_drone)(gains, n)
 
 
 def make_system(num_drones: int = 1, **overrides) -> System:
@@ -276,3 +277,17 @@ def make_trainer(tmp_path, **overrides):
     from multilift_marl.agents.trainer import new_run
 
     return new_run(ml.load_config("hover", SMALL | overrides), "test", tmp_path)
+
+
+def turned_from_rest(torque: np.ndarray, inertia: np.ndarray, timestep: float) -> np.ndarray:
+    """Return the body rates (3,) [rad/s] that a step of the midpoint rule gives a free body at rest.
+
+    Args:
+        torque: (3,) in the body's frame [N m].
+        inertia: (3,) principal moments [kg m²].
+        timestep: [s].
+    """
+    rates = np.zeros(3)
+    for _ in range(20):
+        rates = timestep * (torque - np.cross(rates / 2, inertia * rates / 2)) / inertia
+    return rates

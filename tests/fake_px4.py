@@ -13,9 +13,9 @@ import time
 
 import numpy as np
 
-from multilift_marl.px4.link import PORT
-from multilift_marl.px4.mavlink import MAVLink, Splitter, mavlink
-from multilift_marl.px4.offboard import OWN_PORT, PX4_PORT
+from multilift_marl.deploy.px4.link import PORT
+from multilift_marl.deploy.px4.mavlink import MAVLink, Splitter, mavlink
+from multilift_marl.deploy.px4.offboard import OWN_PORT, PX4_PORT
 from multilift_marl.sim.earth import project_local
 
 HOST = "127.0.0.1"
@@ -57,6 +57,8 @@ class FakePX4(threading.Thread):
         parameters: what PX4 would be given, see `rig_parameters`, with "mass", "inertia" and "thrust" of the vehicle.
         silent_after: answers before it says nothing more; None: it never falls silent.
         vanish_after: answers before it closes the connection.
+        slow: answers before which it takes 50 ms each, while it starts.
+        controls: of its motors once it is armed, in place of those by which it flies.
         rubbish: bytes that it sends before every answer.
         stamp: added to the time of its answers [us].
         refuses: to arm, and says why.
@@ -64,12 +66,12 @@ class FakePX4(threading.Thread):
 
     def __init__(
         self, index: int, parameters: dict, silent_after: int | None = None, vanish_after: int | None = None,
-        rubbish: bytes = b"", stamp: int = 0, refuses: str = "",
+        rubbish: bytes = b"", stamp: int = 0, refuses: str = "", slow: int = 0, controls: list[float] | None = None,
     ):  # fmt: skip
         super().__init__(daemon=True)
         self.index, self.parameters = index, parameters
         self.silent_after, self.vanish_after, self.rubbish, self.stamp = silent_after, vanish_after, rubbish, stamp
-        self.refuses = refuses
+        self.refuses, self.slow, self.controls = refuses, slow, controls
         self.complaints: list[str] = []
         self.setpoints: list = []
         self.commands: list[int] = []
@@ -142,7 +144,10 @@ class FakePX4(threading.Thread):
             return False
         if self.silent_after is not None and self.answers >= self.silent_after:
             return True
-        controls = [*(self._fly() if self.armed else np.zeros(4)), *[0.0] * 12]
+        if self.answers < self.slow:
+            time.sleep(0.05)
+        motors = self._fly() if self.controls is None else self.controls
+        controls = [*(motors if self.armed else np.zeros(4)), *[0.0] * 12]
         message = self._mavlink.hil_actuator_controls_encode(
             sensors.time_usec + self.stamp, [float(c) for c in controls], 129 if self.armed else 1, 1
         )

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import re
 import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +17,7 @@ import torch
 
 from multilift_marl._files import write_whole
 from multilift_marl._platform import lock_file
-from multilift_marl.errors import CheckpointError, reason
+from multilift_marl.errors import CheckpointError, ConfigError, reason
 
 FORMAT = "multilift_marl checkpoint 1"
 _STAMP = re.compile(r"-(\d{8}-\d{6})-s\d+(?:-(\d+))?$")  # of a run's name: time, and which run of that second
@@ -46,9 +50,15 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
             raise CheckpointError(
                 f"no checkpoint {path}: give a run folder, one of its checkpoints or a shipped policy's name"
             )
-        data = io.BytesIO(path.read_bytes())
+        data = path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         raise CheckpointError(f"cannot read {path} ({reason(error)}); give another checkpoint") from error
+    return parse_checkpoint(data, path)
+
+
+def parse_checkpoint(content: bytes, path: Path) -> dict[str, Any]:
+    """Return what `save_checkpoint` wrote, from the content of the file `path`; see `load_checkpoint`."""
+    data = io.BytesIO(content)
     other = "use another checkpoint of the run, such as best.pt or last.pt"
     if not zipfile.is_zipfile(data):
         raise CheckpointError(f"{path} is truncated or no checkpoint at all; {other}")
@@ -61,12 +71,22 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
         raise CheckpointError(f"{path} is damaged (wrong checksum of {damaged}); {other}")
     try:
         data.seek(0)
-        content = torch.load(data, map_location="cpu", weights_only=True)
+        # weights_only: a pickle may run any program when it is loaded.
+        found = torch.load(data, map_location="cpu", weights_only=True)
     except Exception as error:  # torch does so for what it cannot take
         raise CheckpointError(f"{path} holds more than tensors and numbers; {other}") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise CheckpointError(f"{path} was not written by multilift_marl (or by another version); train again")
-    return content
+    return found
+
+
+def copy_content(content: Any) -> Any:
+    """Return the content of a checkpoint with copies of its tensors, which training changes."""
+    if isinstance(content, torch.Tensor):
+        return content.clone()
+    if isinstance(content, dict):
+        return {key: copy_content(value) for key, value in content.items()}
+    return [copy_content(value) for value in content] if isinstance(content, list) else content
 
 
 def check_like(found: Any, expected: Any, name: str) -> None:
@@ -99,8 +119,13 @@ def check_like(found: Any, expected: Any, name: str) -> None:
         raise ValueError(f"'{name}' is NaN")
 
 
-def find_run(name: str | Path, runs: Path = Path("runs")) -> Path:
+def find_run(name: str | Path, runs: Path = Path("runs"), others: Iterable[str] = ()) -> Path:
     """Return the folder of a run by path, by name under `runs`, or the "latest", by the time in its name.
+
+    Args:
+        name: of the run.
+        runs: folder of runs.
+        others: names that the caller knows beside them, for messages.
 
     Raises:
         CheckpointError: there is none.
@@ -122,12 +147,34 @@ def find_run(name: str | Path, runs: Path = Path("runs")) -> Path:
         ) from error
     if str(name) == "latest":
         raise CheckpointError(f"no run with a checkpoint in {runs}/: train one first, python train.py config=hover")
-    raise CheckpointError(f"no run folder {name}: give the path of one, such as runs/<name>, or 'latest'")
+    known = [*others, *(folder.name for folder in runs.glob("*/") if (folder / "checkpoints").is_dir())]
+    close = get_close_matches(str(name), known, n=1, cutoff=0.7)
+    hint = f"; did you mean '{close[0]}'?" if close else ""
+    raise CheckpointError(f"no run folder {name}: give the path of one, such as runs/<name>, or 'latest'{hint}")
 
 
 def _age(folder: Path) -> tuple[str, int, str]:
     stamp = _STAMP.search(folder.name)
     return (stamp[1], int(stamp[2] or 1), folder.name) if stamp else ("", 0, folder.name)
+
+
+@contextmanager
+def making_run(runs: Path) -> Iterator[None]:
+    """Say by a ConfigError that a run cannot be made in `runs`."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"cannot make a run in {runs}/ ({reason(error)}); train in another folder") from error
+
+
+def make_run_folder(runs: Path, stem: str) -> Path:
+    """Return a new folder of this name, or of the next one that is free."""
+    for again in itertools.count(1):
+        folder = runs / (stem if again == 1 else f"{stem}-{again}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            break
+    return folder
 
 
 def lock_run(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Evaluations during training: how good the policy is, which one is the best, and what training gained over its script.
+"""Evaluations during training: how good the policy is, which one is the best, and what training gained.
 
 All episodes are on seeds of evaluation during training. They come in blocks: every evaluation takes block 0,
 so that its numbers can be compared over a training; the others have decided nothing before, so that no policy is called
@@ -17,25 +17,27 @@ import numpy as np
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.config.config import Config
-from multilift_marl.control.policy import Policy
-from multilift_marl.control.scripted import make_residual
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.evaluation.metrics import is_better, summarize
-from multilift_marl.evaluation.rollout import fly_episodes
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.policies.baselines import make_base_policy
+from multilift_marl.policies.policy import Policy
 
 _METRICS = ("success_rate", "payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")
 _BLOCK = 2**20  # episodes
 
 
 class Gain(NamedTuple):
-    """What training gained over the script that it began with, on the same fresh episodes."""
+    """What training gained over the policy that it began with, on the same fresh episodes."""
 
     script: dict[str, float]
-    """Means by metric."""
+    """Means by metric of that policy: the base policy, or that of `train.init`."""
     learned: dict[str, float]
     """The same of the best policy."""
     better: bool
     """Whether the best policy is better beyond the noise of these episodes."""
+    worse: bool
+    """Whether it is worse beyond that noise: it was the best of others."""
 
     def values(self) -> dict[str, float]:
         """Return the numbers to log, by name."""
@@ -53,11 +55,13 @@ class Evaluator:
     Attributes:
         best: what a checkpoint holds of the best policy, its `iteration`, and its `score` in its evaluation, success
             and negative error; None before the first.
+        initial: the same of the policy of `train.init`, without score; None where there is none.
     """
 
     def __init__(self, config: Config):
         self.config = config
         self.best: dict[str, Any] | None = None
+        self.initial: dict[str, Any] | None = None
 
     def evaluate(self, content: dict[str, Any]) -> dict[str, float]:
         """Fly a policy without exploration; keep it if it is better than the best so far.
@@ -80,13 +84,24 @@ class Evaluator:
             "eval/seconds": time.perf_counter() - start,
         }
 
+    def measure_success(self, content: dict[str, Any], environment: Config) -> float:
+        """Return the share of successes of a policy without exploration in a stage's environment, on fresh episodes."""
+        policy = LearnedPolicy(content, "the run")
+        flown = self._fly(policy.bind, content["iteration"] + 1, environment)
+        return float(flown["success_rate"].mean())
+
     def measure_gain(self, iterations: int) -> Gain:
-        """Fly the best policy and the script that training of so many iterations began with."""
+        """Fly the best policy and the one that training of so many iterations began with."""
         learned = self._fly(self.best_policy().bind, iterations + 1)
-        script = self._fly(partial(make_residual, self.config.train.residual), iterations + 1)
+        script = self._fly(self._beginning(), iterations + 1)
         before = {name: float(script[name].mean()) for name in _METRICS}
         after = {name: float(learned[name].mean()) for name in _METRICS}
-        return Gain(before, after, is_better(learned, script))
+        return Gain(before, after, is_better(learned, script), is_better(script, learned))
+
+    def _beginning(self) -> Callable[[MultiliftVec], Policy]:
+        if self.initial is None:
+            return partial(make_base_policy, self.config.train.residual)
+        return LearnedPolicy(self.initial, "the initial policy").bind
 
     def best_policy(self) -> LearnedPolicy:
         """Return the best policy so far."""
@@ -96,16 +111,19 @@ class Evaluator:
     def _confirm(self, candidate: LearnedPolicy, iteration: int) -> bool:
         """Return whether a policy beats the best one on fresh episodes, too.
 
-        The untrained policy, which flies the script, gives way to a gain beyond the noise; among trained ones, whose
+        The policy that training began with gives way to a gain beyond the noise; among trained ones, whose
         gains add up in steps smaller than that, the means decide.
         """
         untrained = self.best_policy().frames == 0
         flown, best = self._fly(candidate.bind, iteration), self._fly(self.best_policy().bind, iteration)
         return is_better(flown, best, beyond_noise=untrained)
 
-    def _fly(self, make_policy: Callable[[MultiliftVec], Policy], block: int) -> dict[str, np.ndarray]:
-        """Return the metrics of each episode of a block."""
-        rigs, seed = evaluated_rigs(self.config), self.config.seed
+    def _fly(
+        self, make_policy: Callable[[MultiliftVec], Policy], block: int, environment: Config | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return the metrics of each episode of a block, in the task's own environment or in another one."""
+        rigs, seed = evaluated_rigs(environment or self.config), self.config.seed
+        # Rounded up, so that each rig has its share; blocks of episodes never meet.
         each, first = -(-self.config.eval.episodes // len(rigs)), block * _BLOCK
-        flown = [fly_episodes(rig, make_policy, each, seed, TRAINING_EVALUATION, first=first) for rig in rigs]
+        flown = [run_episodes(rig, make_policy, each, seed, TRAINING_EVALUATION, first=first) for rig in rigs]
         return {name: np.concatenate([metrics[name] for metrics in flown]) for name in flown[0]}

@@ -21,16 +21,16 @@ from multilift_marl.agents.logging import package_versions
 from multilift_marl.agents.networks import Actor, Normalizer
 from multilift_marl.agents.policy import CONTRACT_FORMAT, LearnedPolicy, TrainedPolicy
 from multilift_marl.config.config import Config
-from multilift_marl.control.actions import ACTIONS, THRUST, Team
+from multilift_marl.control.actions import ACTIONS, THRUST, ControlContext
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.errors import CheckpointError, ConfigError
+from multilift_marl.mdp.env_data import INTEGRAL_LIMIT
+from multilift_marl.mdp.observations import FRAMES, list_components, observation_names
+from multilift_marl.mdp.rig_features import observed_units
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks import find_task
-from multilift_marl.tasks.observations import FRAMES, list_components, observation_names
-from multilift_marl.tasks.rig_numbers import observed_units
-from multilift_marl.tasks.view import INTEGRAL_LIMIT
 
 NETWORK, CONTRACT = "policy.onnx", "policy.json"
 _TOLERANCE = 1e-5  # of actions, between torch and onnxruntime
@@ -57,7 +57,7 @@ class _Mean(nn.Module):
         return self.actor(observation, memory)[0].clamp(-1, 1), memory
 
 
-def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
+def export_policy(policy: TrainedPolicy, folder: str | Path, opset: int | None = None) -> dict[str, Any]:
     """Write policy.onnx and policy.json into a folder, which is made where there is none.
 
     The network takes `observation` (batch, drones, D) float32 and returns `action` (batch, drones, A) in [-1, 1], for
@@ -67,21 +67,23 @@ def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
     Args:
         policy: what to export.
         folder: where to.
+        opset: version of ONNX's operators, for a runtime that does not know newer ones; None for the exporter's own.
 
     Returns:
         The contract, as in policy.json; see docs/export.md.
 
     Raises:
-        CheckpointError, ConfigError: see `make_contract`; or the policy is an exported one.
+        CheckpointError, ConfigError: see `make_contract`; or the policy is an exported one, or its network cannot be
+            expressed in this opset.
         OSError: the folder cannot be written.
         RuntimeError: onnxruntime's actions are not the policy's.
     """
     if not isinstance(policy, LearnedPolicy):
         raise ConfigError(f"{policy.source} is exported already; give the run or the checkpoint that it comes from")
     contract, gru = make_contract(policy), policy.config.train.gru
+    model = _convert(policy, opset)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    model = _convert(policy)
     onnx.save(model, str(folder / NETWORK))
     network = {
         "file": NETWORK,
@@ -89,6 +91,7 @@ def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
         "output": "action",
         "memory": {"input": "memory", "output": "next_memory", "size": gru} if gru else None,
         "opset": model.opset_import[0].version,
+        "ir_version": model.ir_version,
         "largest_difference": _compare(policy, folder / NETWORK),
     }
     contract = {"network": network} | contract
@@ -96,21 +99,27 @@ def export_policy(policy: TrainedPolicy, folder: str | Path) -> dict[str, Any]:
     return contract
 
 
-def _convert(policy: LearnedPolicy) -> onnx.ModelProto:
+def _convert(policy: LearnedPolicy, opset: int | None) -> onnx.ModelProto:
     """Return the network as an ONNX model, without what the exporter notes about this machine's source files."""
     gru = policy.config.train.gru
     inputs, outputs = {"observation": torch.zeros(*_TRACED, len(policy.observation_names))}, ["action"]
     if gru:
         inputs["memory"] = torch.zeros(*_TRACED, gru)
         outputs.append("next_memory")
+    # Sizes that the model leaves open; all others become constants of it.
     free = {0: torch.export.Dim("batch"), 1: torch.export.Dim("drones")}
     with _silence(), torch.no_grad():
         program = torch.onnx.export(
             _Mean(policy.actor), tuple(inputs.values()), dynamo=True, dynamic_shapes=dict.fromkeys(inputs, free),
-            input_names=list(inputs), output_names=outputs, verbose=False,
+            input_names=list(inputs), output_names=outputs, verbose=False, opset_version=opset,
         )  # fmt: skip
     assert program is not None
     model = program.model_proto
+    if opset is not None and (made := model.opset_import[0].version) != opset:
+        raise ConfigError(
+            f"the network cannot be expressed by opset={opset} of ONNX, only by {made}; give that or more"
+        )
+    model.ir_version = onnx.helper.find_min_ir_version_for(model.opset_import)  # the form that most runtimes read
     graph = model.graph
     for part in (graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output):
         part.ClearField("metadata_props")
@@ -142,6 +151,7 @@ def _compare(policy: LearnedPolicy, path: Path) -> float:
         learned.reset()
         memory = {"memory": np.zeros((5, drones, gru), np.float32)} if gru else {}
         for _ in range(3 if gru else 1):
+            # Observations as training had them, or the comparison would be of clipped ones.
             spread = rng.standard_normal((5, drones, len(policy.observation_names)), np.float32)
             observation = normalizer.shift.numpy() + spread / normalizer.scale.numpy()
             action, *after = session.run(None, {"observation": observation} | memory)
@@ -239,7 +249,7 @@ def _measure_thrusts(config: Config) -> np.ndarray:
     interface = ACTIONS[config.control.action](config.acting, 1.0 / config.sim.control_hz)
     e, n = 3, system.num_drones
     action = np.broadcast_to(np.array([-1.0, 0.0, 1.0])[:, None, None], (e, n, len(interface.numbers))).copy()
-    team = Team(
+    team = ControlContext(
         SystemState.zeros(e, n), Goal.zeros(e, n), Reference.zeros(e, n), Setpoint.zeros(e, n),
         np.tile(system.hook_force, (e, 1, 1)), np.zeros((e, n, 4)), make_gains(config.control, system),
     )  # fmt: skip

@@ -15,12 +15,12 @@ from torch.distributions import Independent, Normal
 from torchrl.modules import PopArtValueNorm
 
 from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, TeamNet, draw_action
-from multilift_marl.config.schema import EnvConfig
-from multilift_marl.config.train_schema import TrainConfig
-from multilift_marl.control.scripted import residual_matrix
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
+from multilift_marl.policies.baselines import base_matrix
+from multilift_marl.schema.sections import EnvConfig
+from multilift_marl.schema.training import TrainConfig
 
 _OBSERVATION, _ACTION, _LOG_PROB, _MEMORY = (
     ("agents", name) for name in ("observation", "action", "action_log_prob", "memory")
@@ -77,8 +77,8 @@ class Learner:
 
 
 def make_actor(config: TrainConfig, vec: MultiliftVec) -> Actor:
-    """Return an untrained policy for `vec`, which acts as its script."""
-    base = torch.from_numpy(residual_matrix(config.residual, vec))
+    """Return an untrained policy for `vec`, which acts as its base policy."""
+    base = torch.from_numpy(base_matrix(config.residual, vec))
     sizes = (vec.observation_size, vec.action_size)
     return Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru, config.asinh)
 
@@ -141,6 +141,7 @@ def check_batch(train: TrainConfig, vec: MultiliftVec, num_envs: int, rigs: int 
         )
     per_drone = 2 * (vec.observation_size + vec.action_size + train.gru) + 6
     needed = 4 * steps * (2 * vec.state_size + vec.num_drones * per_drone)
+    # float32; before and after each step observation, action and memory of each drone, and the global state.
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > there:
         raise ConfigError(
@@ -160,6 +161,8 @@ def estimate_advantage(learner: Learner, batch: TensorDictBase) -> tuple[torch.T
     next_value = learner.critic(learner.critic_input(following))
     gamma = torch.tensor(learner.config.gamma)
     discount = gamma * ~following["terminated"].unsqueeze(-2)
+    # `done` also where time is up: the next step is of another episode, so errors do not flow back across it. The value
+    # of the last state still counts there, by `discount`.
     decay = torch.tensor(learner.config.gae_lambda) * gamma * ~following["done"].unsqueeze(-2)
     delta = following["agents", "reward"] + discount * next_value - value
     advantage = torch.empty_like(delta)
@@ -183,7 +186,9 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
     estimates = [estimate_advantage(learner, batch) for batch in batches]
     advantages = torch.cat([advantage.flatten() for advantage, _ in estimates])
     mean, deviation = advantages.mean(), advantages.std().clamp(min=1e-6)
+    # A + V, the λ-return, which the critic is to fit.
     targets = torch.cat([(advantage + value).flatten() for advantage, value in estimates])
+    # 1 - Var(R - V)/Var(R): the advantage is R - V.
     explained = 1 - advantages.var() / targets.var().clamp(min=1e-8)
     tables = [
         _list_columns(learner, batch, (advantage - mean) / deviation, advantage + value)
@@ -195,6 +200,8 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
     diagnostics: list[torch.Tensor] = []
     stop = False
     for _ in range(config.epochs):
+        # Rigs may differ in their numbers of drones, so that their rows do not fit into one tensor: each is cut into as
+        # many chunks.
         orders = [torch.randperm(len(columns[0])).chunk(config.minibatches) for columns in tables]
         for chunks in zip(*orders, strict=True):
             learner.optimizer.zero_grad(set_to_none=True)
@@ -202,21 +209,26 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
                 _add_gradients(learner, [column.index_select(0, chunk) for column in columns], 1 / len(tables))
                 for columns, chunk in zip(tables, chunks, strict=True)
             ]
+            # Each by its own norm: a large gradient of the critic does not shorten the actor's step.
             norm = nn.utils.clip_grad_norm_(actor_parameters, config.max_grad_norm)
             nn.utils.clip_grad_norm_(critic_parameters, config.max_grad_norm)
             learner.optimizer.step()
             diagnostics.append(torch.cat([torch.stack(losses).mean(0), norm.detach()[None]]))
+        # The mean over an epoch: single minibatches are too noisy to stop by.
         if torch.stack(diagnostics[-config.minibatches :])[:, 0].mean() > config.target_kl:
             stop = True
             break
 
     # 3. Statistics of the observations, for the next rollouts.
     for batch in batches:
+        # After the update, or old log-probabilities would be of other inputs than the new ones, and the ratios not 1 at
+        # first.
         learner.actor.normalizer.update(batch[_OBSERVATION])
         learner.critic.normalizer.update(learner.critic_input(batch))
 
     names = ("approx_kl", "clip_fraction", "loss_policy", "loss_critic", "gradient_norm")
     result = dict(zip(names, torch.stack(diagnostics).mean(0).tolist(), strict=True))
+    # ½ log 2π e σ² of each number, the same in every state.
     entropy = 0.5 * torch.log(2 * torch.pi * torch.e * learner.actor.log_std.detach().exp() ** 2).sum()
     return result | {
         "explained_variance": explained.item(),
@@ -279,8 +291,11 @@ def surrogate_loss(
         memory = learner.actor.unroll(observation, memory, started)
     distribution = Independent(Normal(*learner.actor(observation, memory)), 1)
     log_ratio = (distribution.log_prob(action) - log_prob).unsqueeze(-1)
+    # Clipping the logarithm clips the ratio, to 1 - ε and 1 + ε.
     clipped = log_ratio.clamp((-clip).log1p(), clip.log1p())
+    # min(r A, clip(r) A): pessimistic, so that there is nothing to gain beyond the bounds but all to lose.
     gain = torch.stack([log_ratio.exp() * advantage, clipped.exp() * advantage], -1).min(dim=-1).values
+    # KL below: the mean of log π_old/π over what π_old drew, unbiased, and negative at times.
     share = (clipped != log_ratio).float().mean()
     return (-gain).mean(), distribution.entropy().mean(), -log_ratio.mean(), share
 
@@ -296,4 +311,5 @@ def adapted_rate(rate: float, kl: float, desired: float) -> float:
     """Return a learning rate that brings the KL of the next update closer to what is desired (Rudin et al. 2022)."""
     if kl > 2 * desired:
         return max(rate / 1.5, 1e-5)
+    # Factors and bounds are those of Rudin et al.
     return min(rate * 1.5, 1e-2) if kl < desired / 2 else rate

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from multilift_marl.tasks.global_state import DroneNumbers
+from multilift_marl.mdp.global_state import DroneNumbers
 
 if TYPE_CHECKING:  # policies need torch only
     from torchrl.modules import ValueNorm
@@ -55,11 +55,13 @@ class Normalizer(nn.Module):
         flat = batch.reshape(-1, batch.shape[-1]).to(torch.float64, copy=True)
         added, mean = flat.shape[0], flat.mean(0)
         delta, total = mean - self.mean, self.count + added
+        # Sums of squares about two means are joined by δ² n m/(n + m), without a second pass over the old ones.
         flat -= mean  # in place, like the square: this is a tenth of an update
         self.square += flat.mul_(flat).sum(0) + delta**2 * self.count * added / total
         self.mean += delta * added / total
         self.count.copy_(total)
         self.shift.copy_(self.mean)
+        # The floor of 0.01 leaves a constant number near 0, where 1/σ would blow up its round-off.
         self.scale.copy_(1.0 / (self.square / total).sqrt().clamp(min=1e-2))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -67,6 +69,7 @@ class Normalizer(nn.Module):
         rows = (x - self.shift).mul_(self.scale).clamp(-self.clip, self.clip)
         if not self.asinh:
             return rows
+        # Not shifted by the mean: the fine scale is fine about an error of zero, wherever the mean is.
         fine = (x * (self.asinh * self.scale)).asinh() / math.asinh(self.asinh)
         return torch.stack([rows, fine], -1).flatten(-2)
 
@@ -139,6 +142,7 @@ class TeamNet(nn.Module):
             return self.net(rows)
         held = self.embed(rows)
         if self.kind == "set":
+            # Over all, the own row among them: it is the same for each.
             others = held.mean(-2, keepdim=True).expand_as(held)
         else:
             teams = held.reshape(-1, *held.shape[-2:])
@@ -170,6 +174,7 @@ class Memory(nn.GRUCell):
                 memory = memory * goes_on[:, t]
             reset, update, new = nn.functional.linear(memory, self.weight_hh, self.bias_hh).chunk(3, -1)
             new = torch.tanh(new_in[:, t] + torch.sigmoid(reset_in[:, t] + reset) * new)
+            # h' = (1 - z) n + z h, as torch's own cell.
             memory = torch.lerp(new, memory, torch.sigmoid(update_in[:, t] + update))
             memories.append(memory)
         return torch.stack(memories, 1)
@@ -178,15 +183,15 @@ class Memory(nn.GRUCell):
 class Actor(nn.Module):
     """Gaussian policy of a drone, the same for all: observations (..., N, D) to mean and deviation (..., N, A).
 
-    Its mean is that of a linear script, `base` (A, D), plus a network whose last layer starts at zero: an untrained
-    team acts as the script. With a GRU the network takes the drone's memory beside the observation.
+    Its mean is that of a linear base policy, `base` (A, D), plus a network whose last layer starts at zero, so that an
+    untrained team acts as the base policy. With a GRU the network takes the drone's memory beside the observation.
 
     Args:
         kind: what drones know of each other; see `TeamNet`. With "local" each acts on its own observation alone.
         observation_size, action_size: D, A.
         hidden: widths of the hidden layers.
         initial_std: deviation at the start.
-        base: of the script.
+        base: matrix of the base policy (A, D).
         gru: H, size of the memory; 0 for a policy without.
         asinh: see `Normalizer`.
     """
@@ -200,6 +205,7 @@ class Actor(nn.Module):
         super().__init__()
         self.normalizer = Normalizer(observation_size, asinh)
         inputs = self.normalizer.outputs
+        # gain=0: the last layer starts at zero, and with it the network's part of the action.
         self.team = TeamNet(kind, inputs + gru, hidden, action_size, gain=0.0)
         self.memory = Memory(inputs, gru) if gru else None
         self.register_buffer("base", base)
@@ -216,6 +222,7 @@ class Actor(nn.Module):
         """
         rows = self.normalizer(observation)
         inputs = rows if memory is None else torch.cat([rows, memory], -1)
+        # The script reads the raw observation: its gains are in units, not in standard deviations.
         mean = self.team(inputs) + observation @ self.base.T
         return mean, self.log_std.exp().expand_as(mean)
 
@@ -239,6 +246,7 @@ def draw_action(mean: torch.Tensor, deviation: torch.Tensor, noise: torch.Tensor
         deviation: (A,), the same for all.
         noise: (..., N, A), standard normal.
     """
+    # log N(a; μ, σ) = -½ |noise|² - Σ log σ - ½ A log 2π, as a = μ + σ · noise: no need to look at a again.
     constant = deviation.log().sum() + 0.5 * math.log(2 * math.pi) * len(deviation)
     return torch.addcmul(mean, noise, deviation), noise.square().sum(-1).mul_(-0.5) - constant
 
@@ -277,6 +285,7 @@ class CentralCritic(nn.Module):
             shared, own, rest = rows.split([first, count * size, rows.shape[-1] - first - count * size], -1)
             own = own.reshape(*own.shape[:-2], count, size)
             rows = torch.cat([own, torch.cat([shared, rest], -1).expand(*own.shape[:-1], -1)], -1)
+        # The mean over the drones: no order of them can change it.
         value = self.value_norm.denormalize(self.team(rows).mean(-2, keepdim=True))
         return value.expand(*value.shape[:-2], count, 1)
 

@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
+from multilift_marl.agents.contract import AGAIN, Network, open_network, read_fields
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.control.policy import Policy
-from multilift_marl.control.scripted import SCRIPTED, make_scripted
-from multilift_marl.errors import CheckpointError, ConfigError, nearest, pip_install
+from multilift_marl.errors import CheckpointError, ConfigError, nearest, pip_install, reason
+from multilift_marl.plugins import identify, named
+from multilift_marl.policies.baselines import SCRIPTED, check_interface, make_scripted
+from multilift_marl.policies.policy import Policy
+from multilift_marl.trust import review, trusting
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -25,7 +28,7 @@ CONTRACT_FORMAT = "multilift_marl policy 1"  # of the contract beside an exporte
 _SHIPPED = Path(__file__).resolve().parents[1] / "policies"
 _NEEDED = {"config": dict, "actor": dict, "observation_names": list, "action_names": list, "frames": int}
 """What a policy needs of a checkpoint."""
-_NAMES = "script, module:Class, exported policy (.onnx), checkpoint (.pt), run folder or shipped policy"
+_NAMES = "baseline, module:Class, exported policy (.onnx), checkpoint (.pt), run folder or shipped policy"
 
 
 class TrainedPolicy:
@@ -104,19 +107,36 @@ class TrainedPolicy:
 
     def misfit(self, vec: MultiliftVec) -> str:
         """Return why the policy does not fit `vec`, as the rest of a sentence, "" if it does."""
-        trained, asked = self.config.control.action, vec.config.control.action
-        if trained != asked:
-            return f"was trained with control.action={trained} and cannot fly {asked}; set control.action={trained}"
-        parts = {"actions": (self.action_names, vec.action_names)}
-        parts["observations"] = (self.observation_names, vec.observation_names)
-        for kind, names in parts.items():
-            for i, (mine, its) in enumerate(zip_longest(*names, fillvalue="nothing")):
-                if mine != its:
-                    return (
-                        f"was trained in task {self.config.task} and cannot fly this {vec.task.name}: number {i} of "
-                        f"the {kind} is {mine} there and {its} here; fly what it was trained in, or another policy"
-                    )
+        if reason := self.misfit_config(vec.config):
+            return reason
+        if difference := self.first_difference(vec.action_names, vec.observation_names):
+            return (
+                f"was trained in task {self.config.task} and cannot fly this {vec.task.name}: {difference}; fly what "
+                "it was trained in, or another policy"
+            )
         return ""
+
+    def first_difference(self, actions: Iterable[str], observations: Iterable[str]) -> str:
+        """Return which number of an action or an observation has another name than there, "" if none has."""
+        difference = first_difference("actions", self.action_names, actions)
+        return difference or first_difference("observations", self.observation_names, observations)
+
+    def check(self, config: Config, role: str = "") -> None:
+        """Refuse environments, by a ConfigError, of which the configuration alone tells that it cannot fly them.
+
+        Args:
+            config: theirs.
+            role: the key that names the policy, for messages.
+        """
+        if reason := self.misfit_config(config):
+            raise ConfigError(f"the policy of {self.source} {reason}")
+
+    def misfit_config(self, config: Config) -> str:
+        """Return why the policy does not fit a configuration, as the rest of a sentence, "" if nothing tells so."""
+        trained, asked = self.config.control.action, config.control.action
+        if trained == asked:
+            return ""
+        return f"was trained with control.action={trained} and cannot fly {asked}; set control.action={trained}"
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget what was observed in the environments of the mask (E,) bool (None: all)."""
@@ -152,6 +172,7 @@ class LearnedPolicy(TrainedPolicy):
         from multilift_marl.agents.networks import Actor
 
         check_policy(content, source)
+        review(content["config"], source)
         config = build_config(content["config"])
         super().__init__(config, content["observation_names"], content["action_names"], source)
         self.frames: int = content["frames"]
@@ -189,29 +210,29 @@ class ExportedPolicy(TrainedPolicy):
         contract: see docs/export.md.
 
     Raises:
-        CheckpointError: network or contract are missing, damaged or foreign.
+        CheckpointError: network or contract are missing, damaged or foreign, or do not fit each other.
         ConfigError: the configuration is of another version, or a module that it needs is missing.
         ModuleNotFoundError: onnxruntime is missing.
     """
 
     def __init__(self, path: Path):
         self.contract = _read_contract(path)
-        try:
-            config, observation = self.contract["config"], self.contract["observation"]["names"]
-            action = [number["name"] for number in self.contract["action"]["numbers"]]
-        except (KeyError, TypeError) as error:
-            raise CheckpointError(f"the contract beside {path} lacks {error}; export the policy again") from error
-        super().__init__(build_config(config), observation, action, str(path))
-        self._session = _open(path)
+        needed = read_fields(self.contract, path.with_suffix(".json"))
+        review(needed.config, path)
+        action = [number.name for number in needed.action.numbers]
+        super().__init__(build_config(needed.config), needed.observation.names, action, str(path))
+        memory = 0 if needed.network.memory is None else needed.network.memory.size
+        if memory != (gru := self.config.train.gru):
+            raise CheckpointError(f"{path} has a memory of {memory} numbers, its contract train.gru={gru}; {AGAIN}")
+        self._network = Network(open_network(path), needed, str(path))
 
     def _act(self, observation: np.ndarray, memory: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-        given = {"observation": observation} | ({} if memory is None else {"memory": memory})
-        action, *after = self._session.run(None, given)
+        action, *after = self._network.run(observation, *(() if memory is None else (memory,)))
         return np.clip(action, -1, 1), after[0] if after else None
 
 
 class Script(NamedTuple):
-    """A script, or a class of one's own, by its name."""
+    """A baseline, or a class of one's own, by its name."""
 
     name: str
     config: None = None
@@ -219,6 +240,10 @@ class Script(NamedTuple):
     def bind(self, vec: MultiliftVec) -> Policy:
         """Return the policy for the environments, a ConfigError if it does not fit them."""
         return make_scripted(self.name, vec)
+
+    def check(self, config: Config, role: str = "") -> None:
+        """Do as `TrainedPolicy.check`."""
+        check_interface(self.name, config.control.action, role)
 
     def misfit(self, vec: MultiliftVec) -> str:
         """Return nothing: `bind` refuses what does not fit."""
@@ -241,51 +266,77 @@ def find_policy(name: str | Path, what: str = "policy", others: Iterable[str] = 
         CheckpointError, ConfigError: there is none, or it cannot be loaded.
     """
     text = str(name)
-    if text in SCRIPTED or ":" in text:
+    if text in SCRIPTED:
+        return Script(text)
+    if ":" in text:
+        named.add(identify(text.rpartition(":")[0]))
         return Script(text)
     known = text == "latest" or text.endswith((".onnx", ".pt")) or text in shipped_policies()
     if not known and not any(os.path.isdir(folder) for folder in (text, f"runs/{text}")):
-        raise ConfigError(f"unknown {what} '{text}'{nearest(text, [*SCRIPTED, *others])}: give a {_NAMES}")
+        known_names = [*SCRIPTED, *shipped_policies(), *others]
+        raise ConfigError(f"unknown {what} '{text}'{nearest(text, known_names)}: give a {_NAMES}")
     return load_policy(name)
 
 
-def load_policy(name: str | Path, checkpoint: str = "best") -> TrainedPolicy:
+def load_policy(name: str | Path, checkpoint: str = "best", trust: bool = False) -> TrainedPolicy:
     """Return a trained policy.
+
+    Modules that it was trained with (`import`) must be imported before, or trusted: what a file names may be anybody's.
 
     Args:
         name: a run folder, its name, "latest", a checkpoint file, the .onnx file of an exported policy, or the name of
             a shipped policy ("hover").
         checkpoint: of a run, "best" (the last one where there is no best), "last", or a file.
+        trust: whether the modules that it names may run.
 
     Raises:
         CheckpointError: missing, truncated or foreign.
-        ConfigError: its configuration is of another version, or a module that it needs is missing.
+        ConfigError: its configuration is of another version, or a module that it needs is missing or may not run.
         ModuleNotFoundError: a checkpoint needs torch, the `train` extra; an exported policy onnxruntime, `export`.
     """
+    with trusting(trust):
+        return ExportedPolicy(Path(name)) if str(name).endswith(".onnx") else _load_learned(name, checkpoint)
+
+
+def _load_learned(name: str | Path, checkpoint: str) -> LearnedPolicy:
+    """Return the policy of a checkpoint, see `load_policy`."""
+    file, folder = find_checkpoint(name, checkpoint)
+    from multilift_marl.agents.checkpoint import load_checkpoint
+
+    policy = LearnedPolicy(load_checkpoint(file), str(file))
+    policy.folder = folder
+    return policy
+
+
+def find_checkpoint(name: str | Path, checkpoint: str = "best") -> tuple[Path, Path]:
+    """Return the checkpoint file of a policy by name, and the folder that what is made of it belongs to.
+
+    Raises:
+        CheckpointError, ConfigError, ModuleNotFoundError: see `load_policy`.
+    """
     text = str(name)
-    if text.endswith(".onnx"):
-        return ExportedPolicy(Path(name))
     try:
-        from multilift_marl.agents.checkpoint import find_run, load_checkpoint
+        from multilift_marl.agents.checkpoint import find_run
     except ModuleNotFoundError as error:
         message = f"ml.load_policy needs {error.name}: {pip_install('train')}"
         raise ModuleNotFoundError(message, name=error.name) from error
     if text in shipped_policies() and not os.path.exists(text):
         if checkpoint != "best":
             raise ConfigError(f"checkpoint={checkpoint} means nothing to the shipped policy '{text}'; leave it out")
-        folder = Path("runs") / f"shipped-{text}"
-        file = _SHIPPED / f"{text}.pt"
-    elif os.path.isfile(text) or text.endswith(".pt"):
-        file = Path(name)
-        folder = file.parent
-    else:
-        folder = find_run(name)
-        file = folder / "checkpoints" / f"{checkpoint}.pt" if checkpoint in ("best", "last") else Path(checkpoint)
-        if checkpoint == "best" and not file.is_file():
-            file = file.with_name("last.pt")
-    policy = LearnedPolicy(load_checkpoint(file), str(file))
-    policy.folder = folder
-    return policy
+        return _SHIPPED / f"{text}.pt", Path("runs") / f"shipped-{text}"
+    if os.path.isfile(text) or text.endswith(".pt"):
+        return Path(name), Path(name).parent
+    folder = find_run(name, others=shipped_policies())
+    file = folder / "checkpoints" / f"{checkpoint}.pt" if checkpoint in ("best", "last") else Path(checkpoint)
+    return file if file.is_file() or checkpoint != "best" else file.with_name("last.pt"), folder
+
+
+def first_difference(kind: str, there: Iterable[str], here: Iterable[str]) -> str:
+    """Return which of the names of numbers differs, of "actions" say, "" if none does."""
+    for i, (mine, its) in enumerate(zip_longest(there, here, fillvalue="nothing")):
+        if mine != its:
+            return f"number {i} of the {kind} is {mine} there and {its} here"
+    return ""
 
 
 def check_policy(content: dict[str, Any], source: str) -> None:
@@ -320,28 +371,12 @@ def _read_contract(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"no exported policy {path}: give the .onnx file that multilift_marl.export wrote")
     file = path.with_suffix(".json")
-    again = "export the policy again, python -m multilift_marl.export run=<run>"
     try:
         contract = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise CheckpointError(f"{path} has no contract {file.name} beside it; put it there, or {again}") from None
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{file} is no contract of a policy; {again}") from error
+        raise CheckpointError(f"{path} has no contract {file.name} beside it; put it there, or {AGAIN}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{file} is no contract of a policy ({reason(error)}); {AGAIN}") from error
     if not isinstance(contract, dict) or contract.get("format") != CONTRACT_FORMAT:
-        raise CheckpointError(f"{file} was not written by multilift_marl (or by another version); {again}")
+        raise CheckpointError(f"{file} was not written by multilift_marl (or by another version); {AGAIN}")
     return contract
-
-
-def _open(path: Path) -> Any:
-    """Return onnxruntime's session of a network."""
-    try:
-        import onnxruntime
-    except ModuleNotFoundError as error:
-        message = f"{path} needs {error.name}: {pip_install('export')}"
-        raise ModuleNotFoundError(message, name=error.name) from error
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1  # for networks this small, more of them only wait for each other
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime has a kind of its own for everything that a file can lack
-        raise CheckpointError(f"{path} is truncated or no ONNX network; export the policy again") from error

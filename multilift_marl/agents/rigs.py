@@ -6,9 +6,9 @@ from typing import Any
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.config.train_schema import TrainConfig
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
+from multilift_marl.schema.training import TrainConfig
 
 _COMMON = ("task", "seed", "train", "eval", "env.num_envs", "env.policy_hz", "env.episode_seconds")
 

@@ -34,6 +34,7 @@ def exploration_noise(seed: int, envs: range, iteration: int, shape: tuple[int, 
     for row, e in zip(noise, envs, strict=True):
         sequence = np.random.SeedSequence(seed, spawn_key=(NOISE, e, iteration))
         np.random.Generator(np.random.PCG64(sequence)).standard_normal(out=row, dtype=np.float32)
+    # Drawn environment by environment, used step by step.
     return torch.from_numpy(noise).transpose(0, 1).contiguous()
 
 
@@ -82,7 +83,7 @@ class Rollouts:
         self.env.set_state(saved)
         self._restored = True
 
-    def close(self) -> None:
+    def close(self, at_once: bool = False) -> None:
         """Do nothing: there is no other process."""
 
     def _start(self) -> None:
@@ -91,6 +92,7 @@ class Rollouts:
             return
         vec = self.env.vec
         blank = torch.zeros(vec.num_envs, vec.num_drones, vec.action_size)
+        # Not of any stream: an iteration's noise is the same whether its rollouts are the first of a process or not.
         self._policy.noise = iter([blank])  # the collector acts once to see what a policy writes
         collector = Collector(
             self.env,
@@ -136,5 +138,5 @@ class RigRollouts:
             own = {key.partition("/")[2]: tensor for key, tensor in saved.items() if key.startswith(f"{k}/")}
             part.set_state(own)
 
-    def close(self) -> None:
+    def close(self, at_once: bool = False) -> None:
         """Do nothing: there is no other process."""

@@ -2,50 +2,48 @@
 
 from __future__ import annotations
 
-import itertools
-import signal
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from tqdm import tqdm
 
-from multilift_marl._platform import STOPPING, handles_signals
+from multilift_marl._files import check_writable
 from multilift_marl.agents.checkpoint import (
-    check_like,
     clear_leftovers,
+    copy_content,
     load_checkpoint,
     lock_run,
+    make_run_folder,
+    making_run,
     save_checkpoint,
     unlock_run,
 )
+from multilift_marl.agents.curriculum import Curriculum
+from multilift_marl.agents.environments import make_envs, make_rollouts
 from multilift_marl.agents.episodes import EpisodeStatistics
 from multilift_marl.agents.evaluator import Evaluator, Gain
-from multilift_marl.agents.logging import RunLog, write_versions
-from multilift_marl.agents.mappo import (
-    StochasticPolicy,
-    adapted_rate,
-    check_batch,
-    check_communication,
-    make_learner,
-    update,
-)
+from multilift_marl.agents.initial import find_initial
+from multilift_marl.agents.loggers import check_logger, hyperparameters
+from multilift_marl.agents.logging import RunLog, describe_evaluation, quietly, say, write_versions
+from multilift_marl.agents.mappo import adapted_rate, check_batch, make_learner, update
 from multilift_marl.agents.policy import check_policy
-from multilift_marl.agents.rigs import check_rigs, divide_rigs
-from multilift_marl.agents.rollouts import RigRollouts, Rollouts
-from multilift_marl.agents.workers import Workers
+from multilift_marl.agents.resuming import check_content, check_needed, load_networks
+from multilift_marl.agents.rigs import divide_rigs
+from multilift_marl.agents.stopping import Abandoned, Stopper
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, dump_config
+from multilift_marl.config.precedence import give_way
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason
 from multilift_marl.evaluation.rollout import trace_episode
-
-_NEEDED = ("critic", "optimizer", "rng", "env", "returns", "iteration", "seconds", "best_policy")
+from multilift_marl.plugins import import_modules
+from multilift_marl.trust import check_cluster, review
 
 
 class Trainer:
@@ -57,111 +55,140 @@ class Trainer:
         checkpoint: content of the checkpoint to go on from.
 
     Attributes:
-        status: exit status of a process whose training was stopped.
         evaluator: knows the best policy so far.
-        gain: what training gained over its script, once it has finished.
+        gain: what training gained over the policy that it began with, once it has finished.
+        curriculum: the stage that training is in.
+        taken_over: of `train.init`, what a new run starts with: actor, and critic where that fits.
     """
 
     def __init__(self, config: Config, folder: Path, checkpoint: dict[str, Any] | None = None):
         torch.set_num_threads(1)
         torch.manual_seed(config.seed)
+        config, initial = find_initial(config) if checkpoint is None else (config, None)
         self.config, self.folder = config, folder
-        for key in config.train.overrides:
-            if key.partition(".")[0] in ("task", "seed", "train", "eval"):
-                raise ConfigError(f"train.overrides changes the environment and cannot hold '{key}'; set {key} itself")
-        environment = build_config(config.model_dump(), config.train.overrides)
-        for env in (config.env, environment.env):
-            check_communication(config.train, env)
-        train, num_envs = config.train, environment.env.num_envs
-        rigs = divide_rigs(environment)
-        envs = [MultiliftEnv(rig, first_env=k * rig.env.num_envs, memory=train.gru) for k, rig in enumerate(rigs)]
-        check_rigs(train, [env.vec for env in envs])
+        check_logger(config.train.logger)
+        if config.train.workers:
+            check_cluster(config.train.ray)
+        self.curriculum = Curriculum(config, checkpoint)
+        environment = self.curriculum.environment
+        if initial is not None:
+            initial.check(divide_rigs(environment))
+        envs = make_envs(environment, self.curriculum.purpose)
         self.env = envs[0]
-        self.frames_per_batch = num_envs * train.horizon
-        check_batch(train, self.env.vec, num_envs, len(envs))
-        self.learner = make_learner(train, self.env)
-        self.rollouts: Rollouts | RigRollouts | Workers
-        if train.workers == 0:
-            policies = [self.learner.policy, *(StochasticPolicy(self.learner.actor) for _ in envs[1:])]
-            parts = [Rollouts(env, own, train.horizon, num_envs) for env, own in zip(envs, policies, strict=True)]
-            self.rollouts = RigRollouts(parts) if train.rigs else parts[0]
-        else:
-            self.rollouts = Workers(environment, self.learner.actor)
+        num_envs = environment.env.num_envs
+        self.frames_per_batch = num_envs * config.train.horizon
+        check_batch(config.train, self.env.vec, num_envs, len(envs))
+        self.learner = make_learner(config.train, self.env)
+        self.taken_over = "" if initial is None else initial.take_over(self.learner, config)
+        self._simulate(envs)
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
         self.evaluator = Evaluator(config)
         self.gain: Gain | None = None
-        self.episodes = EpisodeStatistics(self.env.vec, num_envs)
-        self._stop, self._warned, self._best_saved, self.status = False, False, True, 128 + signal.SIGINT
+        self._warned, self._best_saved = False, True
+        self._stopper = Stopper(self._rescue, say)
+        self._begun: dict[str, Any] | None = None  # what a checkpoint holds at the beginning of the iteration
+        self._saved_iteration = -1
         if checkpoint is not None:
             self._restore(checkpoint)
             torch.set_rng_state(checkpoint["rng"])
+            self._saved_iteration, self._stopper.worth = self.iteration, True
+        elif initial is not None:
+            self.evaluator.initial = copy_content(self._content())
 
-    def run(self) -> bool:
+    def run(self, ends: bool = False) -> bool:
         """Train to the end; return False if the user stopped it.
 
-        Ctrl-C, SIGTERM and SIGHUP save and stop, a second one stops at once; threads other than the main one leave
-        signals alone. A disk that is full is no reason to stop: what could not be written is written again after the
-        next iteration.
+        Ctrl-C, SIGTERM and SIGHUP save and stop, see `Stopper`. What is saved when an iteration takes too long is its
+        beginning: resumed, it is done again, bit for bit. A disk that is full is no reason to stop: what could not be
+        written is written again after the next iteration.
+
+        Args:
+            ends: whether a signal may end the process, which does nothing else; otherwise it may raise.
 
         Raises:
             CheckpointError: another process trains this run, or its end could not be saved.
+            KeyboardInterrupt: a second signal, or one before there is anything to save.
         """
+        self._stopper.ends = ends
         lock_run(self.folder)
         with ExitStack() as stack:
             stack.callback(unlock_run, self.folder)
-            stack.callback(self.rollouts.close)
+            stack.enter_context(self._stopper)
+            stack.callback(self._close)
             clear_leftovers(self.folder)
-            for number in STOPPING if handles_signals() else ():
-                if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup's stays
-                    stack.callback(signal.signal, number, signal.signal(number, self._interrupt))
-            log = RunLog(self.folder, self.iteration, self.frames)
+            log = RunLog(self.folder, self.iteration, self.frames, self.config.train.logger)
             stack.callback(log.close)
+            self._attempt(partial(log.write_hyperparameters, hyperparameters(self.config)))
             self._attempt(partial(log.write_text, "configuration", dump_config(self.config), self.frames))
             name = f"{self.config.task} {self.config.train.algorithm}"
             bar = tqdm(total=self.iterations, initial=self.iteration, desc=name, unit="it", dynamic_ncols=True)
-            stack.callback(_quietly, bar.close)
-            self._train(log, bar, name)
-        return not self._stop
+            stack.callback(quietly, bar.close)
+            try:
+                self._train(log, bar, name)
+            except Abandoned:
+                self._rescue()
+            except ConfigError:  # of workers that are lost, say
+                self._rescue()
+                raise
+            finally:
+                self._stopper.end()
+        return not self._stopper.asked
+
+    def _close(self) -> None:
+        """End the rollouts, those of the last stage."""
+        self.rollouts.close(at_once=self._stopper.ends and self._stopper.asked)
+
+    @property
+    def status(self) -> int:
+        """Exit status of a process whose training was stopped."""
+        return self._stopper.status
 
     def _train(self, log: RunLog, bar: tqdm, name: str) -> None:
         shown: dict[str, str] = {}
-        unsaved = False
+        unsaved = tabled = False
         self._best_saved = self._attempt(self._restore_best)
-        while not (self.finished or self._stop):
+        while not (self.finished or self._stopper.asked):
             start = time.perf_counter()
-            first = self.evaluator.best is None  # the untrained policy, which acts as the script
+            first = self.evaluator.best is None  # the policy that it begins with; untrained, it acts as its base policy
+            if not first:
+                # An iteration that is given up leaves networks and environments half-way: this is what is saved then.
+                self._begun = copy_content(self._content() | self._training_state())
             values = {} if first else self.step()
             if "return" in values:
                 shown["return"] = f"{values['return']:.0f}"
             last = self.iteration >= self.iterations
             if first or self.iteration % self.config.eval.every == 0 or last:
-                _quietly(bar.set_description, f"{name}, evaluating")
+                quietly(bar.set_description, f"{name}, evaluating")
                 values |= self.evaluate()
-                _quietly(bar.set_description, name)
-                shown["success"] = f"{values['eval/success_rate']:.0%}"
-                shown["error"] = f"{100 * values['eval/payload_position_error_m']:.2f} cm"
+                quietly(bar.set_description, name)
+                say(describe_evaluation(self.frames, values, header=not tabled))
+                tabled = True
                 shown["best"] = f"{values['eval/best_iteration']:.0f}"
             if last:
                 self.gain = self.evaluator.measure_gain(self.iteration)
                 values |= self.gain.values()
+            values |= self.curriculum.values()
             self._attempt(partial(log.write, {"iteration": self.iteration, "frames": self.frames}, values))
+            self._advance(values.get("eval/stage_success_rate"))
             self.seconds += time.perf_counter() - start
             if not self._best_saved:
                 self._best_saved = self._attempt(self._restore_best)
-            if unsaved or first or self.iteration % self.config.train.checkpoint_every == 0 or last or self._stop:
+            if (
+                unsaved
+                or first
+                or self.iteration % self.config.train.checkpoint_every == 0
+                or last
+                or self._stopper.asked
+            ):
                 unsaved = not self._attempt(partial(self.save, "last"))
             if values.get("eval/best_iteration") == self.iteration:
                 self._attempt(lambda: log.write_picture("flight", self._draw_best(), self.frames))
-            _quietly(bar.set_postfix, shown)
-            _quietly(bar.update, not first)
+            quietly(bar.set_postfix, shown)
+            quietly(bar.update, not first)
         if unsaved:
-            spare = Path(tempfile.gettempdir()) / f"{self.folder.name}-last.pt"
-            self.save("last", spare)
-            raise CheckpointError(
-                f"cannot write into {self.folder}: the run is saved as {spare}; make room, move it to "
-                f"{self.folder / 'checkpoints' / 'last.pt'}, and resume"
-            )
+            with self._stopper.writing():
+                self._save_elsewhere(self._content() | self._training_state())
 
     def _attempt(self, write: Callable[[], None]) -> bool:
         """Return whether `write` could write; say so if not, once."""
@@ -169,10 +196,23 @@ class Trainer:
             write()
         except (OSError, CheckpointError) as error:
             if not self._warned:
-                _quietly(tqdm.write, f"warning: {error}; training goes on and tries again after each iteration")
+                say(f"warning: {error}; training goes on and tries again after each iteration")
             self._warned = True
             return False
         return True
+
+    def _simulate(self, envs: list[MultiliftEnv]) -> None:
+        """Have the policy act in the environments of the present stage."""
+        self.env, environment = envs[0], self.curriculum.environment
+        self.rollouts = make_rollouts(environment, envs, self.learner)
+        self.episodes = EpisodeStatistics(self.env.vec, environment.env.num_envs)
+
+    def _advance(self, success: float | None) -> None:
+        """Go on to the next stage where the present one is over."""
+        if not self.finished and self.curriculum.is_over(self.frames, success):
+            self.rollouts.close()
+            say(self.curriculum.advance(self.iteration))
+            self._simulate(make_envs(self.curriculum.environment, self.curriculum.purpose))
 
     @property
     def finished(self) -> bool:
@@ -199,7 +239,7 @@ class Trainer:
         if train.desired_kl and self.iteration >= train.warmup:
             actor["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
         learning = values.pop("learning_seconds")
-        values |= self.episodes.read(batches, self.iteration)
+        values |= self.episodes.read(batches, self.iteration - self.curriculum.began)
         self.iteration += 1
         return values | {
             "learning_rate": rate,
@@ -218,12 +258,35 @@ class Trainer:
         values = self.evaluator.evaluate(self._content())
         if values["eval/best_iteration"] == self.iteration:
             self._best_saved = self._attempt(partial(self.save, "best"))
+        if self.curriculum.needs_success:
+            success = self.evaluator.measure_success(self._content(), self.curriculum.environment)
+            values["eval/stage_success_rate"] = success
         return values
 
     def save(self, name: str, path: Path | None = None) -> None:
         """Write checkpoints/<name>.pt, or `path`; a CheckpointError if that cannot be."""
         path = path or self.folder / "checkpoints" / f"{name}.pt"
-        save_checkpoint(path, self._content() | self._training_state())
+        with self._stopper.writing():
+            save_checkpoint(path, self._content() | self._training_state())
+            if name == "last":
+                self._saved_iteration = self.iteration
+
+    def _rescue(self) -> None:
+        """Save the beginning of the iteration that is given up, unless that, or its end, is on the disk."""
+        if self._begun is not None and self._begun["iteration"] > self._saved_iteration:
+            try:
+                save_checkpoint(self.folder / "checkpoints" / "last.pt", self._begun)
+            except CheckpointError:
+                self._save_elsewhere(self._begun)
+
+    def _save_elsewhere(self, content: dict[str, Any]) -> NoReturn:
+        """Write what the run's folder does not take; a CheckpointError says where."""
+        spare = Path(tempfile.gettempdir()) / f"{self.folder.name}-last.pt"
+        save_checkpoint(spare, content)
+        raise CheckpointError(
+            f"cannot write into {self.folder}: the run is saved as {spare}; make room, move it to "
+            f"{self.folder / 'checkpoints' / 'last.pt'}, and resume"
+        )
 
     def _content(self) -> dict[str, Any]:
         """Return what a policy needs."""
@@ -250,45 +313,24 @@ class Trainer:
             "returns": torch.from_numpy(self.episodes.returns.copy()),
             "seconds": self.seconds,
             "best_policy": self.evaluator.best,
+            **({} if self.evaluator.initial is None else {"initial_policy": self.evaluator.initial}),
+            **self.curriculum.state(),
         }
 
     def _restore(self, content: dict[str, Any]) -> None:
-        if missing := [key for key in _NEEDED if key not in content]:
-            raise CheckpointError(
-                f"the checkpoint cannot be resumed, '{missing[0]}' is missing; give a training run's, of this version"
-            )
+        """Go on from the content of a checkpoint, a CheckpointError if it does not fit."""
+        check_needed(content, self.config.train)
         try:
-            self._load(content)
+            check_content(content, self._content() | self._learning_state(), self.learner)
+            self.rollouts.set_state(content["env"])
+            load_networks(content, self.learner)
         except Exception as error:  # torch's optimizers raise many kinds
             raise CheckpointError(
                 f"the checkpoint does not fit this version or system ({reason(error)}); train anew"
             ) from error
-
-    def _load(self, content: dict[str, Any]) -> None:
-        optimizer = self.learner.optimizer
-        own = self._content() | self._learning_state()
-        for key in ("critic", "rng", "returns", "iteration", "seconds"):
-            check_like(content[key], own[key], key)
-        if content["best_policy"] is not None:
-            check_policy(content["best_policy"], "'best_policy'")
-            check_like(content["best_policy"]["actor"], self.learner.actor.state_dict(), "best_policy.actor")
-        check_like(content["actor"], self.learner.actor.state_dict(), "actor")
-        torch.Generator().set_state(content["rng"])  # refuses what is no state
-        if content["iteration"] < 0:
-            raise ValueError("'iteration' is negative")
-        self.rollouts.set_state(content["env"])
-        self.learner.actor.load_state_dict(content["actor"])
-        self.learner.critic.load_state_dict(content["critic"])
-        optimizer.load_state_dict(content["optimizer"])
-        for group, expected in zip(optimizer.param_groups, own["optimizer"]["param_groups"], strict=True):
-            for key in expected.keys() - {"params"}:
-                check_like(group[key], expected[key], f"optimizer.{key}")
-        for parameter, moments in optimizer.state.items():
-            like = {"step": torch.zeros(()), "exp_avg": parameter.data, "exp_avg_sq": parameter.data}
-            check_like(moments, like, "optimizer.state")
         self.episodes.returns[:] = content["returns"].numpy()
         self.iteration, self.seconds = content["iteration"], content["seconds"]
-        self.evaluator.best = content["best_policy"]
+        self.evaluator.best, self.evaluator.initial = content["best_policy"], content.get("initial_policy")
 
     def _restore_best(self) -> None:
         """Write the best policy of a resumed run, which may have found another one after its last checkpoint."""
@@ -305,45 +347,23 @@ class Trainer:
         plot_paths(path, trace, f"best policy so far, iteration {self.iteration}")
         return path
 
-    def _interrupt(self, signum: int, frame: Any) -> None:
-        if self._stop:
-            raise KeyboardInterrupt
-        self._stop, self.status = True, 128 + signum
-        _quietly(tqdm.write, "stopping after this iteration; press Ctrl-C again to stop at once")
-
-
-def _quietly(show: Callable[..., object], *arguments: Any) -> None:
-    """Show something on a terminal that may be gone."""
-    with suppress(OSError):
-        show(*arguments)
-
 
 def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Trainer:
     """Return the trainer of a new run in runs/<name>-<time>-s<seed>/, with configuration and versions in it.
 
     Raises:
-        ConfigError: what cannot be trained; no folder is made then.
+        ConfigError: what cannot be trained, or written there; no folder is made then.
     """
+    with making_run(runs):
+        check_writable(runs)
     trainer = Trainer(config, runs)
-    try:
+    with making_run(runs):
         runs.mkdir(parents=True, exist_ok=True)
-        trainer.folder = _make_folder(runs, f"{name}-{time.strftime('%Y%m%d-%H%M%S')}-s{config.seed}")
+        trainer.folder = make_run_folder(runs, f"{name}-{time.strftime('%Y%m%d-%H%M%S')}-s{config.seed}")
         (trainer.folder / "checkpoints").mkdir()
-    except OSError as error:
-        raise ConfigError(f"cannot make a run in {runs}/ ({reason(error)}); train in another folder") from error
-    (trainer.folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
-    write_versions(trainer.folder)
+        (trainer.folder / "config.yaml").write_text(dump_config(trainer.config), encoding="utf-8")
+        write_versions(trainer.folder)
     return trainer
-
-
-def _make_folder(runs: Path, stem: str) -> Path:
-    """Return a new folder of this name, or of the next one that is free."""
-    for again in itertools.count(1):
-        folder = runs / (stem if again == 1 else f"{stem}-{again}")
-        with suppress(FileExistsError):
-            folder.mkdir()
-            break
-    return folder
 
 
 def resume_run(folder: Path, overrides: dict[str, Any]) -> Trainer:
@@ -351,13 +371,16 @@ def resume_run(folder: Path, overrides: dict[str, Any]) -> Trainer:
 
     Raises:
         CheckpointError: there is none that can be read, or another process trains this run.
-        ConfigError: an override that a run in progress cannot take.
+        ConfigError: an override that a run in progress cannot take; a module or a cluster that only the run names, see
+            `trust.review`.
     """
+    import_modules(overrides.get("import"))
     lock_run(folder)
     path = folder / "checkpoints" / "last.pt"
     content = load_checkpoint(path)
     check_policy(content, str(path))
-    config = build_config(content["config"], overrides)
+    review(content["config"], path)
+    config = build_config(give_way(content["config"], overrides), overrides)
     trainer = Trainer(config, folder, content)
     (folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
     return trainer

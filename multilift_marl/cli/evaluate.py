@@ -4,56 +4,70 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from multilift_marl.agents.policy import find_policy, load_policy
-from multilift_marl.cli.common import UNTRAINED, limit_torch_threads, make_folder, run_command, split_options, title
+from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
+from multilift_marl.agents.policy import NamedPolicy, find_policy, load_policy, shipped_policies
+from multilift_marl.command import (
+    UNTRAINED,
+    CommandOptions,
+    limit_torch_threads,
+    make_folder,
+    run_command,
+    spell_command,
+    split_options,
+    title,
+)
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, load_config
-from multilift_marl.config.values import Between, Float, Int, Section
-from multilift_marl.control.scripted import fitting_scripts
+from multilift_marl.config.load import build_config, list_configs, load_config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError
-from multilift_marl.evaluation.apart import cluster, fly_apart
-from multilift_marl.evaluation.metrics import format_table, make_report, write_report
-from multilift_marl.evaluation.rollout import Trace, fly_episodes, trace_episode
+from multilift_marl.evaluation.metrics import format_reasons, format_table, make_report, write_report
+from multilift_marl.evaluation.parallel import cluster, evaluate_parallel
+from multilift_marl.evaluation.rollout import Trace, run_episodes, trace_episode
+from multilift_marl.evaluation.trajectories import TrajectoryWriter
+from multilift_marl.policies.baselines import SCRIPTED, fitting_scripts
+from multilift_marl.schema.values import Between, Float, Int
 
-_USAGE = """Evaluate a team on fixed seeds, beside the scripted ones on the same episodes.
+_USAGE = """Evaluate a team on fixed seeds, beside the baselines on the same episodes.
 
   python evaluate.py run=latest episodes=200 seed=1000 baseline=formation_integral video=true [key=value ...]
+  python evaluate.py run=hover config=rigs/falcon3 [key=value ...]
   python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
-Scripts are formation, formation_integral, formation_feedback, formation_gusts, formation_lead, formation_narrow,
+Baselines are formation, formation_integral, formation_feedback, formation_gusts, formation_lead, formation_narrow,
 formation_redistributed and payload_geometric; hold_velocity, hold_acceleration, hold_acc_rates, hold_ctbr, hold_ctbm
 and hold_rotor with these action interfaces. task=<other> keeps the configuration's vehicles, payload, cables and
 control, see python train.py --help.
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
 
 
-class Options(Section):
+class Options(CommandOptions):
     """Keys of the command beside those of the configuration."""
 
     run: str = Field("latest", description='a run folder, its name, "latest", or a shipped policy ("hover")')
     policy: str | None = Field(
-        None, description="in place of a run: a script, one's own class (module:Class, file.py:Class), .onnx, .pt"
+        None, description="in place of a run: a baseline, one's own class (module:Class, file.py:Class), .onnx, .pt"
     )
     config: str | None = Field(
-        None, description="environment of that policy, name or path; None: what it was trained in, of scripts hover"
+        None, description="environment to fly in, name or path; None: what it was trained in, of baselines hover"
     )
     checkpoint: str = Field("best", description="of the run: best, last, or a file")
     episodes: Annotated[Int, Between(1, 1e6)] = Field(200, description="how many")
     seed: Int = Field(1000, ge=0, description="evaluation seed: episode i is the same for every policy")
     baseline: str | None = Field(
         None,
-        description="drawn beside the policy, named like it, or a run; none: the policy alone; None: a script",
+        description="drawn beside the policy, named like it, or a run; none: the policy alone; None: the one that fits",
     )
     video: bool = Field(False, description="also an mp4 of the first episode")
+    plots: Literal["png", "pdf"] = Field("png", description="of plots; pdf: both, for papers")
     camera: Literal["side", "top", "chase"] = Field("side", description="of the video")
     trail: Annotated[Float, Between(0, 1000, "s")] = Field(
         2.0, description="[s] of the paths that the video draws behind drones and payload"
@@ -61,26 +75,59 @@ class Options(Section):
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the first episode, see docs/ros.md")
     ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of that bag")
     names: Literal["multilift", "report"] = Field("multilift", description="of its topics: ours or the report's")
+    trajectories: bool = Field(
+        False, description="also states, actions, rotor thrusts, references and tensions of all episodes, in out"
+    )
     workers: Annotated[Int, Between(0, 1024)] = Field(0, description="processes of Ray that fly the episodes; 0: none")
     ray: str = Field("auto", description="cluster of these workers, as train.ray (docs/ray.md)")
     out: str | None = Field(
-        None, description="folder for metrics.json, plots and video; None: <run>/eval/<time>, of a script runs/..."
+        None, description="folder for metrics.json, plots and video; None: <run>/eval/<time>, of a baseline runs/..."
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate; return the exit status."""
-    return run_command(_evaluate, _USAGE, Options, arguments)
+    return run_command(partial(_evaluate, alone=arguments is None), _USAGE, Options, arguments)
 
 
-def _evaluate(values: dict[str, Any]) -> int:
+def _evaluate(values: dict[str, Any], alone: bool) -> int:
+    """Evaluate; `alone` says whether this process does nothing else, so that a signal may end it."""
     options, overrides = split_options(Options, values)
+    with ending_at_once() if alone else nullcontext():
+        config, makers, team, options = _build(options, overrides)
+    out = make_folder(Path(options.out) if options.out else team.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
+
+    with ExitStack() as files:
+        writer = None
+        if options.trajectories:
+            writer = files.enter_context(TrajectoryWriter(out, config, options.episodes, options.seed))
+        episodes = _fly_all(config, makers, team, options, writer)
+        report = make_report(config, options.seed, episodes.pop(team.name), episodes)
+        print(f"\n{team.source}: {options.episodes} episodes, seed {options.seed}; mean (95 % interval)\n")
+        print(format_table(report, team.name))
+        if reasons := format_reasons(report, team.name):
+            print(f"\n{reasons}")
+        write_report(out / "metrics.json", report)
+        print(f"\nwrote {out / 'metrics.json'}")
+        if writer is not None:
+            writer.finish()
+            print("wrote " + " and ".join(str(path) for path in writer.files))
+    with interrupted_by_signals():  # anew: Ray takes handlers away when it ends
+        _draw(config, makers, team, options, out)
+    return 0
+
+
+def _build(options: Options, overrides: dict[str, Any]) -> tuple[Config, dict[str, Any], _Team, Options]:
+    """Return environment, makers of all policies by name, the team, and the options with their baseline."""
     _check_source(options)
     chosen = options.baseline
     baseline = None if chosen in (None, "none") else find_policy(chosen, "baseline", ["none"])
-    team = _find_run(options) if options.policy is None else _find_named(options, options.policy, overrides)
+    team = _find_team(options, overrides)
     limit_torch_threads()
     config = build_config(team.config.model_dump(), {"env.num_threads": 0} | overrides)
+    team.check(config)
+    if baseline is not None:
+        baseline.check(config, "baseline")
     _ = config.system
     probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
     makers, fitting = {team.name: team.make}, fitting_scripts(probe)
@@ -94,49 +141,40 @@ def _evaluate(values: dict[str, Any]) -> int:
     for make in makers.values():  # refuses what does not fit, before there is a folder
         make(probe)
     if options.bag is not None:
-        from multilift_marl.ros.bag import check_free
+        from multilift_marl.deploy.ros.bag import check_free
 
         check_free(Path(options.bag))
-    out = make_folder(Path(options.out) if options.out else team.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
-
-    order = sorted(makers, key=lambda name: ":" not in name)  # one's own first: should they fail, nothing is lost
-    with ExitStack() as stack:
-        if options.workers:
-            stack.enter_context(cluster(options.ray, options.workers))
-        episodes = {name: _fly(config, makers[name], name, options) for name in order}
-    report = make_report(config, options.seed, episodes.pop(team.name), episodes)
-    print(f"\n{team.source}: {options.episodes} episodes, seed {options.seed}; mean (95 % interval)\n")
-    print(format_table(report, team.name))
-    write_report(out / "metrics.json", report)
-    print(f"\nwrote {out / 'metrics.json'}")
-    _draw(config, makers, team, options, out)
-    return 0
+    return config, makers, team, options
 
 
 class _Team(NamedTuple):
     """What is evaluated."""
 
     name: str
-    """Of its column: "policy" for a learned one, else the script's."""
+    """Of its column: "policy" for a learned one, else its name."""
     source: str
     config: Config
     make: Callable[[MultiliftVec], Any]
     folder: Path
     """That its evaluations belong to."""
+    check: Callable[[Config], None]
+    """Refuses environments that it cannot fly, before they are made."""
 
 
 def _check_source(options: Options) -> None:
-    """Refuse keys of a run beside another policy, and the other way round."""
-    named = options.policy is not None
-    wrong = [key for key in (("run", "checkpoint") if named else ("config",)) if key in options.model_fields_set]
-    if wrong and named:
+    """Refuse keys of a run beside another policy, and a configuration alone."""
+    wrong = [key for key in ("run", "checkpoint") if key in options.model_fields_set]
+    if options.policy is not None and wrong:
         raise ConfigError(f"policy={options.policy} takes the place of a run and has no {wrong[0]}; leave out one")
-    if wrong:
-        raise ConfigError("a run brings its own configuration: leave out config, or fly a script by policy=formation")
+    if options.config is not None and options.policy is None and "run" not in options.model_fields_set:
+        raise ConfigError(
+            f"config={options.config} says where to fly, but not who does: add run=<run or shipped policy>, run=latest "
+            "say, or policy=formation"
+        )
 
 
-def _find_named(options: Options, name: str, overrides: dict[str, Any]) -> _Team:
-    policy = find_policy(name)
+def _find_named(options: Options, policy: NamedPolicy, name: str, overrides: dict[str, Any]) -> _Team:
+    """Return a policy by name in the environment of `config`, in its own one where that is not given."""
     if policy.config is None or options.config is not None:
         config = load_config(options.config or "hover", overrides)
         where = title(overrides | {"config": options.config})
@@ -144,27 +182,76 @@ def _find_named(options: Options, name: str, overrides: dict[str, Any]) -> _Team
         config, where = policy.config, policy.config.task
     module, _, kind = name.rpartition(":")
     label = f"{Path(module).name.removesuffix('.py')}.{kind}" if module else Path(name).stem
-    return _Team(name, f"{name} on {where}", config, policy.bind, Path("runs") / f"{label}-{where}")
+    return _Team(
+        name,
+        f"{name} on {where}",
+        config,
+        policy.bind,
+        Path("runs") / f"{label}-{where}",
+        partial(policy.check, role="policy"),
+    )
 
 
-def _find_run(options: Options) -> _Team:
+def _find_team(options: Options, overrides: dict[str, Any]) -> _Team:
+    if options.config is not None:
+        load_config(options.config, overrides)  # whose name is checked before any policy is loaded
+    if options.policy is not None:
+        _refuse_recipe("policy", options.policy)
+        return _find_named(options, find_policy(options.policy), options.policy, overrides)
+    _refuse_recipe("run", options.run)
     policy = load_policy(options.run, options.checkpoint)
     if options.checkpoint == "best" and getattr(policy, "frames", None) == 0:
         print(f"note: {UNTRAINED}")
-    return _Team("policy", policy.source, policy.config, policy.bind, policy.folder)
+    if options.config is not None:
+        return _find_named(options, policy, options.run, overrides)
+    return _Team("policy", policy.source, policy.config, policy.bind, policy.folder, policy.check)
 
 
-def _fly(config: Config, maker: Any, name: str, options: Options) -> dict[str, np.ndarray]:
+def _refuse_recipe(key: str, name: str) -> None:
+    """Refuse the name of a recipe that no policy has, and say what it is good for."""
+    taken = name in (*SCRIPTED, *shipped_policies()) or any(Path(each).exists() for each in (name, f"runs/{name}"))
+    if name in list_configs() and not taken:
+        train = spell_command("train", f"config={name}")
+        raise ConfigError(
+            f"{key}={name} is a recipe that no shipped policy was trained by; train one by {train}, or fly a baseline "
+            f"in it by policy=formation config={name}"
+        )
+
+
+def _fly_all(
+    config: Config, makers: dict[str, Any], team: _Team, options: Options, writer: TrajectoryWriter | None
+) -> dict[str, dict[str, np.ndarray]]:
+    """Return the metrics of each policy's episodes by name; record those of the team."""
+    order = sorted(makers, key=lambda name: ":" not in name)  # one's own first: should they fail, nothing is lost
+    with interrupted_by_signals(), ExitStack() as stack:
+        if options.workers:
+            stack.enter_context(cluster(options.ray, options.workers))
+            stack.enter_context(interrupted_by_signals())  # in place of Ray's handler
+        return {
+            name: fly(
+                config, makers[name], name, options.episodes, options.seed, options.workers,
+                writer=writer if name == team.name else None,
+            )
+            for name in order
+        }  # fmt: skip
+
+
+def fly(
+    config: Config, maker: Any, name: str, episodes: int, seed: int, workers: int = 0,
+    factors: Mapping[str, Any] | None = None, writer: TrajectoryWriter | None = None,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Do as `run_episodes`, or `evaluate_parallel` with workers, beside a bar with the name of what flies."""
     from tqdm import tqdm
 
-    with tqdm(total=options.episodes, desc=name, unit="episode", leave=False) as bar:
+    with tqdm(total=episodes, desc=name, unit="episode", leave=False) as bar:
 
         def progress(done: int) -> None:
             bar.update(done - bar.n)
 
-        if options.workers:
-            return fly_apart(config, maker, options.episodes, options.seed, options.workers, progress)
-        return fly_episodes(config, maker, options.episodes, options.seed, progress=progress)
+        if workers:
+            return evaluate_parallel(config, maker, episodes, seed, workers, progress, factors, writer)
+        record = None if writer is None else writer.record
+        return run_episodes(config, maker, episodes, seed, progress=progress, factors=factors, record=record)
 
 
 def _draw(config: Config, makers: dict[str, Any], team: _Team, options: Options, out: Path) -> None:
@@ -175,14 +262,15 @@ def _draw(config: Config, makers: dict[str, Any], team: _Team, options: Options,
     names = dict.fromkeys([team.name, *beside])
     traces = {name: trace_episode(config, makers[name], 0, options.seed) for name in names if name != team.name}
     traces = {team.name: _trace(config, team, options)} | traces
-    plots.plot_errors(out / "errors.png", traces)
-    plots.plot_tensions(out / "tensions.png", traces[team.name], f"{team.name}, episode 0")
-    plots.plot_paths(out / "paths.png", traces[team.name], f"{team.name}, episode 0")
+    above, pdf = f"{team.name}, episode 0", options.plots == "pdf"
+    plots.plot_errors(out / "errors.png", traces, pdf)
+    plots.plot_tensions(out / "tensions.png", traces[team.name], above, pdf)
+    plots.plot_paths(out / "paths.png", traces[team.name], above, pdf)
     if options.policy is None:
         from multilift_marl.agents.logging import read_metrics
 
         if rows := read_metrics(team.folder):
-            plots.plot_training(out / "training.png", rows)
+            plots.plot_training(out / "training.png", rows, pdf)
     print(f"wrote plots in {out}")
     if options.video:
         try:
@@ -195,7 +283,7 @@ def _trace(config: Config, team: _Team, options: Options) -> Trace:
     """Return the trace of the first episode; record it in a bag if asked."""
     if options.bag is None:
         return trace_episode(config, team.make, 0, options.seed)
-    from multilift_marl.ros.bag import BagWriter
+    from multilift_marl.deploy.ros.bag import BagWriter
 
     bags: list[BagWriter] = []
     with ExitStack() as stack:
@@ -204,7 +292,8 @@ def _trace(config: Config, team: _Team, options: Options) -> Trace:
             if not bags:
                 folder = Path(str(options.bag))
                 bags.append(stack.enter_context(BagWriter(folder, vec, options.ros, options.names)))
-            bags[0].write(vec.steps[0] * vec.task.dt)
+            else:
+                bags[0].write(vec.steps[0] * vec.task.dt)
 
         trace = trace_episode(config, team.make, 0, options.seed, record)
     print(f"wrote {options.bag}")
@@ -220,7 +309,7 @@ def _film(config: Config, maker: Any, options: Options, path: Path) -> None:
     tools: list[Any] = []  # made with the first frame, so that no empty file is left where there is no OpenGL
     with ExitStack() as stack:
         steps = round(config.env.episode_seconds * config.env.policy_hz)
-        bar = stack.enter_context(tqdm(total=steps // 2, desc="filming", unit="frame", leave=False))
+        bar = stack.enter_context(tqdm(total=steps // 2 + 1, desc="filming", unit="frame", leave=False))
 
         def shoot(vec: Any) -> None:
             if not tools:

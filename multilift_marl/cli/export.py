@@ -4,34 +4,40 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field
 
-from multilift_marl.cli.common import make_folder, run_command, split_options
-from multilift_marl.config.values import Section
+from multilift_marl._interrupt import ending_at_once
+from multilift_marl.command import CommandOptions, make_folder, run_command, split_options
 from multilift_marl.errors import ConfigError
+from multilift_marl.schema.values import Between, Int
 
 _USAGE = """Write a trained policy as an ONNX network and a contract of its inputs and outputs (docs/export.md).
 
-  python -m multilift_marl.export run=latest [out=<folder>]
+  python -m multilift_marl.export run=latest [out=<folder>] [opset=18]
 
 import=<module> says where a module of one's own is that the run was trained with."""
 
 
-class Options(Section):
+class Options(CommandOptions):
     """Keys of the command."""
 
     run: str = Field("latest", description='a run folder, "latest", a checkpoint file, or a shipped policy ("hover")')
     out: str | None = Field(
         None, description="folder for policy.onnx and policy.json; None: <run>/export, runs/shipped-<name>/export"
     )
+    opset: Annotated[Int | None, Between(7, 100)] = Field(
+        None, description="version of ONNX's operators, for an older runtime; None: the exporter's own"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Export; return the exit status."""
-    return run_command(_export, _USAGE, Options, arguments, configuration=None)
+    with ending_at_once() if arguments is None else nullcontext():
+        return run_command(_export, _USAGE, Options, arguments, configuration=None)
 
 
 def _export(values: dict[str, Any]) -> int:
@@ -44,7 +50,7 @@ def _export(values: dict[str, Any]) -> int:
 
     policy = load_policy(options.run)
     out = make_folder(policy.folder / "export" if options.out is None else Path(options.out))
-    contract = export_policy(policy, out)
+    contract = export_policy(policy, out, options.opset)
     sizes = [len(contract["observation"]["names"]), len(contract["action"]["numbers"])]
     print(
         f"{policy.source}: {contract['task']}, {sizes[0]} numbers to {sizes[1]} for each drone, "

@@ -1,1 +1,1 @@
-"""Configuration: schema, values, files, loading."""
+"""A configuration, loaded: names, files, overrides, fragments."""

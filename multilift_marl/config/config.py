@@ -7,19 +7,21 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from multilift_marl.config.files import pin_files
-from multilift_marl.config.schema import ControlConfig, RewardTerm, SystemConfig
-from multilift_marl.config.train_schema import EvalConfig, TrainConfig
 from multilift_marl.config.units import scale_control
 from multilift_marl.rig.resolve import resolve_system
 from multilift_marl.rig.system import System
+from multilift_marl.schema.files import pin_options
+from multilift_marl.schema.planner import PlannerConfig
+from multilift_marl.schema.sections import ControlConfig, RewardTerm, SystemConfig
+from multilift_marl.schema.training import EvalConfig, TrainConfig
 
 
 class Config(SystemConfig):
     """What is simulated, and what a task and its training make of it."""
 
     reward: dict[str, RewardTerm] = Field({}, description="weight of a reward term of the task, or weight and margin")
-    task_options: Annotated[dict[str, Any], AfterValidator(pin_files)] = Field({}, description="options of the task")
+    task_options: Annotated[dict[str, Any], AfterValidator(pin_options)] = Field({}, description="options of the task")
+    planner: PlannerConfig = PlannerConfig()
     train: TrainConfig = TrainConfig()
     eval: EvalConfig = EvalConfig()
 

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from difflib import get_close_matches
 from functools import reduce
 from pathlib import Path
 from typing import Any
 
+from multilift_marl.config.aliases import stored_names
 from multilift_marl.config.config import Config
-from multilift_marl.config.files import as_mapping, is_yaml
-from multilift_marl.config.validate import validate
-from multilift_marl.config.values import Section
-from multilift_marl.config.yaml_text import parse_yaml, read_yaml, write_yaml
-from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest, reason, shorten
-from multilift_marl.plugins import import_modules, load_entry_points
+from multilift_marl.config.precedence import give_way
+from multilift_marl.errors import ConfigError, UnknownKeywordError, called_elsewhere, nearest, reason, shorten
+from multilift_marl.plugins import identify, import_modules, load_entry_points, named, refused
+from multilift_marl.schema.files import as_mapping, change_files, is_yaml
+from multilift_marl.schema.validate import validate
+from multilift_marl.schema.values import Section
+from multilift_marl.schema.yaml_text import parse_yaml, read_yaml, write_yaml
+from multilift_marl.trust import name_cluster, review, trusting
 
 _MOST_SECTIONS = 5  # of a key's name; what is deeper is unknown anyway
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -53,12 +57,15 @@ def register_config(name: str, source: str | Path | Mapping[str, Any]) -> None:
     CONFIGS[name] = source
 
 
-def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None = None) -> Config:
+def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None = None, trust: bool = False) -> Config:
     """Return typed defaults < the configuration `name` < `overrides`.
 
     Where `overrides` name a `task` other than its own, that task's configuration (typed defaults if it has none) takes
     its place, and of `name` only the system counts, which goes over it: env.num_drones, sim, vehicle, payload, cable,
     control and wind. So a rig can be given any task.
+
+    What is overridden goes before what the configuration changes in training alone, `train.overrides` and `train.rigs`,
+    unless these are overridden, too; so does what a configuration says itself before those of its bases.
 
     A configuration may name others below it, `base: rigs/auto6` or a list: its own values go over theirs; of bases with
     another task only the system counts.
@@ -67,16 +74,19 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
         name: a shipped configuration's name, one's own, or the path of a YAML file.
         overrides: values by dotted name, such as {"payload.mass": 2.0}; mappings add to what is there, but an empty one
             drops it where names are free: {"train.overrides": {}}, {"task_options": {}}, {"reward": {}}.
+        trust: whether the file may run the modules that it names by `import`, beside those that `overrides` name.
 
     Raises:
-        ConfigError: an unknown name or key, a wrong type or a value out of range.
+        ConfigError: an unknown name or key, a wrong type, a value out of range, or a module that may not run.
     """
-    overrides = overrides or {}
+    overrides = stored_names(overrides or {})
     import_modules(overrides.get("import"))  # they may bring the configuration
-    values = _read(name)
-    if (task := overrides.get("task", values.get("task"))) != values.get("task"):
-        values = _merge(_read_preset(task), _system_part(values))
-    return build_config(values, overrides, where=str(name))
+    with trusting(trust):
+        values = _read(name)
+        if (task := overrides.get("task", values.get("task"))) != values.get("task"):
+            system = _system_part(values)
+            values = _merge(give_way(_read_preset(task), system), system)
+    return build_config(give_way(values, overrides), overrides, where=str(name))
 
 
 def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, where: str = "") -> Config:
@@ -90,9 +100,10 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    merged, overrides = _merge({}, values), overrides or {}
+    merged, overrides = _merge({}, values), stored_names(overrides or {})
     free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
     for dotted, value in overrides.items():
+        _note_named(dotted, value)
         *sections, key = dotted.split(".", _MOST_SECTIONS)
         change, node = {key: value}, merged
         for part in sections:
@@ -153,11 +164,18 @@ def find_unknown(given: Iterable[str], own: Iterable[str]) -> tuple[str, str] | 
     """
     top = {*Config.model_fields, *own}
     keys: dict[str, list[str]] = {}
-    for key, _, _ in _leaves(Config, ""):
+    meanings = {key: text for key, _, text in _leaves(Config, "")}
+    for key in meanings:
         keys.setdefault(key.rpartition(".")[2], []).append(key)
     keys = {name: homes for name, homes in keys.items() if name != "<name>"} | {name: [name] for name in top}
+    whole = {key.replace(".", "_"): key for key in meanings}
     for name in given:
         if "." not in name and name not in top:
+            if name in whole:  # payload_mass is payload.mass, not its randomization
+                return name, f"; did you mean '{whole[name]}'?"
+            if (here := called_elsewhere(name)) in keys:
+                key = keys[here][0]
+                return name, f"; did you mean '{key}'" + (f" ({meanings[key]})?" if key in meanings else "?")
             hint = nearest(name, keys, lambda near: "' or '".join(keys[near]))
             return name, hint if "did you mean" in hint else nearest(name, top)
     return None
@@ -242,11 +260,19 @@ def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
     except ConfigError:
         raise
     except FileNotFoundError:
-        raise ConfigError(f"no configuration file {path}: give the path of a YAML file or a shipped name") from None
+        known = {each.as_posix(): each.as_posix() for each in path.parent.glob("*.y*ml")}
+        known |= {f"{each}.yaml": each for each in (*list_configs(), *CONFIGS)}
+        close = get_close_matches(path.as_posix(), known, n=1, cutoff=0.7)
+        hint = f"; did you mean '{known[close[0]]}'?" if close else ""
+        raise ConfigError(
+            f"no configuration file {path}: give the path of a YAML file or a shipped name{hint}"
+        ) from None
     except (OSError, ValueError) as error:  # ValueError: what is no YAML, and names with a NUL
         raise ConfigError(f"cannot read {shorten(path, 300)} as YAML: {reason(error)}") from None
     folder = path.absolute().parent
-    return _add_bases(_locate(as_mapping(values, path, "sections such as 'env:'"), folder), folder, (*above, str(path)))
+    located = _locate(stored_names(as_mapping(values, path, "sections such as 'env:'")), folder)
+    review(located, path)
+    return _add_bases(located, folder, (*above, str(path)))
 
 
 def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> dict[str, Any]:
@@ -278,7 +304,7 @@ def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> 
         part = _read(folder / name if is_yaml(name) else name, above)
         task = own.get("task", merged.get("task", part.get("task")))
         merged = _merge(merged, part if part.get("task", task) == task else _system_part(part))
-    return _merge(merged, own)
+    return _merge(give_way(merged, own), own)
 
 
 def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
@@ -289,7 +315,9 @@ def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
         hint = nearest(name, [*list_configs(), *CONFIGS], otherwise="; one's own needs import=<module>, or is a file")
         raise ConfigError(f"no configuration named '{shorten(name)}'{hint}")
     source = CONFIGS[name]
-    return _read(source, above) if isinstance(source, Path) else _add_bases(dict(source), Path(), (*above, name))
+    return (
+        _read(source, above) if isinstance(source, Path) else _add_bases(stored_names(source), Path(), (*above, name))
+    )
 
 
 def _read_preset(task: Any) -> dict[str, Any]:
@@ -307,19 +335,20 @@ def _system_part(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _locate(values: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the values of a file in `folder` with modules and vehicles that lie beside it as absolute paths."""
+    """Return the values of a file in `folder` with modules and files that lie beside it as absolute paths."""
 
     def absolute(reference: Any, suffix: str = "") -> Any:
         if isinstance(reference, list):
             return [absolute(each, suffix) for each in reference]
         beside = folder / f"{reference}{suffix}"
-        return str(beside) if isinstance(reference, str) and beside.is_file() else reference
+        try:
+            return str(beside) if isinstance(reference, str) and beside.is_file() else reference
+        except (OSError, ValueError):  # of names too long, and names with a NUL: refused where they are read
+            return reference
 
-    located = dict(values)
+    located = change_files(values, lambda _, reference: absolute(reference))
     if "import" in values:
         located["import"] = absolute(absolute(values["import"]), ".py")
-    if isinstance(vehicle := values.get("vehicle"), Mapping) and "preset" in vehicle:
-        located["vehicle"] = {**vehicle, "preset": absolute(vehicle["preset"])}
     return located
 
 
@@ -328,6 +357,18 @@ def _import_all(stored: Any, more: Any) -> Any:
     asked = import_modules(more), import_modules(stored)
     wrong = [references for references in asked if not isinstance(references, tuple)]
     return wrong[0] if wrong else import_modules([*asked[1], *asked[0]])
+
+
+def _note_named(key: str, value: Any) -> None:
+    """Note a class of one's own for `train.residual` and a cluster that are given now, and so may run or be joined."""
+    if key == "train" and isinstance(value, Mapping):
+        for part in ("residual", "ray"):
+            _note_named(f"train.{part}", value.get(part))
+    elif key == "train.residual" and isinstance(value, str) and ":" in value:
+        named.add(identify(value.rpartition(":")[0]))
+        refused.pop(value, None)
+    elif key == "train.ray" and isinstance(value, str):
+        name_cluster(value)
 
 
 def _is_number(value: Any) -> bool:

@@ -1,9 +1,9 @@
 """Units of the cables (`env.units=cable`): the numbers of a similar rig whose cables are 1 m long.
 
 A rig with cables of length L behaves as one with cables of l = 1 m whose lengths are l/L times as large and whose times
-are √(l/L) times as long: gravity is the same (Froude scaling). A policy, or a linear script, that observes and acts by
+are √(l/L) times as long: gravity is the same (Froude scaling). A policy, learned or linear, that observes and acts by
 the numbers of that one does the same to all rigs that are similar. What is not similar, such as motor lags and rates of
-controllers, drones know from numbers of the rig (`tasks/rig_numbers.py`).
+controllers, drones know from numbers of the rig (`mdp/rig_features.py`).
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from math import sqrt
 
 import numpy as np
 
-from multilift_marl.config.schema import ControlConfig
 from multilift_marl.rig.system import System
+from multilift_marl.schema.sections import ControlConfig
 
 _POWERS = {  # of length and time in each unit
     "m": (1, 0), "m/s": (1, -1), "m/s²": (1, -2), "m s": (1, 1), "s": (0, 1), "rad/s": (0, -1), "rad/s²": (0, -2),

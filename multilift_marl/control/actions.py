@@ -14,15 +14,15 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import bind, kernel
-from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.formation import Goal, Reference, Smoothing, smooth, smooth_moving, to_goal_frame
 from multilift_marl.control.gains import Gains, drone_gains
 from multilift_marl.control.geometric import fly, fly_rates, hook_moment
 from multilift_marl.control.setpoints import Setpoint, smooth_velocity, track_own_state, track_own_state_to_yaw
+from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, turn, vec
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
+from multilift_marl.schema.sections import ControlConfig
 from multilift_marl.sim.state import SystemState
 
 Call = Callable[[], None]
@@ -72,7 +72,7 @@ def moment_component(name: str, axis: str) -> ActionComponent:
 YAW_RATE = ActionComponent("yaw_rate", "world", "rad/s", "max_yaw_rate", "change of the heading, about the vertical")
 
 
-class Team(NamedTuple):
+class ControlContext(NamedTuple):
     """What an interface reads and writes."""
 
     state: SystemState
@@ -103,25 +103,27 @@ class Interface:
         self.settings = settings
         self.dt = dt
 
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """Return the call that turns `action` (E, N, A) in [-1, 1] of environments lo to hi into set-points."""
         raise NotImplementedError
 
-    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """Return what is called in turn at every control step, the last of them for the thrusts."""
         return (bind(fly, lo, hi, team.state, team.reference, team.cable_force, team.thrust, team.gains, None),)
 
-    def control_step_moving_goal(self, lo: int, hi: int, plan: Call, set_action: Call, team: Team) -> tuple[Call, ...]:
+    def control_step_moving_goal(
+        self, lo: int, hi: int, plan: Call, set_action: Call, team: ControlContext
+    ) -> tuple[Call, ...]:
         """Return the same as `control_step` for goals that move, by calling `plan`, at every control step."""
         return plan, *self.control_step(lo, hi, team)
 
-    def thrusts(self, team: Team) -> np.ndarray:
+    def thrusts(self, team: ControlContext) -> np.ndarray:
         """Return the thrusts (E, N, K) [N] that the last action set itself, K of its numbers."""
         return team.thrust[..., :0]
 
 
 class ReferenceAction(Interface):
-    """Offset of the drone's slot in the formation about the target payload pose; zero is the scripted formation."""
+    """Offset of the drone's slot in the formation about the target payload pose; zero keeps the formation."""
 
     numbers = (
         *vector_components("m", "max_offset", "offset of the own slot"),
@@ -133,16 +135,18 @@ class ReferenceAction(Interface):
         super().__init__(settings, dt)
         self._smoothing = Smoothing(settings.reference_frequency, settings.reference_speed, dt)
 
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
         return bind(_command_offset, lo, hi, action, team, self.settings.max_offset, self.settings.max_yaw)
 
-    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
         smoothed = bind(smooth, lo, hi, team.reference, self._smoothing)
         return smoothed, *super().control_step(lo, hi, team)
 
-    def control_step_moving_goal(self, lo: int, hi: int, plan: Call, set_action: Call, team: Team) -> tuple[Call, ...]:
+    def control_step_moving_goal(
+        self, lo: int, hi: int, plan: Call, set_action: Call, team: ControlContext
+    ) -> tuple[Call, ...]:
         """See `Interface.control_step_moving_goal`."""
         before = Reference.zeros(*team.reference.yaw.shape)
         relative = bind(to_goal_frame, lo, hi, team.reference, team.goal, before)
@@ -156,12 +160,12 @@ class VelocityAction(Interface):
     numbers = (*vector_components("m/s", "max_velocity", "own velocity"), YAW_RATE)
     supports = ("indi",)
 
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
         ranges = (self.settings.max_velocity, self.settings.max_yaw_rate)
         return bind(_command_vector, lo, hi, action, team.goal, team.reference, team.setpoint.velocity, *ranges)
 
-    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
         smoothing = (self.settings.reference_frequency, self.dt)
         smoothed = bind(smooth_velocity, lo, hi, team.state, team.reference, team.setpoint, *smoothing)
@@ -174,12 +178,12 @@ class AccelerationAction(Interface):
     numbers = (*vector_components("m/s²", "max_acceleration", "own acceleration"), YAW_RATE)
     supports = ("indi",)
 
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
         ranges = (self.settings.max_acceleration, self.settings.max_yaw_rate)
         return bind(_command_vector, lo, hi, action, team.goal, team.reference, team.reference.acceleration, *ranges)
 
-    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
         tracked = bind(track_own_state, lo, hi, team.state, team.reference, self.dt)
         return tracked, *super().control_step(lo, hi, team)
@@ -199,12 +203,12 @@ class AccRatesAction(Interface):
     by_rates = True
     supports = ("indi",)
 
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
         ranges = (self.settings.max_acceleration, self.settings.max_tilt_rate)
         return bind(_command_acc_rates, lo, hi, action, team, *ranges)
 
-    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
         smoothing = (self.settings.reference_frequency, self.dt)
         tracked = bind(track_own_state_to_yaw, lo, hi, team.state, team.reference, *smoothing)
@@ -222,15 +226,15 @@ class CtbrAction(Interface):
     )
     by_rates = True
 
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
         return bind(_command_rates, lo, hi, action, team, self.settings.max_tilt_rate, self.settings.max_yaw_rate)
 
-    def thrusts(self, team: Team) -> np.ndarray:
+    def thrusts(self, team: ControlContext) -> np.ndarray:
         """See `Interface.thrusts`."""
         return team.setpoint.thrust[..., None]
 
-    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
         return (bind(fly_rates, lo, hi, team.state, team.setpoint, team.cable_force, team.thrust, team.gains),)
 
@@ -244,11 +248,11 @@ class CtbmAction(CtbrAction):
 
     numbers = (CtbrAction.numbers[0], *map(moment_component, ("outward", "sideways", "yaw"), AXES))
 
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
         return bind(_command_moments, lo, hi, action, team, self.settings.max_angular_acceleration)
 
-    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
         return ()
 
@@ -261,15 +265,15 @@ class RotorAction(Interface):
 
     numbers = tuple(ActionComponent(f"rotor_{k}", "body", "N", THRUST, f"thrust of rotor {k}") for k in range(4))
 
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: Team) -> Call:
+    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
         return bind(_command_rotors, lo, hi, action, team)
 
-    def thrusts(self, team: Team) -> np.ndarray:
+    def thrusts(self, team: ControlContext) -> np.ndarray:
         """See `Interface.thrusts`."""
         return team.thrust
 
-    def control_step(self, lo: int, hi: int, team: Team) -> tuple[Call, ...]:
+    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
         return ()
 

@@ -7,7 +7,7 @@ desaturation): thrust is of no use to a drone that cannot turn it upward.
 
 from __future__ import annotations
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import clip
 
 
@@ -48,11 +48,11 @@ def allocate(thrust, torque, inverse, low, high):
             most = min(most, (high - tilt) / inverse[k, 0])
         total = min(max(thrust, least), most)
         least, most = _yaw_range(total, roll, pitch, torque[2], inverse, low, high)
-    yaw = max(most, 0.0) * torque[2]
-    f0 = _rotor(0, total, roll, pitch, yaw, inverse, low, high)
-    f1 = _rotor(1, total, roll, pitch, yaw, inverse, low, high)
-    f2 = _rotor(2, total, roll, pitch, yaw, inverse, low, high)
-    f3 = _rotor(3, total, roll, pitch, yaw, inverse, low, high)
+    wrench = (total, roll, pitch, max(most, 0.0) * torque[2])
+    f0 = _rotor(0, wrench, inverse, low, high)
+    f1 = _rotor(1, wrench, inverse, low, high)
+    f2 = _rotor(2, wrench, inverse, low, high)
+    f3 = _rotor(3, wrench, inverse, low, high)
     return (f0, f1, f2, f3)
 
 
@@ -66,6 +66,7 @@ def _yaw_range(thrust, roll, pitch, yaw, inverse, low, high):
     for k in range(4):
         base = inverse[k, 0] * thrust + inverse[k, 1] * roll + inverse[k, 2] * pitch
         change = inverse[k, 3] * yaw
+        # A rotor that yaw does not load decides by its limits alone; the quotients would be infinite.
         if abs(change) > 1e-12:
             first, second = (low - base) / change, (high - base) / change
             least, most = max(least, min(first, second)), min(most, max(first, second))
@@ -75,6 +76,7 @@ def _yaw_range(thrust, roll, pitch, yaw, inverse, low, high):
 
 
 @kernel
-def _rotor(k, thrust, roll, pitch, yaw, inverse, low, high):
+def _rotor(k, wrench, inverse, low, high):
+    thrust, roll, pitch, yaw = wrench
     thrust = inverse[k, 0] * thrust + inverse[k, 1] * roll + inverse[k, 2] * pitch + inverse[k, 3] * yaw
     return clip(thrust, low, high)  # it is within the limits, but for round-off

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from multilift_marl.math3d import turn
+from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
 
 
 class LoadFeedforward:
@@ -34,5 +34,6 @@ class LoadFeedforward:
             yaw: its heading from east [rad].
         """
         c, s = np.cos(yaw), np.sin(yaw)
+        # Into the axes of a level drone of this heading, and back.
         drag = np.array(turn(c, s, tuple(self._drag[drone] * turn(c, -s, tuple(velocity)))))
         return acceleration + (self._load_share[drone] * acceleration + cable_force + drag) / self._mass[drone]

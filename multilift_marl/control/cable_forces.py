@@ -1,7 +1,7 @@
 """Cable forces that exert a wrench on the payload, and where the drones are that exert them.
 
 One problem: the forces nearest to given ones whose sum and moment are prescribed. Three solvers, which agree to
-round-off where the cables can exert them (tests/test_cable_forces.py):
+round-off where the cables can exert them (tests/control/test_cable_forces.py):
 
 - `solve_cable_forces`, a kernel, in general: every cable keeps a least tension, found by Newton's method;
 - `distribute_wrench`, a kernel, without that bound: one product with an inverse that `make_wrench_distribution`
@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
 from multilift_marl.control.formation import hook_arm, place_formation
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import (
     add,
     cross,
@@ -34,7 +34,7 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
 from multilift_marl.sim.cables.catenary import cable_end
 
 TILT_WIDENING = 1.8  # [-] at tilted targets, see `place_balanced`
@@ -87,9 +87,11 @@ def make_wrench_distribution(anchors: np.ndarray) -> WrenchDistribution:
 
     Where forces cannot exert one, what is left is least, moments over a lever counted as forces are.
     """
+    # The mean arm of a moment about any axis: two of three coordinates count. 1 for a point, which has no moments.
     lever = np.sqrt((anchors**2).sum(axis=1).mean() * 2 / 3) or 1.0
     exerted = wrench_matrix(anchors)
     exerted[3:] /= lever
+    # f = Gᵀ (G Gᵀ)⁻¹ w, the least-norm solution: its (λ, μ) is (G Gᵀ)⁻¹ w, here in units of force and undone below.
     inverse = np.linalg.pinv(exerted @ exerted.T, rcond=RANK, hermitian=True)
     parts = inverse[:3, :3], inverse[:3, 3:] / lever, inverse[3:, 3:] / lever**2
     return WrenchDistribution(*(tuple(part.ravel().tolist()) for part in parts))
@@ -134,33 +136,41 @@ def solve_cable_forces(force, moment, attitude, anchors, least, cable_force):
     """
     linear = _ZERO  # λ
     angular = _ZERO  # μ
-    imbalance = np.inf
+    by_linear = by_angular = _ZERO  # the last step
+    left = imbalance = np.inf
+    at_bounds = -1
     exact = 1e-13 * max(_largest(force), 1.0)  # round-off of the sums
     for _ in range(_ITERATIONS):
-        # What the forces of these λ, μ leave of the wrench. It ends there if that is nothing, or stays as it is.
+        # What the forces of these λ, μ leave of the wrench. It ends there if that is nothing, or stays as it is where
+        # the equations are linear. Half of a step is taken back that led far away, to cables that nearly depend on
+        # one another.
         wrench = (force, moment)
-        missing, (a, b, c) = _balance(wrench, attitude, anchors, least, cable_force, linear, angular)
+        missing, (a, b, c), bound = _balance(wrench, attitude, anchors, least, cable_force, linear, angular)
         lacking, twisting = missing
         left = max(_largest(lacking), _largest(twisting))
-        stalled = abs(left - imbalance) < 0.01 * imbalance
-        imbalance = left
-        if stalled or left <= exact:
+        if left <= exact or (bound == at_bounds and abs(left - imbalance) < 0.01 * imbalance):
             break
+        if bound != at_bounds and left > 1e4 * imbalance:
+            by_linear, by_angular = scale(0.5, by_linear), scale(0.5, by_angular)
+            linear, angular = sub(linear, by_linear), sub(angular, by_angular)
+            continue
+        imbalance, at_bounds = left, bound
 
         # Newton's step, a symmetric system in blocks: a Δλ + b Δμ = lacking, bᵀ Δλ + c Δμ = twisting, by the Schur
         # complement of a.
+        # Damped in proportion to the trace: all cables in one line leave a turn about it without stiffness.
         inverse = _inverse(a, _DAMPING * (a[0] + a[4] + a[8]))
         through = matmul(transpose(b), inverse)
         schur = _minus(c, matmul(through, b))
         change = mul(_inverse(schur, _DAMPING * (c[0] + c[4] + c[8])), sub(twisting, mul(through, lacking)))
-        linear = add(linear, mul(inverse, sub(lacking, mul(b, change))))
-        angular = add(angular, change)
+        by_linear, by_angular = mul(inverse, sub(lacking, mul(b, change))), change
+        linear, angular = add(linear, by_linear), add(angular, by_angular)
 
     # The forces of the λ, μ found.
     for i in range(cable_force.shape[0]):
         arm = mul(attitude, row(anchors, i))
         put(cable_force[i], _bounded_force(row(cable_force, i), arm, least, linear, angular)[0])
-    return imbalance
+    return left
 
 
 @kernel
@@ -177,8 +187,12 @@ def _bounded_force(given, arm, least, linear, angular):
 
 @kernel
 def _balance(wrench, attitude, anchors, least, cable_force, linear, angular):
-    """Return what is left of force and moment, and the blocks a, b, c of their derivative by λ and μ."""
+    """Return what is left of force and moment, blocks a, b, c of its derivative by λ and μ, which cables are at bounds.
+
+    The last is a sum of powers of two.
+    """
     force, moment = wrench
+    at_bounds = 0
     a = b = c = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for i in range(cable_force.shape[0]):
         # The force of one cable, taken from the wrench.
@@ -189,6 +203,7 @@ def _balance(wrench, attitude, anchors, least, cable_force, linear, angular):
         moment = sub(moment, cross(arm, own))
 
         # Its derivative: P = 1, or 1 - u uᵀ of a cable at its bound, by λ; P X by μ.
+        at_bounds += 2**i if bound else 0
         u = scale(1.0 if bound else 0.0, unit(given))
         p = (
             1.0 - u[0] * u[0], -u[0] * u[1], -u[0] * u[2],
@@ -198,7 +213,7 @@ def _balance(wrench, attitude, anchors, least, cable_force, linear, angular):
         x = (0.0, arm[2], -arm[1], -arm[2], 0.0, arm[0], arm[1], -arm[0], 0.0)  # x μ = μ × r
         px = matmul(p, x)
         a, b, c = _plus(a, p), _plus(b, px), _plus(c, matmul(transpose(x), px))
-    return (force, moment), (a, b, c)
+    return (force, moment), (a, b, c), at_bounds
 
 
 @kernel
@@ -225,6 +240,7 @@ def _minus(p, q):
 @kernel
 def _inverse(m, damping):
     """Return the inverse of a symmetric, positive semidefinite matrix with `damping` added to its diagonal."""
+    # By cofactors. Of a matrix of zeros the inverse is huge, but finite.
     damping = max(damping, 1e-30)
     x = (m[0] + damping, m[3], m[6])
     y = (m[1], m[4] + damping, m[7])
@@ -235,17 +251,22 @@ def _inverse(m, damping):
 
 
 @kernel
-def drone_offset(n, cable_force, hanging):
+def drone_offset(n, cable_force, rig):
     """Return where drone n is, from its anchor, as its cable exerts `cable_force` [N] on the payload at rest [m]."""
-    middle = add(cable_force, (0.0, 0.0, 0.5 * hanging.weight[n]))
+    middle = add(cable_force, (0.0, 0.0, 0.5 * rig.cable_weight[n]))
     size = norm(middle)
     return cable_end(
-        scale(1.0 / size, middle), size, hanging.length[n], hanging.stiffness[n], hanging.segments[n], hanging.weight[n]
+        scale(1.0 / size, middle),
+        size,
+        rig.cable_length[n],
+        rig.cable_stiffness[n],
+        rig.cable_segments[n],
+        rig.cable_weight[n],
     )
 
 
 @kernel
-def place_slots(e, goal, rig, hanging):
+def place_slots(e, goal, rig):
     """Write the slots of environment e from which drones exert `goal.cable_force` on the payload.
 
     The forces become those of the drones on their cables, whose weight they carry too.
@@ -254,14 +275,14 @@ def place_slots(e, goal, rig, hanging):
     for n in range(rig.anchors.shape[0]):
         cable_force = vec(goal.cable_force, e, n)
         anchor = add(position, mul(target, row(rig.anchors, n)))
-        held = add(cable_force, (0.0, 0.0, hanging.weight[n]))
-        hook = add(anchor, drone_offset(n, cable_force, hanging))
+        held = add(cable_force, (0.0, 0.0, rig.cable_weight[n]))
+        hook = add(anchor, drone_offset(n, cable_force, rig))
         put(goal.cable_force[e, n], held)
         put(goal.slots[e, n], sub(hook, hook_arm(n, held, goal.drone_yaw[e], rig)))
 
 
 @kernel
-def place_balanced(e, goal, rig, hanging):
+def place_balanced(e, goal, rig):
     """Do as `place_formation`, for tilted targets too; return whether the team can hold the payload there.
 
     Over a level target the formation balances. Over one tilted by θ its cable forces, with 1 + `TILT_WIDENING`
@@ -275,16 +296,21 @@ def place_balanced(e, goal, rig, hanging):
         return True
     for n in range(rig.anchors.shape[0]):
         cable_force = vec(goal.cable_force, e, n)
+        # target[8] = R33 = cos θ. Goals hold the drones' forces: the cables' weight is taken off, `place_slots` adds it
+        # again.
         wide = 1.0 + TILT_WIDENING * (1.0 - target[8])
-        put(goal.cable_force[e, n], (wide * cable_force[0], wide * cable_force[1], cable_force[2] - hanging.weight[n]))
-    weight = hanging.payload_mass * GRAVITY
+        put(
+            goal.cable_force[e, n],
+            (wide * cable_force[0], wide * cable_force[1], cable_force[2] - rig.cable_weight[n]),
+        )
+    weight = rig.payload_mass * GRAVITY
     left = solve_cable_forces((0.0, 0.0, weight), _ZERO, target, rig.anchors, MIN_TENSION_RATIO, goal.cable_force[e])
-    place_slots(e, goal, rig, hanging)
+    place_slots(e, goal, rig)
     return left <= BALANCED * weight
 
 
 @kernel
-def is_stable(e, goal, rig, hanging, stiffness):
+def is_stable(e, goal, rig, stiffness):
     """Return whether the payload, pushed a little, would come back to a tilted goal, the drones held by springs.
 
     The potential energy of payload, cables and springs is to be convex there. Between its spring and the payload a
@@ -292,7 +318,7 @@ def is_stable(e, goal, rig, hanging, stiffness):
     S⁻¹ = (T/L (1 - u uᵀ) + k u uᵀ)⁻¹ + 1/κ; where the payload turns, the arm of the force turns too.
 
     Args:
-        e, goal, rig, hanging: after `place_balanced`.
+        e, goal, rig: after `place_balanced`.
         stiffness: (N,) κ [N/m].
     """
     target = matrow(goal.rotation, e)
@@ -300,12 +326,12 @@ def is_stable(e, goal, rig, hanging, stiffness):
     for n in range(rig.anchors.shape[0]):
         # Stiffness S of one anchor: across and along the cable.
         r = mul(target, row(rig.anchors, n))
-        f = sub(vec(goal.cable_force, e, n), (0.0, 0.0, hanging.weight[n]))
+        f = sub(vec(goal.cable_force, e, n), (0.0, 0.0, rig.cable_weight[n]))
         size = norm(f)
         u = scale(1.0 / size, f)
         soft = 1.0 / stiffness[n]
-        across = 1.0 / (hanging.length[n] / size + soft)
-        along = 1.0 / (1.0 / hanging.stiffness[n] + soft) - across
+        across = 1.0 / (rig.cable_length[n] / size + soft)
+        along = 1.0 / (1.0 / rig.cable_stiffness[n] + soft) - across
         s = _plus(_diagonal(across), _outer(scale(along, u), u))
 
         # The Hessian of the energy in blocks: a by shifts, b mixed, c by turns θ, of which the force's own arm is part.

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from multilift_marl._jit import bind
 from multilift_marl.config.config import Config
-from multilift_marl.control.actions import ACTIONS, Call, Team
+from multilift_marl.control.actions import ACTIONS, Call, ControlContext
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
 from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.errors import ConfigError
+from multilift_marl.kernels.jit import bind
+from multilift_marl.rig.linearised import warn_of_instability
 from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
@@ -45,6 +46,7 @@ class Controller:
         self.disturbance: Disturbance | None = None
         self._setpoint = Setpoint.zeros(e, n)
         self.gains = make_gains(settings, world.system)
+        warn_of_instability(world.system, np.sqrt(self.gains.k_p), config.randomization)
         self._kind = settings.disturbance
         if self._kind != "none":
             if self._kind not in self.interface.supports:
@@ -69,8 +71,9 @@ class Controller:
         """
         state, thrust, g = self.state, self.world.thrust, self.gains
         rejection = self.disturbance
+        # The same array in every step: kernels are bound to it.
         cable_force = goal.cable_force if rejection is None else rejection.cable_force
-        team = Team(state, goal, self.reference, self._setpoint, cable_force, thrust, g)
+        team = ControlContext(state, goal, self.reference, self._setpoint, cable_force, thrust, g)
         set_action = self.interface.set_action(lo, hi, action, team)
         control_step = (
             self.interface.control_step(lo, hi, team)
@@ -80,7 +83,7 @@ class Controller:
         if rejection is None:
             return set_action, control_step
         known = (state, self.reference, goal.cable_force)
-        estimate = bind(REJECTIONS[self._kind], lo, hi, *known, rejection, g, self._rejection)
+        estimate = bind(REJECTIONS[self._kind], lo, hi, *known, rejection, self._rejection)
         return set_action, (*control_step[:-1], estimate, control_step[-1])
 
     def start(self, e: int) -> None:

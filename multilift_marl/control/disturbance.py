@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
-from multilift_marl.config.schema import ControlConfig
 from multilift_marl.control.gains import Gains, limited
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale, sub, tmul, vec
-from multilift_marl.rig.constants import make_constants
+from multilift_marl.physical import GRAVITY
+from multilift_marl.rig.constants import make_rig
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.schema.sections import ControlConfig
 
 # Bandwidth over ω_p m/(m + m_L), at most: ω_p of the position loop, m and m_L the masses of a drone and of its load.
 # The share m_L/(m + m_L) of a thrust comes back through the cable, which slows any loop around the drone. Faster,
@@ -53,6 +53,8 @@ class Rejection(NamedTuple):
     """(N,) limit of the estimate [N]."""
     thrust_coefficient: np.ndarray
     """(N,) [N s²]."""
+    gains: Gains
+    """Of the controller, which says what is fed forward."""
 
 
 def make_rejection(control: ControlConfig, system: System, g: Gains, dt: float) -> Rejection:
@@ -62,10 +64,12 @@ def make_rejection(control: ControlConfig, system: System, g: Gains, dt: float) 
     frequency = limited(control, "disturbance_frequency", slowest, "what the load lets through")
     return Rejection(
         dt=dt,
+        # Exact for a first-order filter whose input is held over a step: stable at any frequency.
         share=np.array([1 - exp(-each * dt) for each in frequency]),
         gain=g.mass * g.k_p * frequency,
         largest=control.disturbance_limit * g.mass * GRAVITY,
-        thrust_coefficient=make_constants(system).thrust_coefficient,
+        thrust_coefficient=make_rig(system).thrust_coefficient,
+        gains=g,
     )
 
 
@@ -87,7 +91,7 @@ def reset_estimate(e, state, disturbance):
 
 
 @kernel
-def integrate_error(lo, hi, state, reference, cable_force, disturbance, g, c):
+def integrate_error(lo, hi, state, reference, cable_force, disturbance, c):
     """Add the integral of the position error to the cable forces of environments lo to hi: `integral`.
 
     F_i = -m k_p ω ∫ (p - p_d) dt, no longer than the limit. While a rotor is at its limit the integral may only shrink.
@@ -97,15 +101,18 @@ def integrate_error(lo, hi, state, reference, cable_force, disturbance, g, c):
         state, reference: SystemState, Reference.
         cable_force: nominal (E, N, 3) [N].
         disturbance: Disturbance, written.
-        g, c: Gains, Rejection.
+        c: Rejection.
     """
+    g = c.gains
     for e in range(lo, hi):
         for n in range(cable_force.shape[1]):
             low, high = g.thrust_min[n], g.thrust_max[n]
             saturated = False  # within 1 % of the range
             for k in range(4):
                 thrust = c.thrust_coefficient[n] * state.rotor_speed[e, n, k] ** 2
+                # Anti-windup, by the rotors' speeds: what acts is their thrust, not the command.
                 saturated = saturated or thrust > high - 0.01 * high or thrust < low + 0.01 * high
+            # A drone beyond its reference (positive error) is to push back: hence the minus.
             error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
             before = vec(disturbance.force, e, n)
             force = limit(sub(before, scale(c.gain[n] * c.dt, error)), c.largest[n])
@@ -116,7 +123,7 @@ def integrate_error(lo, hi, state, reference, cable_force, disturbance, g, c):
 
 
 @kernel
-def estimate_force(lo, hi, state, reference, cable_force, disturbance, g, c):
+def estimate_force(lo, hi, state, reference, cable_force, disturbance, c):
     """Add the measured external force to the cable forces of environments lo to hi: `indi`.
 
     What moved the drone over the last control step is m Δv/Δt = F_rotors - m g e3 - (cable force, load and drag that
@@ -124,6 +131,7 @@ def estimate_force(lo, hi, state, reference, cable_force, disturbance, g, c):
     force pass the same first-order low-pass filter, here as one number (Smeur, de Croon and Chu, Control Engineering
     Practice 73, 2018; Tal and Karaman, IEEE TCST 29(3), 2021). Arguments are those of `integrate_error`.
     """
+    g = c.gains
     for e in range(lo, hi):
         for n in range(cable_force.shape[1]):
             # What the controller feeds forward.
@@ -137,8 +145,11 @@ def estimate_force(lo, hi, state, reference, cable_force, disturbance, g, c):
 
             # What the rotors exert beyond that and beyond what moves the drone, filtered and limited.
             inertial = scale(g.mass[n] / c.dt, sub(velocity, vec(disturbance.velocity, e, n)))
+            # m (Δv/Δt + g e3), what moves the drone and holds it up.
             used = add(inertial, (0.0, 0.0, g.mass[n] * GRAVITY))
             before = vec(disturbance.force, e, n)
+            # What the rotors exert = what moves the drone + what is fed forward + F. `before` makes the filter's step F
+            # += share (F_measured - F).
             gap = sub(sub(sub(rotors, used), fed_forward), before)
             force = limit(add(before, scale(c.share[n], gap)), c.largest[n])
             put(disturbance.force[e, n], force)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import (
     add,
     clip,
@@ -24,9 +24,8 @@ from multilift_marl.math3d import (
     turn,
     vec,
 )
-from multilift_marl.rig.constants import RigConstants, make_constants
-from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
+from multilift_marl.rig.constants import RigArrays
 
 LEAP_SPEED = 20.0  # [m/s] of a slot from one control step to the next: what is faster was put elsewhere ...
 LEAP_RATE = 50.0  # [rad/s] ... or turned at once
@@ -48,7 +47,7 @@ class Goal(NamedTuple):
     cable_force: np.ndarray
     """(E, N, 3) nominal force of each drone on its cable there [N]."""
     drone_yaw: np.ndarray
-    """(E,) heading of the team, the target's where a task does not say otherwise; a drone's own is `Rig.heading`
+    """(E,) heading of the team, the target's where a task does not say otherwise; a drone's own is `RigArrays.heading`
     from there [rad]."""
     velocity: np.ndarray
     """(E, 3) of a target that moves, and of its slots [m/s]; zero otherwise, like the next ones."""
@@ -74,38 +73,6 @@ class Goal(NamedTuple):
         placed = ((e, 3), (e, 3, 3), (e,), (e, n, 3), (e, n, 2), (e, n, 3), (e,))
         moving = ((e, 3), (e, 3), (e, 3), (e,), (e, 3), (e, n, 3), (e, n, 3), (e, n, 3))
         return cls(*(np.zeros(shape) for shape in (*placed, *moving)))
-
-
-class Rig(NamedTuple):
-    """The nominal formation in the payload frame, as System describes it."""
-
-    anchors: np.ndarray
-    """(N, 3) [m]."""
-    slots: np.ndarray
-    """(N, 3) [m]."""
-    azimuth: np.ndarray
-    """(N,) [rad]."""
-    heading: np.ndarray
-    """(N,) of each drone, from the team's [rad]."""
-    force: np.ndarray
-    """(N, 3) [N]."""
-    constants: RigConstants
-    is_point: bool
-    """Whether all cables end at the payload's centre of mass: it has no attitude to speak of."""
-
-
-def make_rig(system: System) -> Rig:
-    """Return the formation of `system`."""
-    point = not system.anchors.any()
-    return Rig(
-        system.anchors,
-        system.slots,
-        system.slot_azimuth,
-        system.heading,
-        system.hook_force,
-        make_constants(system),
-        point,
-    )
 
 
 class Reference(NamedTuple):
@@ -137,7 +104,7 @@ class Reference(NamedTuple):
 
 
 @kernel
-def place_formation(e: int, goal: Goal, rig: Rig) -> None:
+def place_formation(e: int, goal: Goal, rig: RigArrays) -> None:
     """Write slots, slot frames and cable forces of environment e for its target pose."""
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     yaw = heading(target)
@@ -147,6 +114,8 @@ def place_formation(e: int, goal: Goal, rig: Rig) -> None:
     for n in range(rig.slots.shape[0]):
         anchor = (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2])
         cable = sub((rig.slots[n, 0], rig.slots[n, 1], rig.slots[n, 2]), anchor)
+        # Anchors tilt with the target, cables and slots turn with its heading alone: drones stay above a tilted
+        # payload.
         put(goal.slots[e, n], add(add(position, mul(target, anchor)), turn(c, s, cable)))
         put(goal.cable_force[e, n], turn(c, s, (rig.force[n, 0], rig.force[n, 1], rig.force[n, 2])))
         turn_slot_frame(e, n, yaw, goal, rig)
@@ -168,10 +137,10 @@ def goal_arm(e, n, goal, rig, yaw):
 @kernel
 def hook_arm(n, cable_force, yaw, rig):
     """Return the hook of drone n from its centre, at rest with a cable force [N] in a team of heading `yaw` [m]."""
-    if not rig.constants.hooked:
+    if not rig.hooked:
         return (0.0, 0.0, 0.0)
-    force = add(cable_force, (0.0, 0.0, rig.constants.mass[n] * GRAVITY))
-    return mul(thrust_frame(force, yaw + rig.heading[n]), row(rig.constants.hooks, n))
+    force = add(cable_force, (0.0, 0.0, rig.mass[n] * GRAVITY))
+    return mul(thrust_frame(force, yaw + rig.heading[n]), row(rig.hooks, n))
 
 
 @kernel
@@ -183,7 +152,7 @@ def goal_hook(e, n, goal, rig):
 @kernel
 def set_heading(e, yaw, goal, rig):
     """Give the team of environment e another heading than the target's; its hooks stay where they are."""
-    if rig.constants.hooked:
+    if rig.hooked:
         for n in range(rig.slots.shape[0]):
             turned = sub(goal_arm(e, n, goal, rig, goal.drone_yaw[e]), goal_arm(e, n, goal, rig, yaw))
             put(goal.slots[e, n], add(vec(goal.slots, e, n), turned))
@@ -221,12 +190,14 @@ def smooth(lo, hi, reference, smoothing):
     approached at the smoothing's speed; yaw: a second-order one.
     """
     w, dt = smoothing.frequency, smoothing.dt
+    # In steady motion the filter's jerk and acceleration are 0: ω³ gap = 3 ω² v, so a gap of 3 v/ω gives the speed v.
     reach = 3.0 * smoothing.speed / w
     for e in range(lo, hi):
         for n in range(reference.yaw.shape[1]):
             p, v, a = vec(reference.position, e, n), vec(reference.velocity, e, n), vec(reference.acceleration, e, n)
             gap = limit(sub(vec(reference.command, e, n), p), reach)
             jerk = sub(scale(w * w * w, gap), add(scale(3.0 * w * w, v), scale(3.0 * w, a)))
+            # Semi-implicit Euler: each derivative moves on by the new one above it.
             a = add(a, scale(dt, jerk))
             v = add(v, scale(dt, a))
             put(reference.position[e, n], add(p, scale(dt, v)))
@@ -316,6 +287,7 @@ def smooth_yaw(e, n, reference, frequency, dt):
     w = frequency
     gap = wrap(reference.command_yaw[e, n] - reference.yaw[e, n])
     rate = reference.yaw_rate[e, n]
+    # A gap beyond 1 rad counts as 1: half a turn then takes no more rate than the filter's ω/2.
     rate += dt * (w * w * clip(gap, -1.0, 1.0) - 2.0 * w * rate)
     reference.yaw_rate[e, n] = rate
     reference.yaw[e, n] += dt * rate

@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import inlined
-from multilift_marl.config.schema import ControlConfig
 from multilift_marl.errors import warn_once
+from multilift_marl.kernels.jit import inlined
 from multilift_marl.math3d import row
-from multilift_marl.rig.constants import make_constants
+from multilift_marl.physical import GRAVITY
+from multilift_marl.rig.constants import make_rig
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.schema.sections import ControlConfig
 
 POSITION_RATIO = 5.0  # attitude's natural frequency over position's, at least
 
@@ -82,27 +82,28 @@ def make_gains(control: ControlConfig, system: System) -> Gains:
     Attitude is no faster than the motors allow (0.7/τ of the slower lag), position and yaw no faster than attitude
     allows.
     """
-    vehicles, constants = system.vehicles, make_constants(system)
+    vehicles, rig = system.vehicles, make_rig(system)
     motors = np.array([0.7 / vehicle.rotor_time_constant for vehicle in vehicles])
     tilt = limited(control, "attitude_frequency", motors, "0.7 / motor lag")
     position = limited(control, "position_frequency", tilt / POSITION_RATIO, "1/5 of attitude's", "attitude_frequency")
     yaw = limited(control, "yaw_frequency", tilt, "attitude's", "attitude_frequency")
     frequency = np.stack([tilt, tilt, yaw], axis=1)
     return Gains(
-        mass=constants.mass,
+        mass=rig.mass,
         inertia=np.array([vehicle.inertia for vehicle in vehicles], float),
         k_p=position**2,
+        # s² + 2 ζ ω s + ω².
         k_v=2 * control.position_damping * position,
         k_R=frequency**2,
         k_w=2 * control.attitude_damping * frequency,
-        allocation=constants.allocation,
+        allocation=rig.allocation,
         thrust_min=np.array([vehicle.thrust_coefficient * vehicle.rotor_speed_min**2 for vehicle in vehicles]),
         thrust_max=np.array([vehicle.rotor_thrust_max for vehicle in vehicles], float),
-        load_share=system.hook_force[:, 2] / GRAVITY,
+        load_share=rig.force[:, 2] / GRAVITY,
         drag=np.array([vehicle.drag for vehicle in vehicles], float) * control.drag_feedforward,
-        heading=system.heading,
-        hooks=constants.hooks,
-        hooked=constants.hooked,
+        heading=rig.heading,
+        hooks=rig.hooks,
+        hooked=rig.hooked,
     )
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from math import cos, sin
 
-from multilift_marl._jit import kernel
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.gains import drone_gains
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import (
     add,
     column,
@@ -30,7 +30,7 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
 
 
 @kernel
@@ -45,11 +45,14 @@ def desired_rates(attitude, force, force_rate, yaw, yaw_rate):
         force, force_rate: F [N], Ḟ [N/s].
         yaw, yaw_rate: ψ [rad], ψ̇ [rad/s].
     """
+    # ḃ3: the part of Ḟ/|F| across b3. The floors keep the rates finite where a force vanishes or points along the
+    # heading.
     b1, b2, b3 = column(attitude, 0), column(attitude, 1), column(attitude, 2)
     b3_rate = scale(1.0 / max(norm(force), 1e-6), sub(force_rate, scale(dot(force_rate, b3), b3)))
     heading = (cos(yaw), sin(yaw), 0.0)
     heading_rate = (-yaw_rate * sin(yaw), yaw_rate * cos(yaw), 0.0)
     side_rate = add(cross(b3_rate, heading), cross(b3, heading_rate))
+    # b1 · ḃ2, with ḃ2 the part of ċ/|c| across b2.
     turning = dot(b1, side_rate) / max(norm(cross(b3, heading)), 1e-3)
     return (-dot(b2, b3_rate), dot(b1, b3_rate), -turning)
 
@@ -63,12 +66,16 @@ def attitude_torque(attitude, rates, desired, desired_rate, g):
         rates, desired_rate: Ω and Ω_d in their own frames [rad/s].
         g: DroneGains.
     """
+    # e_R = ½ (R_dᵀ R - Rᵀ R_d)^∨ (eq 31): the antisymmetric part of `error`, whose (2,1), (0,2), (1,0) entries less
+    # their mirror images are the three components.
     error = matmul(transpose(desired), attitude)
     e_r = (0.5 * (error[7] - error[5]), 0.5 * (error[2] - error[6]), 0.5 * (error[3] - error[1]))
+    # e_Ω = Ω - Rᵀ R_d Ω_d: Ω_d is in the desired frame and must be brought into the body's.
     rotated = mul(transpose(error), desired_rate)
     e_w = sub(rates, rotated)
     momentum = (g.inertia[0] * rates[0], g.inertia[1] * rates[1], g.inertia[2] * rates[2])
     gyroscopic = cross(rates, momentum)
+    # Of eq 32 the part Ω × Rᵀ R_d Ω_d; gains are for unit inertia, so that J stands before all of the feedback.
     transport = cross(rates, rotated)
     return (
         gyroscopic[0] - g.inertia[0] * (g.k_R[0] * e_r[0] + g.k_w[0] * e_w[0] + transport[0]),
@@ -102,6 +109,7 @@ def hook_moment(n, attitude, cable_force, acceleration, g):
     """
     if not g.hooked:
         return (0.0, 0.0, 0.0)
+    # The rotors must balance the cable's moment, hook × (-P), which takes hook × P.
     return cross(row(g.hooks, n), tmul(attitude, add(cable_force, scale(g.load_share[n], acceleration))))
 
 
@@ -119,10 +127,14 @@ def desired_force(feedback, acceleration, velocity, cable_force, attitude, g):
         attitude: R, 9 numbers.
         g: DroneGains.
     """
+    # (m + m_L) a_d - m (k_p e_p + k_v e_v): feedback is for the drone's own mass, feed-forward for its share of the
+    # load, too.
     force = sub(scale(g.mass + g.load_share, acceleration), scale(g.mass, feedback))
     force = add(force, cable_force)
+    # R D Rᵀ v_d, of the set-point: with the drone's own velocity it would take its damping away.
     air = tmul(attitude, velocity)
     force = add(force, mul(attitude, (g.drag[0] * air[0], g.drag[1] * air[1], g.drag[2] * air[2])))
+    # Not downward: eq 28 follows the force wherever it points, and would turn the drone over.
     return (force[0], force[1], max(force[2] + g.mass * GRAVITY, 0.1 * g.mass * GRAVITY))
 
 

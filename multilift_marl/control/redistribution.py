@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
 from multilift_marl.control.cable_forces import balance_forces
 from multilift_marl.control.gains import Gains
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import clip
+from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
 
 TILTS = np.radians(np.arange(0.0, 71.0))  # tried in this order
 AXES = np.radians(np.arange(0.0, 360.0, 5.0))  # horizontal axes of the tilt
@@ -61,14 +61,17 @@ def redistribute(
         arms = np.einsum("aij,nj->ani", attitude, system.anchors)
         wrench = np.zeros((len(attitude), 6))
         wrench[:, 2] = GRAVITY * system.payload_mass + weight
+        # The lost drone's weight acts at its anchor, downward: the others have to exert the opposite wrench.
         wrench[:, 3:] = np.cross(arms[:, lost], [0.0, 0.0, weight])
         force, missed = balance_forces(arms[:, keep], system.formation_force[keep], wrench)
+        # Two cables exert no moment about the line of their anchors: what they miss of one shows here.
         balanced = missed < 1e-6
         # 2. Where the drones are that exert them, each held by the spring that its position gain is.
         size = np.linalg.norm(force, axis=2, keepdims=True)
         stretched = system.cable_length[keep, None] + size / system.cable_stiffness[keep, None]
         moved = arms[:, keep] + stretched * force / size - system.slots[keep]
         stiffness = (gains.mass * gains.k_p)[keep, None]
+        # Beyond the place itself: a drone pulled by ΔF hangs back by ΔF/κ, so its slot is put that much farther.
         offset = _to_slots(moved + (force - system.formation_force[keep]) / stiffness, system.slot_azimuth[keep])
         # 3. What is possible.
         lifted = force + GRAVITY * (gains.mass + system.cable_mass)[keep, None] * [0.0, 0.0, 1.0]
@@ -77,6 +80,8 @@ def redistribute(
         possible = balanced & (thrust.max(axis=1) <= thrust_share) & (height >= LEAST_HEIGHT)
         possible &= np.abs(offset).max(axis=(1, 2)) <= max_offset
         if possible.any():
+            # Tilts are tried in rising order: among the axes of the first possible one, that which asks least of any
+            # drone.
             best = np.where(possible, thrust.max(axis=1), np.inf).argmin()
             found = Redistribution(float(tilt), *(np.zeros((system.num_drones, *shape)) for shape in ((3,), (), (3,))))
             found.force[keep] = force[best]
@@ -115,6 +120,7 @@ def plan_offset(seconds: float, held: np.ndarray, cosine: float, hangs: bool) ->
     """
     giving = 1.0 if hangs and seconds < GIVE_SECONDS else 0.0
     share = clip((seconds - WAIT) / RAMP, 0.0, 1.0)
+    # Without a step of velocity at either end.
     share = share**2 * (3.0 - 2.0 * share)
     down = GIVE_DOWN + GIVE_NEAR * cosine
     return share * held[0] + giving * GIVE_OUT, share * held[1], share * held[2] - giving * down

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
 from multilift_marl.control.formation import smooth_yaw
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, put, scale, sub, vec
 
 

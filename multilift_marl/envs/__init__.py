@@ -1,1 +1,1 @@
-"""Doors to the environment: the batched core, Gymnasium, PettingZoo, TorchRL."""
+"""The APIs of an environment: the batched core, Gymnasium, PettingZoo, TorchRL, Stable-Baselines3."""

@@ -8,24 +8,23 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from multilift_marl import _precompile
-from multilift_marl._jit import bind
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
 from multilift_marl.control.controller import Controller
-from multilift_marl.control.estimator import StateEstimator
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
-from multilift_marl.envs.pipeline import Pipeline, Teams, describe_stages
+from multilift_marl.envs.pipeline import Pipeline, StageContext, describe_stages, join_pipelines
 from multilift_marl.envs.step_kernels import ENDED, TAKEN, Outcome, end_step, take_actions
 from multilift_marl.errors import ConfigError
+from multilift_marl.kernels.jit import bind
+from multilift_marl.mdp.failures import FIRST_OWN
+from multilift_marl.mdp.observations import observation_names
 from multilift_marl.rig.resolve import whole_ratio
-from multilift_marl.sim.saved import check_saved, fingerprint
-from multilift_marl.sim.world import Shard, World
+from multilift_marl.sensing.estimator import StateEstimator
+from multilift_marl.sensing.measurement import Sensing
+from multilift_marl.sim.saved import check_counts, check_saved, fingerprint
+from multilift_marl.sim.world import World
 from multilift_marl.tasks import find_task
-from multilift_marl.tasks.failures import CAUSES
-from multilift_marl.tasks.observations import observation_names
-from multilift_marl.tasks.sensing import Sensing
 
 TRAINING, TRAINING_EVALUATION, EVALUATION = 0, 1, 2  # purposes of seeds
 _SAVED = ("_stacked", "seeds", "episodes", "steps", "_ended")  # arrays of its own
@@ -66,7 +65,6 @@ class MultiliftVec:
         if first_env < 0:
             raise ConfigError(f"first_env must not be negative, but is {first_env}")
         kind = find_task(config.task)
-        _precompile.offer(config)
         self.config, self.purpose, self.first_env = config, purpose, first_env
         self.num_envs, self.num_drones = config.env.num_envs, config.system.num_drones
         e = self.num_envs
@@ -87,7 +85,7 @@ class MultiliftVec:
         self._sensing = Sensing(config, self.world, estimator, (a, self.observation_size // config.env.history))
         self.task = kind(config, self.world, self.reference, self._sensing)
         self.state_size = self.task.critic.shape[1]
-        self.reward_terms, self.failure_causes = tuple(kind.REWARD), CAUSES
+        self.reward_terms, self.failure_causes = tuple(kind.REWARD), kind.causes()
         observation = self.task.observation
         self._stacked = observation if config.env.history == 1 else np.tile(observation, config.env.history)
         self._starts = Episodes(config, self.world, self.task, self._sensing)
@@ -97,14 +95,13 @@ class MultiliftVec:
         self._given, self._halted = np.zeros_like(self.task.action), np.zeros(e, bool)
         actions = self.task.action, self.task.previous
         self._take_actions: Callable[[], Any] = bind(take_actions, self._given, self._halted, *actions)
-        counted = self.steps, self.max_steps, self._ended
-        self._end_step: Callable[[], Any] = bind(end_step, self.world.diverged, self.task.cause, *counted, outcome)
+        causes, counted = (self.task.cause, len(self.failure_causes)), (self.steps, self.max_steps, self._ended)
+        self._end_step: Callable[[], Any] = bind(end_step, self.world.diverged, *causes, *counted, outcome)
         self._checked = False  # whether all components were seen to be written
         self._bind()
         self._first_sense = self._sensing.bind_sense(self.task.view, first=True) if self._sensing.measures else None
         delays = self._sensing.delays_observation
         self._first_delay = self._sensing.bind_delay(observation) if delays else None
-        _precompile.offer(None)
 
     def reset(
         self, seed: int | None = None, mask: np.ndarray | None = None, options: dict[str, Any] | None = None
@@ -136,6 +133,7 @@ class MultiliftVec:
         try:
             self._start(mask, fixed)
         except ValueError:
+            # A reset that is refused skips no episode.
             (self.seeds[:], self.episodes[:]), self._ended[mask] = before, True
             raise
         return self.current()
@@ -166,11 +164,12 @@ class MultiliftVec:
         """Do as `step`, and return the live arrays of `outcome`, which the next step overwrites."""
         begin = self._ended & (self.episodes >= 0) if restart and self._ended.any() else None
         self._set_action(action, self._ended if begin is None else self._ended & ~begin)
-        self.world.run(self._run_shard)
+        for run in self._parts:  # one, unless the task has NumPy functions
+            run()
         self.world.check_warnings()
         out_of_time, bad = self._end_step()
         if bad >= 0:
-            self._refuse_reward(bad)
+            self._refuse_step(bad)
         if out_of_time:
             truncated = self.outcome.flags[1]
             np.logical_and(truncated, self.task.succeeded(), out=self.outcome.flags[2])
@@ -241,6 +240,12 @@ class MultiliftVec:
             ValueError: it is of other environments, or not what `state_dict` returned; nothing is changed then.
         """
         check_saved(saved, self.state_dict(), "world.diverged", "world.system", "task_name")
+        delays, most = self.config.randomization, 2**63 - 1
+        counts = dict.fromkeys(("steps", "seeds", "sensing.sent", "sensing.seen"), (0, most))
+        counts |= {"episodes": (-1, most), "task.time": (0, most), "task.cause": (0, len(self.failure_causes) - 1)}
+        counts |= {f"task.own.{name}": limits for name, limits in self.task.count_limits().items()}
+        counts |= {f"sensing.{name}": (0, getattr(delays, name)[1]) for name in ("action_delay", "observation_delay")}
+        check_counts(saved, counts)
         groups: dict[str, Rows] = {"world": {}, "task": {}, "sensing": {}}
         for key, array in saved.items():
             group, _, name = key.partition(".")
@@ -284,8 +289,14 @@ class MultiliftVec:
                 self._checked = True
             self._stacked[e] = np.tile(self.task.observation[e], self.config.env.history)
 
-    def _refuse_reward(self, env: int) -> None:
-        """Name the reward term that is not finite in an environment, by a ConfigError."""
+    def _refuse_step(self, env: int) -> None:
+        """Name the cause of failure that is none, or the reward term that is not finite, by a ConfigError."""
+        cause, most = int(self.outcome.cause[env]), len(self.failure_causes) - 1
+        if not 0 <= cause <= most:
+            raise ConfigError(
+                f"task {self.task.name} wrote {cause} as the cause of a failure in environment {env}; causes are 1 to "
+                f"{most}: those of failures.CAUSES, then its own FAILURES from failures.FIRST_OWN = {FIRST_OWN} on"
+            )
         bad = ~np.isfinite(self.outcome.terms[env])
         name = self.reward_terms[int(bad.argmax())] if bad.any() else "the sum"
         raise ConfigError(f"reward term {name} is not finite in environment {env}; mend what computes it")
@@ -297,8 +308,9 @@ class MultiliftVec:
 
     def _bind(self) -> None:
         """Build the stages of every shard, from the controller and the task as they are."""
-        teams = Teams(self.world, self.controller, self.task, self._estimator, self._sensing, self._stacked)
+        teams = StageContext(self.world, self.controller, self.task, self._estimator, self._sensing, self._stacked)
         self._pipelines = {shard.lo: Pipeline(teams, shard, self.control_ticks) for shard in self.world.shards}
+        self._parts = join_pipelines(self._pipelines, self.world)
 
     def _observe(self, e: int) -> None:
         """Write the first observation and global state of an episode."""
@@ -306,11 +318,9 @@ class MultiliftVec:
             self._first_sense(e, e + 1)
         self.task.stages["observe state"](e, e + 1)
         self.task.stages["observe"](e, e + 1)
+        self.task.numpy.observe(e, e + 1)
         if self._first_delay is not None:
             self._first_delay(e, e + 1)
-
-    def _run_shard(self, shard: Shard) -> None:
-        self._pipelines[shard.lo].run()
 
     def _set_action(self, action: np.ndarray, ended: np.ndarray) -> None:
         """Take actions (E, N, A) unless an environment in `ended` (E,) cannot go on, or one of them cannot be."""
@@ -321,6 +331,7 @@ class MultiliftVec:
             )
         if action.dtype.kind != "f":
             raise ValueError(f"action has dtype {action.dtype}, expected floating point numbers in [-1, 1]")
+        # Kernels are bound to this array, so actions of any float type are copied into it.
         np.copyto(self._given, action)
         self._halted[:] = ended
         taken = self._take_actions()

@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.config.config import Config
-from multilift_marl.envs.options import Rows, check_delays, check_stretch, read_options
+from multilift_marl.envs.options import Rows, check_delays, check_draw, check_state, check_stretch, read_options
 from multilift_marl.errors import ConfigError
 from multilift_marl.rig.feasibility import check_fixed
-from multilift_marl.sim.parameters import Parameters, check_parameters
+from multilift_marl.sensing.measurement import Sensing
+from multilift_marl.sim.parameters import Parameters, check_parameters, nominal_parameters
 from multilift_marl.sim.randomization import Draw
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.failures import CAUSES
-from multilift_marl.tasks.sensing import Sensing
 
 TURBULENCE, PARAMETERS, SENSORS, PUSHES = 1, 2, 3, 4  # streams of their own, so that none moves what the others draw
 _MAX_REDRAWS = 1000
@@ -36,6 +35,7 @@ class Episodes:
     def __init__(self, config: Config, world: World, task: Task, sensing: Sensing):
         self._world, self._task, self._sensing, ranges = world, task, sensing, config.randomization
         self._draw = Draw(world, ranges, self._sensing.drawn())
+        self._nominal = {name: array[0] for name, array in nominal_parameters(world.system, 1)._asdict().items()}
         self._longest = {"action_delay": ranges.action_delay[1], "observation_delay": ranges.observation_delay[1]}
         self._update_drawn()
 
@@ -51,6 +51,8 @@ class Episodes:
                 value[mask] = rows
                 check_parameters(self._world.system, self._draw.parameters, mask, {name: value})
         check_fixed(self._world.system, self._draw.ranges, fixed["randomization"])
+        check_draw(fixed["randomization"], self._nominal, self._world.system)
+        check_state(fixed["state"], self._world.system)
         return fixed
 
     def draw(self, e: int, seed: int, key: tuple[int, int, int], fixed: dict[str, Rows], row: int) -> None:
@@ -72,6 +74,7 @@ class Episodes:
             self._world.seed_pushes(e, np.random.SeedSequence(seed, spawn_key=(*key, PUSHES)))
         if self._sensing.enabled:
             self._sensing.start(e, np.random.SeedSequence(seed, spawn_key=(*key, SENSORS)))
+        # By name: NumPy may change what `default_rng` gives.
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
         self._draw.draw(e, rng, seed, (*key, PARAMETERS))
         for name, rows in fixed["randomization"].items():
@@ -86,7 +89,7 @@ class Episodes:
             if self._task.draw_start(e, rng, self._draw.parameters):
                 return
         raise ConfigError(
-            f"no start of task {self._task.name} is free of failure ({CAUSES[self._task.cause[e]]}) in {_MAX_REDRAWS} "
+            f"no start of task {self._task.name} is free of failure ({self._cause(e)}) in {_MAX_REDRAWS} "
             "draws; narrow the start ranges in task_options or change the rig"
         )
 
@@ -97,8 +100,13 @@ class Episodes:
         parameters = self._draw.parameters
         check_stretch(self._world, e, parameters.cable_length[e], parameters.cable_stiffness[e])
         if not self._task.begin(e):
-            cause = CAUSES[self._task.cause[e]]
+            cause = self._cause(e)
             raise ValueError(f"the given state of environment {e} is a failure from the start ({cause}); change it")
+
+    def _cause(self, e: int) -> str:
+        """Return why the start of an environment is a failure."""
+        number, names = int(self._task.cause[e]), self._task.causes()
+        return names[number] if 0 <= number < len(names) else f"cause {number}, which is none"
 
     def load(self, mask: np.ndarray) -> None:
         """Make draw and start of the environments in `mask` the world's own."""

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import re
+from copy import copy
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import list_configs
+from multilift_marl.config.load import list_configs, resolve_config
 from multilift_marl.envs.core import MultiliftVec, make_vec
+from multilift_marl.envs.options import check_mask
 from multilift_marl.envs.wrapper_utils import (
     BATCH_RENDER_MODES,
     RENDER_MODES,
     FrameRenderer,
+    check_open,
+    limit_steps,
     mean_reward,
     possible_modes,
     row_spaces,
@@ -30,10 +35,12 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A team of N drones as one agent: observations (N·D,) float32, actions (N·A,) in [-1, 1], the drones' mean reward.
 
     Drone n has the n-th D numbers of an observation and the n-th A numbers of an action. Info holds `success`,
-    `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms` {name: float} and
-    `randomization` {name: array}, the hidden draw. Copies, also by pickle, go on bit for bit.
+    `failure`, `diverged` (bool), `failure_cause`, an index into `vec.failure_causes` (0: none), `reward_terms`
+    {name: float} and `randomization` {name: array}, the hidden draw. Copies, also by pickle, go on bit for bit.
 
     Where neither the configuration nor the first reset states a seed, that reset draws one (`vec.seeds`).
+
+    The time limit is `env.episode_seconds`; `max_episode_steps` of `gymnasium.make` can only shorten it.
 
     Args:
         task: a configuration's name, the path of one, or a Config.
@@ -51,6 +58,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012 (as Gymnasium has it)
+    _spec: EnvSpec | None = None
 
     def __init__(
         self, task: str | Config = "hover", render_mode: str | None = None, *,
@@ -120,6 +128,15 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Free renderer and window; the environment itself holds nothing that must be closed."""
         self._pictures.close()
 
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What `gymnasium.make` made it of, with `max_episode_steps`; None where it was made without that."""
+        return _with_limit(self._spec, self.vec)
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
+
 
 class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """E teams of N drones on the batched core, each as one agent: observations (E, N·D), actions (E, N·A).
@@ -139,6 +156,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         first_env: number of the first environment, for replaying one of a larger batch.
         render_mode: None, or "rgb_array" for `render`.
         autoreset_mode: see above; also "SameStep", "NextStep" or "Disabled".
+        max_episode_steps: time limit in policy steps, in place of `env.episode_seconds`.
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
 
     Attributes:
@@ -154,18 +172,21 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         "render_modes": list(BATCH_RENDER_MODES),
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
+    _spec: EnvSpec | None = None
     closed = True  # until there is something to close: Gymnasium 1.1 closes what was refused, too
 
     def __init__(
         self, task: str | Config = "hover", *, num_envs: int | None = None, num_threads: int | None = None,
         num_drones: int | None = None, seed: int | None = None, first_env: int = 0, render_mode: str | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, **overrides: Any,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, max_episode_steps: int | None = None,
+        **overrides: Any,
     ):  # fmt: skip
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        self.vec = make_vec(
-            task, num_envs=num_envs, num_threads=num_threads, num_drones=num_drones, seed=seed, first_env=first_env,
-            **overrides,
-        )  # fmt: skip
+        config = resolve_config(
+            task, num_envs=num_envs, num_threads=num_threads, num_drones=num_drones, seed=seed, **overrides
+        )
+        config = limit_steps(config, max_episode_steps, "max_episode_steps", overrides)
+        self.vec = MultiliftVec(config, first_env=first_env)
         self.num_envs = self.vec.num_envs
         own = {"autoreset_mode": self.autoreset_mode, "render_fps": self.vec.config.env.policy_hz}
         self.metadata = {**self.metadata, **own}
@@ -174,7 +195,6 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._pictures = FrameRenderer(self.vec, render_mode, BATCH_RENDER_MODES)
-        self._causes = np.array(self.vec.failure_causes, dtype=object)
         self.closed = False
 
     def reset(
@@ -193,10 +213,13 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises:
             ValueError: a negative seed, a mask of wrong shape or type, an unknown option or one that cannot be.
         """
+        check_open(self.closed)
         seed_afresh(self.vec)
         options = dict(options or {})
         mask = options.pop("reset_mask", None)
+        mask = None if mask is None else check_mask(mask, self.num_envs)
         observation, info = self.vec.reset(seed, mask, options)
+        super().reset(seed=seed)  # for wrappers that draw from np_random; nothing here does
         return self._joint(observation), self._masked(info, np.ones(self.num_envs, bool) if mask is None else mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -210,8 +233,9 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Raises:
             ValueError: actions of wrong shape or type, or not finite.
-            RuntimeError: environments were never reset, or have ended and nobody resets them.
+            RuntimeError: environments were never reset, or are closed, or have ended and nobody resets them.
         """
+        check_open(self.closed)
         joint, mode = _split(self.vec, actions, self.action_space), self.autoreset_mode
         restart = mode is AutoresetMode.NEXT_STEP
         observation, reward, terminated, truncated, info = self.vec.step(joint, restart)
@@ -237,8 +261,17 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(frame for frame in frames if frame is not None)  # all: there is no mode "human"
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free the renderer."""
+        """Free the renderer; later steps and resets raise a RuntimeError."""
         self._pictures.close()
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What `gymnasium.make_vec` made it of, with `max_episode_steps`; None where it was made without that."""
+        return _with_limit(self._spec, self.vec)
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
 
     def _joint(self, observation: np.ndarray) -> np.ndarray:
         return observation.reshape(self.num_envs, -1)
@@ -246,7 +279,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _masked(self, info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
         """Return the core's info in Gymnasium's form: a mask beside every entry, and nothing outside the mask."""
         values: dict[str, Any] = {key: info[key] & mask for key in ("success", "failure", "diverged")}
-        values["failure_cause"] = np.where(mask, self._causes[info["failure_cause"]], None)
+        values["failure_cause"] = np.where(mask, info["failure_cause"], 0)
         terms = {name: np.where(mask, value, 0.0) for name, value in info["reward_terms"].items()}
         values["reward_terms"] = terms | {f"_{name}": mask.copy() for name in terms}
         drawn = {}
@@ -254,6 +287,14 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             drawn[name] = np.where(mask.reshape(-1, *(1,) * (value.ndim - 1)), value, np.zeros_like(value))
         values["randomization"] = drawn | {f"_{name}": mask.copy() for name in drawn}
         return values | {f"_{key}": mask.copy() for key in values}
+
+
+def _with_limit(spec: EnvSpec | None, vec: MultiliftVec) -> EnvSpec | None:
+    """Return a spec that states the time limit of the environments, whatever configured it."""
+    if spec is not None:
+        spec = copy(spec)
+        spec.max_episode_steps = vec.max_steps
+    return spec
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -9,7 +9,6 @@ from multilift_marl.config.load import build_config
 from multilift_marl.control.formation import Reference
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.sim.world import Shard, World
-from multilift_marl.tasks.failures import CAUSES
 
 Measured = dict[str, np.ndarray]
 """Fields of `SystemState` by name, of one environment."""
@@ -76,6 +75,7 @@ class MeasuredTeam(MultiliftVec):
             ValueError: see `MultiliftVec.step`.
         """
         self._set_action(action, self.ended)
+        self.task.cause[0] = 0  # what fails here does not end what flies elsewhere
         for call in self._pipelines[0].before:
             call()
         self._ticks_left = self.control_ticks
@@ -109,4 +109,4 @@ class MeasuredTeam(MultiliftVec):
     def failure(self) -> str:
         """What has failed, in words; empty if nothing has."""
         cause = int(self.task.cause[0])
-        return CAUSES[cause] if cause else ""
+        return self.failure_causes[cause] if cause else ""

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pettingzoo
 from gymnasium.spaces import Box
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import list_configs, resolve_config
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.envs.wrapper_utils import RENDER_MODES, FrameRenderer, possible_modes, seed_afresh
+from multilift_marl.envs.wrapper_utils import RENDER_MODES, FrameRenderer, limit_steps, possible_modes, seed_afresh
 from multilift_marl.errors import nearest
 
 
@@ -189,7 +190,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
 
 def parallel_env(
     task: str | Config = "hover", *, num_drones: int | None = None, seed: int | None = None,
-    render_mode: str | None = None, **overrides: Any,
+    render_mode: str | None = None, max_cycles: int | None = None, **overrides: Any,
 ) -> MultiliftParallelEnv:  # fmt: skip
     """Return one environment of a task as a PettingZoo parallel environment.
 
@@ -198,17 +199,27 @@ def parallel_env(
         num_drones: N; None for the configured value, as for the next.
         seed: of the first reset; None draws one, unless the configuration states it.
         render_mode: None, "rgb_array" or "human".
+        max_cycles: time limit in policy steps, in place of `env.episode_seconds`.
         **overrides: configuration values by dotted name, `**{"payload.mass": 2.0}`.
 
     Raises:
         ConfigError: an unknown key, a wrong value or an impossible system.
         ValueError: an unknown render mode.
     """
-    return MultiliftParallelEnv(resolve_config(task, num_drones=num_drones, seed=seed, **overrides), render_mode)
+    config = resolve_config(task, num_drones=num_drones, seed=seed, **overrides)
+    return MultiliftParallelEnv(limit_steps(config, max_cycles, "max_cycles", overrides), render_mode)
+
+
+def env(task: str | Config = "hover", **keywords: Any) -> AECEnv[str, np.ndarray, np.ndarray]:
+    """Return the same as an AEC environment, whose drones act one after the other; arguments as for `parallel_env`.
+
+    The physics goes on once all drones have acted.
+    """
+    return parallel_to_aec(parallel_env(task, **keywords))
 
 
 def register() -> None:
-    """Enter every shipped configuration in PettingZoo's registry, `multilift_marl/hover-v0`.
+    """Enter every shipped configuration in both of PettingZoo's registries, `multilift_marl/hover-v0`.
 
     `rigs/falcon3` is entered as `multilift_marl/rigs_falcon3-v0`. Does nothing where PettingZoo has no registry (before
     1.27), and nothing the second time.
@@ -217,5 +228,8 @@ def register() -> None:
         return
     for config in list_configs():
         name = f"multilift_marl/{config.replace('/', '_')}-v0"
-        if name not in pettingzoo.parallel_registry:
-            pettingzoo.register("parallel", name, f"{__name__}:parallel_env", kwargs={"task": config})
+        for kind, function, known in (
+            ("parallel", parallel_env, pettingzoo.parallel_registry), ("aec", env, pettingzoo.aec_registry)
+        ):  # fmt: skip
+            if name not in known:
+                pettingzoo.register(kind, name, f"{__name__}:{function.__name__}", kwargs={"task": config})

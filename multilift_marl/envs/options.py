@@ -9,11 +9,24 @@ import numpy as np
 
 from multilift_marl.errors import nearest
 from multilift_marl.math3d import add, matrow, mul, row, sub
+from multilift_marl.physical import GRAVITY
+from multilift_marl.rig.feasibility import MAX_LOAD, MAX_WIND
+from multilift_marl.rig.plausible import MAX_THRUST
+from multilift_marl.rig.system import System
 from multilift_marl.sim.parameters import CONFIGURED
 from multilift_marl.sim.state import SystemState, hook_position
 from multilift_marl.sim.world import World
 
 Rows = dict[str, np.ndarray]
+_LARGEST = {  # of a given state, of the length of a vector and its unit; physics diverges beyond 100 m/s and 500 rad/s
+    "payload_position": (1e4, "m"), "drone_position": (1e4, "m"),
+    "payload_velocity": (MAX_WIND, "m/s"), "drone_velocity": (MAX_WIND, "m/s"),
+    "payload_body_rates": (100.0, "rad/s"), "drone_body_rates": (100.0, "rad/s"),
+}  # fmt: skip
+_FACTORS = (
+    0.01,
+    100.0,
+)  # of fixed masses, inertias, lengths, stiffnesses, thrusts, lags and drags, over the nominal ones
 OPTIONS = ("randomization", "state")
 MOST_STRETCH = 0.01  # [-] of its length that a cable may be stretched at the start, or ...
 MOST_TENSION = 5.0  # [-] ... as much as this times its tension at rest stretches it
@@ -106,6 +119,67 @@ def _check_field(name: str, rows: np.ndarray) -> None:
         raise ValueError("state 'rotor_speed' must not be negative; the sense of rotation is the vehicle's")
 
 
+def check_state(given: Rows, system: System) -> None:
+    """Refuse a given state as fast, far or spinning as no team is, by a ValueError."""
+    for name, rows in given.items():
+        if name in _LARGEST:
+            largest, unit = _LARGEST[name]
+            size = float(np.abs(rows).max())  # first, since squares may overflow
+            size = size if size > largest else float(np.linalg.norm(rows, axis=-1).max())
+            if size > largest:
+                raise ValueError(f"state '{name}' is {size:.3g} {unit} long, more than {largest:g} {unit}; give less")
+    if "rotor_speed" in given:
+        fastest = np.array([vehicle.rotor_speed_max for vehicle in system.vehicles])[:, None]
+        if (beyond := given["rotor_speed"] > fastest * (1 + 1e-9)).any():
+            n = int(np.argwhere(beyond)[0][-2])
+            raise ValueError(
+                f"state 'rotor_speed' of drone_{n} is {given['rotor_speed'][beyond].max():.4g} rad/s, more than its "
+                f"rotors reach, {fastest[n, 0]:.4g} rad/s; give less"
+            )
+
+
+def check_draw(fixed: Rows, nominal: Rows, system: System) -> None:
+    """Refuse fixed draws that no configuration could have, by a ValueError.
+
+    Args:
+        fixed: by name, with a row for each environment.
+        nominal: of what is drawn about a nominal value, by name, (...).
+        system: of the environments.
+    """
+    low, high = _FACTORS
+    for name, rows in fixed.items():
+        if name == "payload_center_of_mass":
+            _refuse_beyond(name, rows, float(np.linalg.norm(system.payload_size)), "m")
+        elif name in nominal:
+            least = 0.0 if name.endswith("drag") else low
+            factor = rows / nominal[name]
+            if not ((factor >= least) & (factor <= high)).all():
+                odd = rows[~((factor >= least) & (factor <= high))]
+                raise ValueError(
+                    f"randomization '{name}' is {odd.flat[0]:.3g}, not within {least:g} and {high:g} times the nominal "
+                    f"{float(nominal[name].flat[0]):.3g}; give less of a change, or change the configuration"
+                )
+        elif name == "wind":
+            _refuse_beyond(name, rows, MAX_WIND, "m/s")
+        elif name == "payload_force":
+            _refuse_beyond(name, rows, MAX_LOAD * GRAVITY * system.payload_mass, "N")
+        elif name == "observation_bias":
+            _refuse_beyond(name, rows, 100.0, "in its units")
+    coefficient, mass = fixed.get("vehicle_thrust_coefficient", 1.0), fixed.get("vehicle_mass", system.drone_mass)
+    thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles]) * coefficient
+    names = [name for name in ("vehicle_mass", "vehicle_thrust_coefficient") if name in fixed]
+    if names and (thrust > MAX_THRUST * GRAVITY * mass).any():
+        raise ValueError(
+            f"with the {' and '.join(names)} that reset is to fix, a drone lifts more than {MAX_THRUST:g} × its "
+            "weight; fix heavier drones or weaker rotors"
+        )
+
+
+def _refuse_beyond(name: str, rows: np.ndarray, largest: float, unit: str) -> None:
+    if (size := float(np.abs(rows).max(initial=0.0))) > largest:
+        raise ValueError(f"randomization '{name}' holds {size:.3g} {unit}, more than {largest:.4g}; give less")
+
+
 def check_delays(fixed: Rows, longest: dict[str, int]) -> None:
     """Refuse delays longer than those that are remembered, by a ValueError."""
     for name, most in longest.items():
@@ -124,7 +198,7 @@ def check_stretch(world: World, e: int, length: np.ndarray, stiffness: np.ndarra
         if state.cable_broken[e, n]:
             continue
         foot = add(row(state.payload_position, e), mul(matrow(state.payload_rotation, e), tuple(anchor)))
-        span = float(np.linalg.norm(sub(hook_position(e, n, state, world.constants.hooks), foot)))
+        span = float(np.linalg.norm(sub(hook_position(e, n, state, world.rig.hooks), foot)))
         most = max(MOST_STRETCH * length[n], MOST_TENSION * system.resting_tension[n] / stiffness[n])
         if span > length[n] + most:
             raise ValueError(

@@ -4,30 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import groupby
+from operator import attrgetter
 from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import bind, kernel_name
 from multilift_marl.control.controller import Controller
-from multilift_marl.control.estimator import StateEstimator
+from multilift_marl.kernels.jit import bind, kernel_name
+from multilift_marl.mdp.observation_kernels import stack
+from multilift_marl.sensing.estimator import StateEstimator
+from multilift_marl.sensing.measurement import Sensing
 from multilift_marl.sim.world import Shard, World
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.observation_kernels import stack
-from multilift_marl.tasks.sensing import Sensing
 
 
 class Stage(NamedTuple):
-    """A part of a policy step; it runs for one shard, several at the same time, and may write their rows only."""
+    """A part of a policy step; it runs for one shard, several at the same time, and may write their rows only.
+
+    Those that are NumPy functions run for all environments at once, when all shards have come that far.
+    """
 
     name: str
     call: Callable[[], None]
     times: int = 1
     """How often it runs in a policy step."""
+    is_whole: bool = False
+    """Whether it runs once, for all environments."""
 
 
-class Teams(NamedTuple):
+class StageContext(NamedTuple):
     """What the stages of E environments work on."""
 
     world: World
@@ -39,7 +46,7 @@ class Teams(NamedTuple):
     """(E, N, H D) float32 observations of the last H steps; the task's own array where H = 1."""
 
 
-def build_stages(teams: Teams, shard: Shard, ticks: int) -> tuple[list[Stage], list[Stage], list[Stage]]:
+def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[Stage], list[Stage], list[Stage]]:
     """Return what runs for a shard before its control ticks, at each of `ticks`, and after them."""
     world, controller, task, estimator, sensing, stacked = teams
     lo, hi = shard.lo, shard.hi
@@ -47,9 +54,10 @@ def build_stages(teams: Teams, shard: Shard, ticks: int) -> tuple[list[Stage], l
     arriving = sensing.applied if sensing.delays_action else task.action
 
     # once, before: the action arrives
+    own, every = task.numpy, (0, world.num_envs)
+    before = [Stage("goals (NumPy)", partial(own.plan_goals, *every), is_whole=True)] if own.plans else []
     plan = on_shard.get("plan")
     set_action, control = controller.bind(lo, hi, arriving, task.planned, plan)
-    before = []
     if sensing.delays_action:
         before.append(Stage("delay action", partial(sensing.bind_send(task.action), lo, hi)))
     before.append(Stage("set action", set_action))
@@ -63,11 +71,16 @@ def build_stages(teams: Teams, shard: Shard, ticks: int) -> tuple[list[Stage], l
         tick.append(Stage("estimate own state", partial(estimator.estimate, lo, hi), ticks))
 
     # once, after: measure, reward, observe
-    after = [Stage("errors and failures", on_shard["check"]), Stage("reward", on_shard["reward"])]
+    after = [Stage("errors and failures", on_shard["check"])]
+    if own.judges:
+        after.append(Stage("failures, reward (NumPy)", partial(own.judge, *every), is_whole=True))
+    after.append(Stage("reward", on_shard["reward"]))
     after.append(Stage("observe state", on_shard["observe state"]))
     if sensing.measures:
         after.append(Stage("sense", partial(sensing.bind_sense(task.view), lo, hi)))
     after.append(Stage("observe", on_shard["observe"]))
+    if own.observes:
+        after.append(Stage("observe (NumPy)", partial(own.observe, *every), is_whole=True))
     if sensing.delays_observation:
         after.append(Stage("delay observation", partial(sensing.bind_delay(task.observation), lo, hi)))
     if stacked is not task.observation:
@@ -85,20 +98,24 @@ class Pipeline:
 
     Attributes:
         stages: each of them once, in order.
+        parts: calls of a policy step, in runs that are for all environments (True) or this shard alone (False): one of
+            the latter where no stage is for all.
         before, tick, after: calls of those that run before the control ticks, at each of them, and after them.
     """
 
-    def __init__(self, teams: Teams, shard: Shard, ticks: int):
+    def __init__(self, teams: StageContext, shard: Shard, ticks: int):
         before, tick, after = build_stages(teams, shard, ticks)
         self.before, self.tick, self.after = (tuple(stage.call for stage in part) for part in (before, tick, after))
         self.stages = [*before, *tick, *after]
         first, last = len(before), len(before) + len(tick)
         self._order = [*range(first), *[*range(first, last)] * ticks, *range(last, len(self.stages))]
         self._calls = tuple(self.stages[i].call for i in self._order)
+        runs = groupby((self.stages[i] for i in self._order), key=attrgetter("is_whole"))
+        self.parts = [(whole, tuple(stage.call for stage in stages)) for whole, stages in runs]
 
-    def run(self) -> None:
-        """Make one policy step."""
-        for call in self._calls:
+    def run(self, part: int) -> None:
+        """Run one of the parts of a policy step."""
+        for call in self.parts[part][1]:
             call()
 
     def run_timed(self, seconds: np.ndarray) -> None:
@@ -107,6 +124,24 @@ class Pipeline:
             begin = perf_counter()
             call()
             seconds[i] += perf_counter() - begin
+
+
+def join_pipelines(pipelines: dict[int, Pipeline], world: World) -> list[Callable[[], None]]:
+    """Return what makes a policy step, one call after the other: those of all shards at a time, or of all environments.
+
+    Args:
+        pipelines: of all shards, by their first environment.
+        world: of the shards.
+    """
+
+    def run_shard(part: int, shard: Shard) -> None:
+        pipelines[shard.lo].run(part)
+
+    first = pipelines[0]
+    return [
+        partial(first.run, part) if is_whole else partial(world.run, partial(run_shard, part))
+        for part, (is_whole, _) in enumerate(first.parts)
+    ]
 
 
 def describe_stages(stages: list[Stage], seconds: np.ndarray) -> str:

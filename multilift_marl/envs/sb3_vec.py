@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.envs.core import make_vec
-from multilift_marl.envs.wrapper_utils import BATCH_RENDER_MODES, FrameRenderer, mean_reward, row_spaces, seed_afresh
-from multilift_marl.errors import pip_install
+from multilift_marl.envs.wrapper_utils import (
+    BATCH_RENDER_MODES,
+    FrameRenderer,
+    check_open,
+    mean_reward,
+    row_spaces,
+    seed_afresh,
+)
+from multilift_marl.errors import ConfigError, pip_install
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -26,6 +33,9 @@ class MultiliftSB3VecEnv(VecEnv):
     With `shared`, each drone is a row, so that one policy flies them all: E·N rows, row e·N + n drone n of environment
     e; observations (D,), actions (A,), the drone's reward. Without, each team is one: E rows, observations (N·D,) and
     actions (N·A,) drone after drone, the drones' mean reward.
+
+    What counts episodes by rows, as SB3's `evaluate_policy` does, counts those of each drone with `shared`. To count
+    teams, evaluate `TeamPolicy(model, N)` in environments that are not `shared`.
 
     An environment that ends is reset in the same step. Its rows' infos then hold `terminal_observation`,
     `TimeLimit.truncated`, `is_success` and `failure_cause` (its name, "none" without one); those of other rows are
@@ -65,6 +75,8 @@ class MultiliftSB3VecEnv(VecEnv):
         self._rows = vec.num_drones if shared else 1  # of an environment
         self._pictures = FrameRenderer(vec, render_mode, BATCH_RENDER_MODES)
         super().__init__(vec.num_envs * self._rows, *row_spaces(vec, vec.num_drones // self._rows))
+        cast(dict[str, Any], self.metadata)["render_fps"] = vec.config.env.policy_hz
+        self.closed = False
         self._actions = np.zeros((self.num_envs, vec.num_drones // self._rows * vec.action_size), np.float32)
         self._shape = self._actions.shape
 
@@ -79,6 +91,7 @@ class MultiliftSB3VecEnv(VecEnv):
         """
         if any(options != self._options[0] for options in self._options):
             raise ValueError("options of reset must be the same for all rows: give set_options one dict")
+        check_open(self.closed)
         seed_afresh(self.vec)
         observation, _ = self.vec.reset(self._seeds[0], options=self._options[0])  # the core tells environments apart
         self._reset_seeds()
@@ -98,8 +111,9 @@ class MultiliftSB3VecEnv(VecEnv):
 
         Raises:
             ValueError: actions of wrong shape or type, or not finite.
-            RuntimeError: the environments were never reset.
+            RuntimeError: the environments were never reset, or are closed.
         """
+        check_open(self.closed)
         vec = self.vec
         if self._actions.shape != self._shape:
             raise ValueError(f"actions have shape {self._actions.shape}, expected {self._shape} (rows, numbers)")
@@ -124,21 +138,26 @@ class MultiliftSB3VecEnv(VecEnv):
         return self._by_row(observation), reward, over.repeat(self._rows), infos
 
     def close(self) -> None:
-        """Free the renderer; the environments themselves hold nothing that must be closed."""
+        """Free the renderer; later steps and resets raise a RuntimeError."""
         self._pictures.close()
+        self.closed = True
 
     def get_images(self) -> list[np.ndarray | None]:
         """Return a picture (H, W, 3) uint8 of each environment, for `render`."""
         return [self._pictures.frame(e) for e in range(self.vec.num_envs)]
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Return an attribute of the core (or `render_mode`) for each row; of arrays (E, ...) its environment's part.
+        """Return an attribute of the core for each row, of arrays (E, ...) its environment's part; or of this wrapper.
+
+        That is `render_mode`, `metadata`, `spec` (None) or a space.
 
         Raises:
             AttributeError: the core has none such.
         """
-        if attr_name == "render_mode":
-            return [self.render_mode for _ in self._get_indices(indices)]
+        if attr_name in ("render_mode", "metadata", "observation_space", "action_space"):
+            return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+        if attr_name == "spec":
+            return [None for _ in self._get_indices(indices)]
         return self._share(getattr(self.vec, attr_name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
@@ -166,3 +185,45 @@ class MultiliftSB3VecEnv(VecEnv):
         """Return what each of the chosen rows has of a value of the core."""
         split = isinstance(value, np.ndarray) and value.shape[:1] == (self.vec.num_envs,)
         return [value[row // self._rows] if split else value for row in self._get_indices(indices)]
+
+
+class TeamPolicy:
+    """A policy that was trained with a row for each drone (`shared`), for environments in which a row is a team.
+
+    `evaluate_policy(TeamPolicy(model, 4), MultiliftSB3VecEnv(shared=False), n_eval_episodes=100)` evaluates 100
+    episodes of the team.
+
+    Args:
+        model: a model of SB3; its observation space is (D,).
+        num_drones: N.
+
+    Raises:
+        ConfigError: the model observes anything else than one drone's numbers in a row.
+    """
+
+    def __init__(self, model: Any, num_drones: int):
+        if len(model.observation_space.shape) != 1 or num_drones < 1:
+            raise ConfigError(
+                f"a model for one drone observes (D,) numbers, but this one has {model.observation_space.shape}, and "
+                f"num_drones is {num_drones}; give the model and the size of the team that it flies"
+            )
+        self._model, self._num_drones = model, num_drones
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, Any]:  # fmt: skip
+        """Return actions (E, N·A) for observations (E, N·D), as SB3's models do for their rows.
+
+        Raises:
+            ConfigError: the observations are of another team.
+        """
+        size = self._model.observation_space.shape[0]
+        if observation.shape[-1] != size * self._num_drones:
+            raise ConfigError(
+                f"a team of {self._num_drones} observes {self._num_drones} x {size} numbers, but these are "
+                f"{observation.shape[-1]}; use MultiliftSB3VecEnv(shared=False) with num_drones={self._num_drones}"
+            )
+        starts = None if episode_start is None else np.repeat(episode_start, self._num_drones)
+        action, state = self._model.predict(observation.reshape(-1, size), state, starts, deterministic)
+        return action.reshape(len(observation), -1), state

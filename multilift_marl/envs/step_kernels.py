@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
-from multilift_marl.tasks.failures import DIVERGED
+from multilift_marl.kernels.jit import kernel
+from multilift_marl.mdp.failures import DIVERGED
 
 TAKEN, ENDED, NOT_FINITE = range(3)  # what becomes of actions
 
@@ -53,6 +53,7 @@ def take_actions(given, ended, action, previous):
     Returns:
         TAKEN, or why none was: ENDED, or else NOT_FINITE.
     """
+    # All are looked at before any is taken: a step that is refused changes nothing.
     for e in range(ended.shape[0]):
         if ended[e]:
             return ENDED
@@ -70,19 +71,21 @@ def take_actions(given, ended, action, previous):
 
 
 @kernel
-def end_step(diverged, cause, steps, max_steps, ended, outcome):
+def end_step(diverged, cause, num_causes, steps, max_steps, ended, outcome):
     """Count a step of all environments, find those whose episodes end, and sum up their rewards.
 
     Args:
         diverged: (E,) bool; such a step has no reward.
         cause: (E,) int64, of failures; written where the simulation has diverged.
+        num_causes: of failures, none among them.
         steps: policy steps so far (E,); one more.
         max_steps: of an episode.
         ended: written, (E,) bool.
         outcome: Outcome, written; whether time limits are successes is for the task to say.
 
     Returns:
-        How many episodes have reached their time limit, and an environment whose reward is not finite, or -1.
+        How many episodes have reached their time limit, and an environment whose reward is not finite, or whose cause
+        is none, or -1.
     """
     flags = outcome.flags
     terms = outcome.terms
@@ -102,7 +105,7 @@ def end_step(diverged, cause, steps, max_steps, ended, outcome):
         flags[4, e] = diverged[e]
         outcome.cause[e] = cause[e]
         reward = _sum(terms[e])
-        if not isfinite(reward):
+        if not isfinite(reward) or cause[e] < 0 or cause[e] >= num_causes:
             bad = e
         for n in range(outcome.reward.shape[1]):
             outcome.reward[e, n] = reward

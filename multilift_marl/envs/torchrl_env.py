@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
 from multilift_marl.envs.core import TRAINING, MultiliftVec
+from multilift_marl.envs.wrapper_utils import check_open, seed_afresh
 
 _CPU = torch.device("cpu")
 
@@ -24,6 +25,9 @@ class MultiliftEnv(EnvBase):
     Keys: ("agents", "observation") (E, N, D), ("agents", "action") (E, N, A), ("agents", "reward") (E, N, 1), root
     `state` (E, S) for critics, root `done`, `terminated`, `truncated` (E, 1), and `info` with `success`, `failure`,
     `diverged` (E, 1) and `reward_terms` (E, T).
+
+    Where neither the configuration nor `set_seed` states a seed, the first reset draws one (`vec.seeds`), so that
+    workers simulate different episodes. After `close()`, steps and resets raise a RuntimeError.
 
     Args:
         config: what to build.
@@ -43,6 +47,7 @@ class MultiliftEnv(EnvBase):
     def __init__(self, config: Config, purpose: int = TRAINING, first_env: int = 0, memory: int = 0):
         self.vec = vec = MultiliftVec(config, purpose, first_env)
         super().__init__(device="cpu", batch_size=[vec.num_envs])
+        self.is_closed = False
         self.group_map = {"agents": [f"drone_{n}" for n in range(vec.num_drones)]}
         e, n, flag = vec.num_envs, vec.num_drones, Binary(1, (vec.num_envs, 1), dtype=torch.bool)
         agents = {"observation": Unbounded((e, n, vec.observation_size))}
@@ -68,6 +73,7 @@ class MultiliftEnv(EnvBase):
         self._terminated = torch.zeros(e, 1, dtype=torch.bool)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        check_open(self.is_closed)
         mask = tensordict.get("_reset", None) if tensordict is not None else None
         if mask is None and self._resumed:
             self._resumed = False  # the restored episodes go on
@@ -76,6 +82,7 @@ class MultiliftEnv(EnvBase):
             if mask is None and self._memory is not None:
                 self._memory = torch.zeros_like(self._memory)
             seed, self._seed, self._resumed = self._seed, None, False
+            seed_afresh(self.vec)
             observation, info = self.vec.reset(seed, None if mask is None else mask.reshape(-1).numpy())
         ended = torch.from_numpy(self.vec.ended).unsqueeze(-1)  # of environments that this reset leaves alone
         flags = [torch.from_numpy(info[key]).unsqueeze(-1) for key in ("success", "failure", "diverged")]
@@ -85,9 +92,11 @@ class MultiliftEnv(EnvBase):
         return package
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        check_open(self.is_closed)
         action = tensordict["agents", "action"].detach().numpy()
         outcome = self.vec.step_live(action)
         self._resumed = False
+        # Copied, since the core overwrites them in its next step.
         flags = torch.from_numpy(outcome.flags.copy()).unsqueeze(-1).unbind()
         self._terminated = flags[0]
         return self._package(outcome.observation.copy(), flags, outcome.reward.copy())

@@ -1,20 +1,29 @@
-"""What the faces of the core share: fresh seeds, spaces, pictures, and what one environment tells of itself."""
+"""What the APIs of the core share: fresh seeds, time limits, spaces, pictures, what one environment tells of itself."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.error import ClosedEnvironmentError as _ClosedError
 from gymnasium.spaces import Box
 
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.errors import nearest
+from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.rendering import Renderer, Window
 
 BATCH_RENDER_MODES = ("rgb_array",)  # of many environments
+
+
+class ClosedEnvironmentError(_ClosedError, RuntimeError):
+    """Environments that were closed are asked to go on."""
+
+
 _FLAGS = ("success", "failure", "diverged")
 RENDER_MODES = (*BATCH_RENDER_MODES, "human")
 
@@ -26,6 +35,36 @@ def seed_afresh(vec: MultiliftVec) -> None:
     """
     if "seed" not in vec.config.model_fields_set and (vec.episodes < 0).all():
         vec.seeds[:] = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def check_open(closed: bool) -> None:
+    """Refuse what is asked of environments after their `close()`, by a RuntimeError."""
+    if closed:
+        raise ClosedEnvironmentError("these environments are closed and cannot go on; make new ones")
+
+
+def limit_steps(config: Config, steps: int | None, name: str, given: Iterable[str] = ()) -> Config:
+    """Return a configuration whose episodes last a number of policy steps, as other libraries state their time limit.
+
+    Args:
+        config: of the environments.
+        steps: policy steps; None or -1 leaves the configured `env.episode_seconds`.
+        name: of that argument, for messages.
+        given: keys that were overridden.
+
+    Raises:
+        ConfigError: no such number, or another length was given, too.
+    """
+    if steps is None or steps == -1:
+        return config
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+        raise ConfigError(f"{name} must be a number of policy steps, 1 or more, but is {steps!r}")
+    seconds, configured = steps / config.env.policy_hz, config.env.episode_seconds
+    if "env.episode_seconds" in given and round(configured * config.env.policy_hz) != steps:
+        raise ConfigError(
+            f"{name}={steps} ({seconds:g} s) and env.episode_seconds={configured:g} were both given; leave out one"
+        )
+    return build_config(config.model_dump(include=config.model_fields_set), {"env.episode_seconds": seconds})
 
 
 def possible_modes(render_mode: str | None) -> list[str]:
@@ -107,12 +146,12 @@ def solo_info(vec: MultiliftVec) -> dict[str, Any]:
     """Return the info of the last step or reset of the only environment of `vec` in plain values.
 
     Returns:
-        `success`, `failure`, `diverged` (bool), `failure_cause` (its name, "none" without one), `reward_terms`
-        {name: float} and `randomization` {name: array}.
+        `success`, `failure`, `diverged` (bool), `failure_cause`, an index into `vec.failure_causes` (0: none),
+        `reward_terms` {name: float} and `randomization` {name: array}.
     """
     outcome = vec.outcome
     values: dict[str, Any] = dict(zip(_FLAGS, outcome.flags[2:, 0].tolist(), strict=True))
-    values["failure_cause"] = vec.failure_causes[outcome.cause[0]]
+    values["failure_cause"] = int(outcome.cause[0])
     values["reward_terms"] = dict(zip(vec.reward_terms, outcome.terms[0].tolist(), strict=True))
     values["randomization"] = {name: array[0].copy() for name, array in vec.drawn.items()}
     return values

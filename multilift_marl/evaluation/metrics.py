@@ -6,7 +6,7 @@ Intervals are Wilson's for rates, bootstrapped for means and paired differences.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.config.config import Config
-from multilift_marl.tasks.failures import CAUSES
+from multilift_marl.evaluation.shortfalls import explain, format_explanation, is_shortfall
+from multilift_marl.mdp.failures import CAUSES
+from multilift_marl.tasks import find_task
 
 _Z = 1.959964  # two-sided 95 %
 _RESAMPLES = 2000
@@ -43,8 +45,10 @@ _ROWS = (  # metric, heading, factor, digits
 def wilson(successes: int, trials: int) -> tuple[float, float]:
     """Return the 95 % Wilson score interval of the rate of `successes` in `trials`, at least one (Wilson 1927)."""
     rate, square = successes / trials, _Z**2 / trials
+    # Wilson's interval is (p + z²/2n ± z √(p (1 - p)/n + z²/4n²))/(1 + z²/n); `square` is z²/n.
     centre = (rate + square / 2) / (1 + square)
     half = _Z / (1 + square) * sqrt(rate * (1 - rate) / trials + square / (4 * trials))
+    # Round-off may put the rate itself outside at 0 and 1.
     return max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half))
 
 
@@ -56,37 +60,41 @@ def bootstrap(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Return {metric: {"mean", "ci95": [low, high]}} of what `fly_episodes` measured.
+def summarize(episodes: dict[str, np.ndarray], causes: Sequence[str] = CAUSES) -> dict[str, dict[str, Any]]:
+    """Return {metric: {"mean", "ci95": [low, high]}} of what `run_episodes` measured.
 
     Errors include failed episodes at the failure bound; "<metric>_held" takes the episodes without failure alone,
     "<metric>_successful" the successful ones; they are missing where there are none.
+
+    Args:
+        episodes: (n,) each.
+        causes: names of the causes of failures, see `Task.causes`.
     """
     success, cause = episodes["success_rate"], episodes["failure_cause"]
     count = len(success)
     result = {"success_rate": _rate(int(success.sum()), count)}
     for name, values in episodes.items():
-        if name in ("success_rate", "failure_cause"):
+        if name in ("success_rate", "failure_cause") or is_shortfall(name):
             continue
         result[name] = _rate(int(values.sum()), count) if values.dtype == bool else _mean(values)
         for kind, chosen in (("held", cause == 0), ("successful", success)):
             if name in _APART and chosen.any():
                 result[f"{name}_{kind}"] = _mean(values[chosen])
-    for index, name in enumerate(CAUSES):
+    for index, name in enumerate(causes):
         if index > 0:
             result[f"failure_{name}_rate"] = _rate(int((cause == index).sum()), count)
     return result
 
 
 def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Return the mean paired difference, policy minus baseline, of every metric of `fly_episodes`.
+    """Return the mean paired difference, policy minus baseline, of every metric of `run_episodes`.
 
     Both on the same episodes, (n,) each; the form is that of `summarize`.
     """
     return {
         name: _mean(values.astype(float) - baseline[name].astype(float))
         for name, values in policy.items()
-        if name != "failure_cause"
+        if name != "failure_cause" and not is_shortfall(name)
     }
 
 
@@ -94,7 +102,7 @@ def is_better(policy: dict[str, np.ndarray], other: dict[str, np.ndarray], beyon
     """Return whether a policy is better than another one on the same episodes: in success first, then in error.
 
     Args:
-        policy, other: what `fly_episodes` measured of both.
+        policy, other: what `run_episodes` measured of both.
         beyond_noise: by `is_gain`; else by the means alone.
     """
     names = ("success_rate", "payload_position_error_m")
@@ -105,20 +113,15 @@ def is_better(policy: dict[str, np.ndarray], other: dict[str, np.ndarray], beyon
     return success.sum() > 0 or (success.sum() == 0 and alike.size > 0 and alike.mean() < 0)
 
 
-def is_gain(success: np.ndarray, error: np.ndarray, strict: bool = True) -> bool:
+def is_gain(success: np.ndarray, error: np.ndarray) -> bool:
     """Return whether paired differences of success and error (n,) are an improvement beyond the noise.
 
     That is in success or, succeeding no less often, in error: the 95 % interval of the difference leaves out zero.
     Errors are compared in episodes that end alike: the others differ by metres, and count as successes already.
-
-    Args:
-        success, error: (n,).
-        strict: no less often by the mean; else within the interval of the difference.
     """
-    low, high = bootstrap(success)
+    low, _ = bootstrap(success)
     alike = error[success == 0]
-    as_often = success.mean() >= 0 if strict else high >= 0
-    return bool(low > 0 or (as_often and alike.size > 0 and bootstrap(alike)[1] < 0))
+    return bool(low > 0 or (success.mean() >= 0 and alike.size > 0 and bootstrap(alike)[1] < 0))
 
 
 def _mean(values: np.ndarray) -> dict[str, Any]:
@@ -137,16 +140,21 @@ def make_report(
     Args:
         config: the environment.
         seed: evaluation seed.
-        policy: what `fly_episodes` measured of the policy.
+        policy: what `run_episodes` measured of the policy.
         baselines: the same of every baseline, on the same episodes.
     """
+    causes = find_task(config.task).causes()
     return {
         "episodes": len(policy["return"]),
         "seed": seed,
         "config": config.model_dump(mode="json"),
-        "policy": summarize(policy),
-        "baselines": {name: summarize(episodes) for name, episodes in baselines.items()},
+        "policy": summarize(policy, causes),
+        "baselines": {name: summarize(episodes, causes) for name, episodes in baselines.items()},
         "paired": {name: compare(policy, episodes) for name, episodes in baselines.items()},
+        "unsuccessful": {
+            "policy": explain(policy, causes),
+            "baselines": {name: explain(episodes, causes) for name, episodes in baselines.items()},
+        },
     }
 
 
@@ -165,6 +173,58 @@ def format_table(report: dict[str, Any], name: str = "policy") -> str:
     cells = [["", *columns]]
     for key, heading, factor, digits in rows:
         cells.append([heading, *(_cell(summary.get(key), factor, digits) for summary in columns.values())])
+    return _align(cells)
+
+
+def format_reasons(report: dict[str, Any], name: str = "policy") -> str:
+    """Return why episodes of each policy were no success, as lines of text; "" where all were."""
+    found = report["unsuccessful"]
+    policies = {name: found["policy"], **found["baselines"]}
+    return "\n".join(
+        filter(None, (format_explanation(each, key, report["episodes"]) for key, each in policies.items()))
+    )
+
+
+def format_card(card: dict[str, Any]) -> str:
+    """Return a card of the benchmark as Markdown: a table of the tasks, and why the policy cannot fly the others."""
+    cells = [["task", "policy", "best baseline", "shipped policy", "policy - baseline: points, cm"]]
+    refused, reasons = [], []
+    for name, row in card["tasks"].items():
+        if "not_applicable" in row:
+            cells.append([name, "not applicable", "-", "-", "-"])
+            refused.append(f"- {name}: {row['not_applicable']}")
+            continue
+        if unsuccessful := row["policies"]["policy"].get("unsuccessful"):  # none in cards of former versions
+            reasons.append(format_explanation(unsuccessful, name, card["episodes"]))
+        cells.append([name])
+        for label in ("policy", "baseline", "shipped"):
+            each = row["policies"].get(label, {"name": "", "metrics": {}})
+            success, error = (_cell(each["metrics"].get(key), 100, 2 - rate) for key, rate in _shown(row))
+            title = "" if label == "policy" else f"{each['name']}: "
+            cells[-1].append(f"{title}{success} %, {error} cm" if each["metrics"] else "-")
+        gain = row["paired"].get("baseline")
+        cells[-1].append("-" if gain is None else ", ".join(_gain(gain[key], 2 - rate) for key, rate in _shown(row)))
+    place = f"{card['benchmark']}, suite {card['suite']}, digest {card['digest'][:12]}, seed {card['seed']}"
+    whole = "" if card["complete"] else "; not complete"
+    told = f"{card['policy']['name']}: {place}, {card['episodes']} episodes of each task{whole}"
+    parts = [told, _align(cells), *(["Not applicable:\n\n" + "\n".join(refused)] if refused else [])]
+    if any(reasons):
+        parts.append("The policy, by task:\n\n```\n" + "\n".join(filter(None, reasons)) + "\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def _shown(row: dict[str, Any]) -> tuple[tuple[str, bool], ...]:
+    """Return the metrics of a task in a card's table, and whether each is a rate."""
+    return ("success_rate", True), (row["error"], False)
+
+
+def _gain(value: dict[str, Any], digits: int) -> str:
+    mean, low, high = (f"{100 * each:+.{digits}f}" for each in (value["mean"], *value["ci95"]))
+    return f"{mean} ({low}, {high})"
+
+
+def _align(cells: list[list[str]]) -> str:
+    """Return lines of cells, the first of headings, as a Markdown table."""
     widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in cells

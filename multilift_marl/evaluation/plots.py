@@ -1,4 +1,4 @@
-"""Plots of episodes and of a training, as PNG files. No pyplot: nothing global, no window, safe in any thread."""
+"""Plots of episodes and of a training, as PNG files and PDF. No pyplot: nothing global, no window, in any thread."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
 
@@ -22,12 +23,13 @@ _LINES = ("-", "--", ":", "-.")  # of drones beyond the number of colours
 _DPI = 160
 
 
-def plot_errors(path: str | Path, traces: Mapping[str, Trace]) -> None:
+def plot_errors(path: str | Path, traces: Mapping[str, Trace], pdf: bool = False) -> None:
     """Plot the payload's distance from its target [m], logarithmic, and its attitude error [deg] over time [s].
 
     Args:
         path: of the PNG; its folder is made.
         traces: {name of the policy: its trace}, a colour each.
+        pdf: whether there is a PDF beside it, too.
     """
     figure = Figure(figsize=(6.4, 4.6), layout="constrained")
     position, attitude = figure.subplots(2, 1, sharex=True)
@@ -38,10 +40,10 @@ def plot_errors(path: str | Path, traces: Mapping[str, Trace]) -> None:
     _label(attitude, "time [s]", "attitude error [deg]")
     attitude.set_ylim(bottom=0)
     _legend(figure, position)
-    _save(figure, path)
+    _save(figure, path, pdf)
 
 
-def plot_tensions(path: str | Path, trace: Trace, title: str = "") -> None:
+def plot_tensions(path: str | Path, trace: Trace, title: str = "", pdf: bool = False) -> None:
     """Plot the tension of each cable [N] over time [s], in the colours that the drones have in videos."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
@@ -50,26 +52,32 @@ def plot_tensions(path: str | Path, trace: Trace, title: str = "") -> None:
     _label(axes, "time [s]", "cable tension [N]", title)
     axes.set_ylim(bottom=0)
     _legend(figure, axes)
-    _save(figure, path)
+    _save(figure, path, pdf)
 
 
-def plot_paths(path: str | Path, trace: Trace, title: str = "") -> None:
+def plot_paths(path: str | Path, trace: Trace, title: str = "", pdf: bool = False) -> None:
     """Plot the paths of payload and drones [m] from above (x-y) and from the side (x-z), to one scale.
 
-    The team is drawn where the episode ends; its cables are lines to the payload's centre.
+    The team is drawn where the episode ends: the payload by its outline, the cables from their anchors, dots.
     """
     figure = Figure(figsize=(8.4, 4.4), layout="constrained")
     for axes, up, name in zip(figure.subplots(1, 2), (1, 2), "yz", strict=True):
         payload, target = trace.payload_position[:, [0, up]].T, trace.target_position[:, [0, up]].T
+        if len(trace.surface):
+            outline = PolyCollection(list(trace.surface[..., [0, up]]), facecolors="0.8", edgecolors="0.8", zorder=1)
+            axes.add_collection(outline)
+        for cable in trace.cables:
+            axes.plot(*cable[:, [0, up]].T, color="0.45", linewidth=0.8, zorder=1.5)
+            axes.plot(*cable[0, [0, up]], ".", color="0.2", markersize=4)
         for n in range(trace.drone_position.shape[1]):
             drone, style = trace.drone_position[:, n, [0, up]].T, _drone_style(n)
             axes.plot(*drone, **style, linewidth=1.0, alpha=0.8)
-            axes.plot(*np.stack([payload[:, -1], drone[:, -1]], axis=1), color="0.45", linewidth=0.8, zorder=1)
             axes.plot(*drone[:, -1], "o", color=style["color"], markersize=6, label=f"drone {n}")
         if np.ptp(target, axis=1).max() > 0:
             axes.plot(*target, color=TARGET_COLOUR, linestyle="--", linewidth=1.2, label="target's path")
         axes.plot(*payload, color=PAYLOAD_COLOUR, linewidth=1.6, label="payload")
-        axes.plot(*payload[:, -1], "s", color=PAYLOAD_COLOUR, markersize=6)
+        if not len(trace.surface):
+            axes.plot(*payload[:, -1], "s", color=PAYLOAD_COLOUR, markersize=6)
         axes.plot(*payload[:, 0], "o", color=PAYLOAD_COLOUR, markerfacecolor="white", markersize=7, label="start")
         axes.plot(*target[:, -1], "*", color=TARGET_COLOUR, markerfacecolor="none", markersize=17, label="target")
         _label(axes, "x [m]", f"{name} [m]", {1: "from above", 2: "from the side"}[up])
@@ -77,10 +85,10 @@ def plot_paths(path: str | Path, trace: Trace, title: str = "") -> None:
         axes.margins(0.1)
     figure.suptitle(title, fontsize=11)
     _legend(figure, axes)
-    _save(figure, path)
+    _save(figure, path, pdf)
 
 
-def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
+def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]], pdf: bool = False) -> None:
     """Plot success rate [%], payload error [cm] and return over the environment steps of a training.
 
     Args:
@@ -88,6 +96,7 @@ def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
         rows: lines of metrics.csv, numbers or their text; an empty or missing value is left out. Thin lines are
             episodes with exploration, dots the evaluations of the deterministic policy. Their returns have a panel
             each, as training may pay by other weights.
+        pdf: whether there is a PDF beside it, too.
     """
     rows = list(rows)
     figure = Figure(figsize=(6.4, 8.0), layout="constrained")
@@ -114,6 +123,49 @@ def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
         error.yaxis.set_minor_formatter(NullFormatter())
     paid.set_xlabel("environment steps")
     paid.xaxis.set_major_formatter(EngFormatter(sep=""))
+    _legend(figure, success)
+    _save(figure, path, pdf)
+
+
+def plot_card(path: str | Path, card: Mapping[str, Any]) -> None:
+    """Plot success [%] and error [cm, logarithmic] of a card of the benchmark with 95 % intervals, a row for each task.
+
+    Args:
+        path: of the PNG; its folder is made.
+        card: see docs/benchmark.md. Tasks that the policy cannot fly have no bars.
+    """
+    tasks = card["tasks"]
+    figure = Figure(figsize=(8.4, 1.6 + 0.55 * max(len(tasks), 1)), layout="constrained")
+    panels = success, error = figure.subplots(1, 2, sharey=True)
+    for place, (label, colour) in enumerate(zip(("policy", "baseline", "shipped"), POLICY_COLOURS, strict=False)):
+        rows = [(y, row) for y, row in enumerate(tasks.values()) if label in row.get("policies", {})]
+        for axes in panels:
+            found = [
+                row["policies"][label]["metrics"]["success_rate" if axes is success else row["error"]]
+                for _, row in rows
+            ]
+            low, mean, high = 100 * np.array([[m["ci95"][0], m["mean"], m["ci95"][1]] for m in found]).reshape(-1, 3).T
+            heights = np.array([y for y, _ in rows]) + 0.26 * (place - 1)
+            title = {"policy": card["policy"]["name"], "baseline": "best baseline", "shipped": "shipped policy"}[label]
+            axes.barh(
+                heights, mean, 0.24, xerr=np.stack([mean - low, high - mean]), color=colour, ecolor="0.3", label=title
+            )
+    for y, row in enumerate(tasks.values()):
+        if "not_applicable" in row:
+            success.text(1, y, "not applicable", va="center", color="0.4", fontsize=9)
+    success.set(xlim=(0, 103), yticks=range(len(tasks)), yticklabels=list(tasks))
+    success.set_ylim(len(tasks) - 0.5, -0.5)
+    if any("policies" in row for row in tasks.values()):
+        error.set_xscale("log")
+        error.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        error.xaxis.set_major_formatter("{x:g}")
+        error.xaxis.set_minor_formatter(NullFormatter())
+    for axes, name in ((success, "success [%]"), (error, "error [cm]")):
+        axes.set_xlabel(name)
+        axes.grid(True, axis="x", color="0.9", linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(f"{card['benchmark']}, {card['suite']}", fontsize=11)
     _legend(figure, success)
     _save(figure, path)
 
@@ -154,6 +206,8 @@ def _legend(figure: Figure, axes: Axes) -> None:
         figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
-def _save(figure: Figure, path: str | Path) -> None:
+def _save(figure: Figure, path: str | Path, pdf: bool = False) -> None:
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=_DPI, format="png")
+    if pdf:
+        figure.savefig(Path(path).with_suffix(".pdf"), format="pdf", metadata={"CreationDate": None})

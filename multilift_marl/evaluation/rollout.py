@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.control.policy import Policy
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
-from multilift_marl.tasks.failures import MAX_DISTANCE
+from multilift_marl.evaluation.outline import payload_surface
+from multilift_marl.evaluation.shortfalls import ShortfallMeter
+from multilift_marl.mdp.failures import MAX_DISTANCE
+from multilift_marl.policies.policy import Policy
 
 SETTLED = 0.05  # [m] settling time counts until the payload stays within this
 PRECISE = (0.01, 1.0)  # [m], [deg] mean errors of an episode that counts as precise
@@ -35,11 +37,17 @@ class Trace(NamedTuple):
     """(T,) payload from its target attitude [deg]."""
     tension: np.ndarray
     """(T, N) [N]."""
+    cables: tuple[np.ndarray, ...] = ()
+    """Of each cable its points from anchor to hook at the end (P, 3), of a broken one without the hook [m]."""
+    surface: np.ndarray = np.zeros((0, 3, 3))
+    """(F, 3, 3) triangles of the payload's surface at the end, world frame [m]."""
 
 
-def fly_episodes(
+def run_episodes(
     config: Config, make_policy: Callable[[MultiliftVec], Policy], episodes: int, seed: int,
     purpose: int = EVALUATION, progress: Callable[[int], Any] | None = None, first: int = 0,
+    factors: Mapping[str, Any] | None = None,
+    record: Callable[[int], Callable[[MultiliftVec], None]] | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Fly episodes `first` to `first` + `episodes` - 1 of an evaluation seed, the same at any batch size.
 
@@ -51,10 +59,15 @@ def fly_episodes(
         purpose: of the seeds.
         progress: called with the number of episodes finished.
         first: number of the first episode.
+        factors: hidden parameters by name that are the same in all episodes, as factors of the nominal values: one
+            for all drones or (N,).
+        record: called with the number of each batch's first episode, counted from `first`; what it returns is called
+            with the environments at the start and after every step.
 
     Returns:
         Metrics of each episode by name, (episodes,) each, units in their names; see docs/evaluation.md. Errors of a
-        failed episode stand at the failure bound. "failure_cause" holds indices into `CAUSES`.
+        failed episode stand at the failure bound. "failure_cause" holds indices into `Task.causes()`. Entries that are
+        `shortfalls.is_shortfall` are for `shortfalls.explain`.
 
     Raises:
         ConfigError: see `MultiliftVec`.
@@ -65,17 +78,30 @@ def fly_episodes(
         count = min(_BATCH, episodes - done)
         part = build_config(config.model_dump(), {"env.num_envs": count})
         vec = MultiliftVec(part, purpose, first_env=first + done)
-        observation, _ = vec.reset(seed=seed)
-        parts.append(measure_episodes(vec, make_policy(vec), observation))
+        observation, _ = vec.reset(seed=seed, options=_fix_parameters(vec, factors) if factors else None)
+        policy, on_step = make_policy(vec), None if record is None else record(done)
+        if on_step is not None:
+            on_step(vec)
+        parts.append(measure_episodes(vec, policy, observation, on_step))
         if progress is not None:
             progress(done + count)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
+def _fix_parameters(vec: MultiliftVec, factors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options of a reset that fix hidden parameters."""
+    nominal, fixed = vec.world.parameters, {}
+    for name, factor in factors.items():
+        whole = getattr(nominal, name)
+        relative = name.startswith("vehicle_")  # these are factors themselves
+        fixed[name] = np.broadcast_to(np.asarray(factor) * (1.0 if relative else whole[:1]), whole.shape)
+    return {"randomization": fixed}
+
+
 def measure_episodes(
     vec: MultiliftVec, policy: Policy, observation: np.ndarray, on_step: Callable[[MultiliftVec], None] | None = None
 ) -> dict[str, np.ndarray]:
-    """Fly the episodes that have begun to their ends, and return what `fly_episodes` does of them.
+    """Fly the episodes that have begun to their ends, and return what `run_episodes` does of them.
 
     Args:
         vec: environments after a reset.
@@ -95,11 +121,13 @@ def measure_episodes(
     result = {name: np.zeros(e) for name in _AT_END}
     result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
     previous = np.zeros((e, vec.num_drones, vec.action_size))
+    meter = ShortfallMeter(vec)
     for step in range(vec.max_steps):
         action = policy.act(observation)
         observation, reward, terminated, truncated, info = vec.step(action)
         if on_step is not None:
             on_step(vec)
+        meter.measure(step + 1)
         errors = vec.task.errors
         total += running * reward.mean(axis=1, dtype=np.float64)
         length += running
@@ -107,6 +135,7 @@ def measure_episodes(
         if (step + 1) * dt > vec.task.rmse_after:
             square += running * _along_axes(vec) ** 2
             counted += running
+        # The last time at which it was farther away.
         settling = np.where(running & (errors.distance > SETTLED), (step + 1) * dt, settling)
         if vec.task.in_error_window((step + 1) * dt, vec.max_steps * dt):
             final_distance += running * errors.distance
@@ -136,6 +165,7 @@ def measure_episodes(
     distance = final_distance / steps
     angle = final_angle / steps
     return result | {
+        **meter.result(np.logical_not(failed | result["success_rate"].astype(bool))),
         "precise_rate": ~failed & (distance <= PRECISE[0]) & (angle <= PRECISE[1]),
         "payload_position_error_m": np.where(failed, MAX_DISTANCE, distance),
         "payload_attitude_error_deg": np.where(failed, 180.0, angle),
@@ -164,7 +194,11 @@ _AXES = {  # metric: what a failed episode counts
 
 
 def _along_axes(vec: MultiliftVec) -> np.ndarray:
-    """Return position error [m] and rotation vector [deg] along the axes of the target's heading frame, (6, E)."""
+    """Return position error [m] and rotation vector [deg] along the axes of the target's heading frame, (6, E).
+
+    The last, the yaw error, is the turn about the vertical; where payload and target tilt little it is the difference
+    of their ψ = atan2(-R01, R11).
+    """
     errors, yaw = vec.task.errors, vec.task.goal.yaw
     c, s = np.cos(yaw), np.sin(yaw)
     (x, y, z), (roll, pitch, turn) = errors.position.T, np.rad2deg(errors.rotation.T)
@@ -190,18 +224,20 @@ def trace_episode(
     Args:
         config: the environment.
         make_policy: returns the policy for given environments.
-        episode: which one of `fly_episodes`.
+        episode: which one of `run_episodes`.
         seed: evaluation seed.
-        on_step: called with the environment after every step.
+        on_step: called with the environment at the start and after every step.
 
     Raises:
-        ConfigError, ValueError: see `fly_episodes`.
+        ConfigError, ValueError: see `run_episodes`.
     """
     vec = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}), EVALUATION, first_env=episode)
     policy = make_policy(vec)
     observation, _ = vec.reset(seed=seed)
     policy.reset()
     tracer = Tracer()
+    if on_step is not None:
+        on_step(vec)
     for _ in range(vec.max_steps):
         observation, _, terminated, truncated, _ = vec.step(policy.act(observation))
         tracer(vec)
@@ -217,10 +253,16 @@ class Tracer:
 
     def __init__(self) -> None:
         self._rows: list[tuple[Any, ...]] = []
+        self._end: tuple[tuple[np.ndarray, ...], np.ndarray] = (), np.zeros((0, 3, 3))
+        self._surface: np.ndarray | None = None  # in the payload's frame
 
     def __call__(self, vec: MultiliftVec) -> None:
         """Record the step that has just been made."""
         state, task = vec.world.state, vec.task
+        if self._surface is None:
+            self._surface = payload_surface(vec.world.system)
+        surface = self._surface @ state.payload_rotation[0].T + state.payload_position[0]
+        self._end = tuple(vec.world.cable_points(0, n) for n in range(vec.num_drones)), surface
         self._rows.append(
             (
                 (len(self._rows) + 1) * task.dt, state.payload_position[0].copy(), task.goal.position[0].copy(),
@@ -231,4 +273,6 @@ class Tracer:
 
     def trace(self) -> Trace:
         """Return what was recorded, at least one step."""
-        return Trace(*(np.array(column) for column in zip(*self._rows, strict=True)))
+        columns = (np.array(column) for column in zip(*self._rows, strict=True))
+        fields = dict(zip(Trace._fields, columns, strict=False))
+        return Trace(**fields, cables=self._end[0], surface=self._end[1])

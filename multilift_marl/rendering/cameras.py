@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import mujoco
 import numpy as np
 
 from multilift_marl.errors import RenderingError, nearest
-
-if TYPE_CHECKING:
-    from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.sim.world import World
+from multilift_marl.tasks.base import Task
 
 CAMERAS = ("side", "top", "chase")
 _ROOM = 0.35  # [m] of the payload from its target that the picture holds; beyond it the camera follows
 _CHASE_ELEVATION = -22.0  # [deg]
 _CHASE_TURN = 1.5  # [m] of flight in which a chasing camera turns most of the way to the direction of flight
+
+
+class Environments(Protocol):
+    """What can be drawn: environments, such as those of `envs.core.MultiliftVec`."""
+
+    num_envs: int
+    num_drones: int
+    world: World
+    task: Task
+    steps: np.ndarray
+    seeds: np.ndarray
+    episodes: np.ndarray
 
 
 class Camera:
@@ -37,7 +48,7 @@ class Camera:
         RenderingError: an unknown name.
     """
 
-    def __init__(self, vec: MultiliftVec, model: mujoco.MjModel, name: str, aspect: float):
+    def __init__(self, vec: Environments, model: mujoco.MjModel, name: str, aspect: float):
         if name not in CAMERAS:
             raise RenderingError(f"unknown camera '{name}'{nearest(name, CAMERAS)}")
         self._vec = vec
@@ -70,6 +81,7 @@ class Camera:
         else:
             away = payload - target
             distance = float(np.linalg.norm(away))
+            # The target, or as much nearer to the payload as that is farther away than `_ROOM`.
             self.view.lookat[:] = target + max(0.0, 1.0 - _ROOM / max(distance, _ROOM)) * away
         self.view.lookat[2] += self._lift
 

@@ -9,16 +9,14 @@ import sys
 import weakref
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from multilift_marl.errors import RenderingError, pip_install
+from multilift_marl.rendering.cameras import Environments
 from multilift_marl.rendering.scene import Stage
-
-if TYPE_CHECKING:
-    from multilift_marl.envs.core import MultiliftVec
 
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in the order of preference: EGL can use a graphics card
 _OTHERS = {"darwin": "cgl", "win32": "glfw"}  # MuJoCo's context on systems that bring OpenGL with them
@@ -46,7 +44,7 @@ class Renderer:
     """
 
     def __init__(
-        self, vec: MultiliftVec, width: int = 960, height: int = 540, camera: str = "side", trail: float = 0.0
+        self, vec: Environments, width: int = 960, height: int = 540, camera: str = "side", trail: float = 0.0
     ):
         self._vec = vec
         self._stage = Stage(vec, camera, width / height, trail)

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from multilift_marl.math3d import mat_to_quat
-from multilift_marl.rendering.cameras import Camera
+from multilift_marl.rendering.cameras import Camera, Environments
+from multilift_marl.rendering.draft import Draft
 from multilift_marl.rendering.overlays import Trail, add_box, add_lines, dashes, tension_colours
 from multilift_marl.sim.scene import DRONE_COLOURS, PAYLOAD_COLOUR, build_model
-
-if TYPE_CHECKING:
-    from multilift_marl.envs.core import MultiliftVec
 
 _MAX_GEOMS = 20_000
 _CABLE, _LINE, _DASH = 0.0013, 0.0011, 0.016  # radii and length, over the camera's distance: visible from anywhere
@@ -42,10 +39,12 @@ class Stage:
         RenderingError: an unknown camera.
     """
 
-    def __init__(self, vec: MultiliftVec, camera: str = "side", aspect: float = 16 / 9, trail: float = 0.0):
+    def __init__(self, vec: Environments, camera: str = "side", aspect: float = 16 / 9, trail: float = 0.0):
         self._vec = vec
         system = vec.world.system
         self.model, _ = build_model(system, visuals=True)
+        if isinstance(vec, Draft):
+            vec.mark(self.model)
         self.data = mujoco.MjData(self.model)
         self.camera = Camera(vec, self.model, camera, aspect)
         self.scene = mujoco.MjvScene(self.model, maxgeom=_MAX_GEOMS)

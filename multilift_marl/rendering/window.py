@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import time
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 
 from multilift_marl.errors import RenderingError
+from multilift_marl.rendering.cameras import Environments
 from multilift_marl.rendering.scene import Stage
-
-if TYPE_CHECKING:
-    from multilift_marl.envs.core import MultiliftVec
 
 _WIDTH = 1280
 _HEIGHT = 720
@@ -39,7 +37,7 @@ class Window:
         RenderingError: there is no display to open a window on.
     """
 
-    def __init__(self, vec: MultiliftVec, camera: str = "side"):
+    def __init__(self, vec: Environments, camera: str = "side"):
         self._vec = vec
         self.stage = Stage(vec, camera, _WIDTH / _HEIGHT, _TRAIL)
         self._glfw, self._window = _open(vec.task.name)

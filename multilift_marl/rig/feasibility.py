@@ -1,4 +1,4 @@
-"""Conditions of any system, before anything is simulated: it can hover, drones keep apart, time steps resolve it.
+"""Conditions of any system, before anything is simulated: it can hover, and time steps resolve it.
 
 Limits of time steps are dimensionless: how far something goes within a step, in units of what the step can resolve.
 There masses, moments of inertia, lengths and stiffnesses are the least that `randomization` draws, loads the largest.
@@ -11,22 +11,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from multilift_marl.config.schema import RandomizationConfig, SystemConfig
-from multilift_marl.errors import ConfigError
+from multilift_marl.errors import ConfigError, RigError
 from multilift_marl.math3d import thrust_frame
+from multilift_marl.physical import AIR_DENSITY, GRAVITY
+from multilift_marl.rig.linearised import fastest_swing
+from multilift_marl.rig.plausible import MAX_THRUST, unit_hint
+from multilift_marl.rig.restitution import contact_law
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import AIR_DENSITY, GRAVITY, Vehicle, check_rotors, describe_team
+from multilift_marl.rig.vehicle import Vehicle
+from multilift_marl.rig.vehicles import check_rotors, describe_team
+from multilift_marl.schema.sections import RandomizationConfig, SystemConfig
 
 MIN_THRUST_TO_WEIGHT = 1.18
 MAX_BENDING = 500.0  # [-] rate of bending in physics steps: substeps are as short as its inverse
 MAX_WIND = 60.0  # [m/s] mean wind and gusts together; bodies diverge at 100 m/s
-MAX_THRUST = 50.0  # [-] of a drone over its weight
 MAX_LOAD = 100.0  # [-] hidden force over weight of the payload
 MAX_SPIN_UP = 50.0  # [rad/s] by which one physics step may change a body rate; rates diverge at 500 rad/s
-MAX_NUTATION = 200.0  # [rad/s] of a drone, also about twice its yaw rate when two rotors stop at once
-MAX_SWING = 100.0  # [rad/s] of a payload at rest between its cables: five times the tension is as fast as diverges
+MAX_NUTATION = 200.0  # [rad/s] of a drone by its rotors' momentum, and of its yaw rate when two of them stop at once
+MAX_SWING = 100.0  # [rad/s] of a team at rest between its cables: five times the tension is as fast as diverges
 MAX_STRAIN = 0.1  # [-] of a resting cable; cables diverge at 0.2
 MAX_LIGHTNESS = 100.0  # [-] time step over the period of a chain's nodes, across their links, which substeps resolve
+BOUNCING = 2.0  # [m/s] at which bodies that bounce must not pass through each other
 MIN_LENGTH = 0.15  # [-] of a cable less its hook's distance from the centre of the drone, over the span of that
 _OWN_SPEED = 3.0  # [m/s] of a payload through the air, beside the wind's
 
@@ -37,7 +42,7 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
     Raises:
         ConfigError: why not, and what to change.
     """
-    n, vehicles, heaviest = system.num_drones, system.vehicles, 1 + ranges.payload_mass
+    vehicles, heaviest = system.vehicles, 1 + ranges.payload_mass
     if system.air.wash or system.air.ground_effect:
         for vehicle in vehicles:
             check_rotors(vehicle)
@@ -49,30 +54,36 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
     thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in vehicles])
     if thrust.sum() < MIN_THRUST_TO_WEIGHT * system.weight:
         lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"
+        load = system.payload_mass
+        hint = unit_hint(load, "kg", load + (0.7 * thrust.sum() - system.weight) / GRAVITY, 30.0)
         raise ConfigError(
             f"{describe_team(vehicles)} lift {thrust.sum():.1f} N, less than {MIN_THRUST_TO_WEIGHT} × the weight of "
-            f"{lifted}, {system.weight:.1f} N; lower payload.mass ({system.payload_mass:g} kg) or add drones"
+            f"{lifted}, {system.weight:.1f} N; lower payload.mass ({load:g} kg) or add drones{hint}"
         )
     cable_weight = system.hook_force - system.formation_force
     own = (1 + ranges.vehicle_mass) * GRAVITY * system.drone_mass[:, None] * [0, 0, 1]
     hover = np.linalg.norm(heaviest * system.formation_force + cable_weight + own, axis=1)
+    # The weakest rotors under the heaviest drone; `cable_weight` does not vary with the payload.
     thrust *= 1 - ranges.vehicle_thrust_coefficient
     if np.any(hover > thrust):
         i = int(np.argmax(hover - thrust))
         varied = ranges.vehicle_mass or ranges.vehicle_thrust_coefficient
         cure = "randomization.vehicle_mass, randomization.vehicle_thrust_coefficient, " if varied else ""
-        raise ConfigError(
+        raise RigError(
             f"drone {i} would need {hover[i]:.1f} N of its {thrust[i]:.1f} N to hover under the heaviest payload; "
-            f"lower {cure}payload.mass, randomization.payload_mass or cable.angle, or share the load by payload.anchors"
+            f"lower {cure}payload.mass, randomization.payload_mass or cable.angle, or share the load by "
+            "payload.anchors",
+            drones=[i],
         )
     if system.hooks.any():
         _check_hooks(system, ranges)
     tight = heaviest * system.resting_tension
     if np.any(tight >= system.breaking_load):
         i = int(np.argmax(tight - system.breaking_load))
-        raise ConfigError(
+        raise RigError(
             f"cable {i} would break at rest: {tight[i]:.1f} N under the heaviest payload, but cable.breaking_load is "
-            f"{system.breaking_load[i]:g} N; raise it or lower payload.mass"
+            f"{system.breaking_load[i]:g} N; raise it or lower payload.mass",
+            anchors=[i],
         )
     shortest = (1 - ranges.cable_length) * system.cable_length
     if (fastest := system.bending_rate(shortest)) * system.timestep > MAX_BENDING:
@@ -83,26 +94,6 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
             f"cable.{name}={getattr(system, name).max():g} is too stiff for links so light; lower it, {lower}or "
             "cable.segments, or raise cable.density"
         )
-    if n > 1:
-        _check_separation(system, ranges)
-
-
-def _check_separation(system: System, ranges: RandomizationConfig) -> None:
-    """Refuse drones that rest too close, nominally or with the lightest payload on the shortest and stiffest cables."""
-    strain = np.linalg.norm(system.formation_force, axis=1) / (system.cable_stiffness * system.cable_length)
-    least = strain * (1 - ranges.payload_mass) / ((1 + ranges.cable_stiffness) * (1 - ranges.cable_length))
-    shorter = 1 - (1 - ranges.cable_length) * (1 + least) / (1 + strain)
-    for verb, share in (("would", 0.0 * shorter), ("may", shorter)):
-        slots = system.slots - share[:, None] * (system.cable_ends - system.anchors)
-        apart = np.linalg.norm(slots[:, None] - slots[None], axis=-1) + 1e9 * np.eye(system.num_drones)
-        i, j = (int(k) for k in np.unravel_index(np.argmin(apart - system.min_separation), apart.shape))
-        if apart[i, j] < system.min_separation[i, j]:
-            lower = "lower randomization.cable_length, " if verb == "may" and ranges.cable_length else ""
-            raise ConfigError(
-                f"neighbouring drones {i} and {j} {verb} rest {apart[i, j]:.2f} m apart, closer than the separation "
-                f"limit of {system.min_separation[i, j]:.2f} m; {lower}spread payload.anchors or raise cable.length or "
-                "cable.angle"
-            )
 
 
 def check_fixed(system: System, ranges: RandomizationConfig, fixed: Mapping[str, np.ndarray]) -> None:
@@ -160,10 +151,11 @@ def _check_hooks(system: System, ranges: RandomizationConfig) -> None:
         least = vehicle.thrust_coefficient * vehicle.rotor_speed_min**2
         most = weakest * vehicle.rotor_thrust_max
         if rotors.min() < least or rotors.max() > most:
-            raise ConfigError(
+            raise RigError(
                 f"drone {i} would need {rotors.min():.2f} to {rotors.max():.2f} N of its rotors to hold the pull at "
                 f"cable.hook {system.hooks[i].tolist()}, but they give {least:.2f} to "
-                f"{most:.2f} N; move the hook nearer to the centre of mass"
+                f"{most:.2f} N; move the hook nearer to the centre of mass{_hook_hint(system, i)}",
+                drones=[i],
             )
 
 
@@ -183,6 +175,8 @@ def check_resolved(config: SystemConfig, system: System) -> None:
             raise error if len(set(system.vehicles)) == 1 else ConfigError(f"drone {i}: {error}") from None
     _check_payload(ranges, wind, system)
     _check_cables(ranges, system)
+    _check_swing(ranges, system)
+    _check_contact(system)
 
 
 def _check_controller(config: SystemConfig, system: System) -> None:
@@ -224,6 +218,7 @@ def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, sys
         raise ConfigError(
             f"vehicle.rotor_thrust_max={vehicle.rotor_thrust_max:g} N lifts more than {MAX_THRUST:g} × the weight of a "
             f"drone of vehicle.mass={vehicle.mass:g} kg; lower the thrust or raise the mass"
+            + unit_hint(vehicle.rotor_thrust_max, "N", 3 * vehicle.mass * GRAVITY / 4)
         )
     drag = max(vehicle.drag) * (1 + ranges.vehicle_drag)
     if drag * step > lightest:
@@ -231,8 +226,15 @@ def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, sys
             f"vehicle.drag of {max(vehicle.drag):g} kg/s stops a drone of vehicle.mass={vehicle.mass:g} kg within less "
             f"than sim.timestep={step:g} s; lower the drag or the time step, or raise the mass"
         )
-    arm = np.abs(vehicle.rotor_positions).sum(axis=0) / 2
-    torque = 2 * strongest * np.array([arm[1], arm[0], vehicle.torque_ratio])
+    least = min(lightest, 2 * inertia.min() / vehicle.arm**2)
+    if system.inflow and vehicle.inflow_damping * (1 + ranges.vehicle_thrust_coefficient) * step > least:
+        raise ConfigError(
+            f"inflow into rotors of vehicle.rotor_radius={vehicle.rotor_radius:g} m stops a drone of vehicle.mass="
+            f"{vehicle.mass:g} kg and vehicle.inertia {list(vehicle.inertia)} kg m² within less than sim.timestep="
+            f"{step:g} s; lower vehicle.rotor_solidity or the time step, or set wind.inflow=false"
+        )
+    # Rows of A: moments of all rotors at full thrust that turn it one way, the others idle.
+    torque = strongest * np.maximum(vehicle.allocation, 0).sum(axis=1)[1:]  # of the rotors that turn it one way
     spin_up = (torque / inertia).max() * step
     if spin_up > MAX_SPIN_UP:
         raise ConfigError(
@@ -240,16 +242,19 @@ def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, sys
             f"within sim.timestep={step:g} s, more than {MAX_SPIN_UP:g} rad/s; raise vehicle.inertia, or lower "
             "vehicle.rotor_thrust_max, vehicle.arm or vehicle.torque_ratio"
         )
-    gyroscopic = 2 * vehicle.rotor_inertia * vehicle.rotor_speed_max / inertia.min()
+    momentum = 2 * vehicle.rotor_inertia * vehicle.rotor_speed_max
+    gyroscopic = momentum / min(np.sqrt(inertia[0] * inertia[1]), inertia[2])  # nutation; spin after two rotors stop
     if gyroscopic * step > 1 or gyroscopic > MAX_NUTATION:
         fast = f"sim.timestep={step:g} s resolves" if gyroscopic * step > 1 else f"{MAX_NUTATION:g} rad/s"
         raise ConfigError(
             f"rotors of vehicle.rotor_inertia={vehicle.rotor_inertia:g} kg m² at {vehicle.rotor_speed_max:.3g} rad/s "
-            f"let a drone of vehicle.inertia {list(vehicle.inertia)} kg m² nutate at {gyroscopic:.3g} rad/s, faster "
-            f"than {fast}; lower vehicle.rotor_inertia or raise vehicle.thrust_coefficient"
+            f"let a drone of vehicle.inertia {list(vehicle.inertia)} kg m² nutate or spin at {gyroscopic:.3g} rad/s, "
+            f"faster than {fast}; lower vehicle.rotor_inertia or raise vehicle.thrust_coefficient"
+            + unit_hint(vehicle.rotor_inertia, "kg m²", min(vehicle.inertia) / 400)
         )
-    rolling = 4 * vehicle.rolling_moment * vehicle.rotor_speed_max + abs(system.air.roll_moment)
-    spin_up = rolling * (wind + _OWN_SPEED) / inertia.min() * step
+    rolling = 2 * vehicle.rolling_moment * vehicle.rotor_speed_max  # two rotors turn one way, the others not
+    moments = np.array([np.hypot(rolling, system.air.roll_moment), rolling])
+    spin_up = (moments / inertia[:2]).max() * (wind + _OWN_SPEED) * step
     if spin_up > MAX_SPIN_UP:
         raise ConfigError(
             f"vehicle.rolling_moment and wind.roll_moment turn a drone by {spin_up:.3g} rad/s faster within "
@@ -267,24 +272,47 @@ def _check_payload(ranges: RandomizationConfig, wind: float, system: System) -> 
         )
     drag = 0.5 * AIR_DENSITY * system.payload_drag_area * (1 + ranges.payload_drag)
     if drag * (wind + _OWN_SPEED) * step > lightest:
+        hint = unit_hint(system.payload_drag_area, "m²", system.payload_size.max() ** 2, 100.0)
         raise ConfigError(
             f"payload.drag_area={system.payload_drag_area:g} m² stops the lightest payload, {lightest:g} kg, within "
             f"less than sim.timestep={step:g} s at {wind + _OWN_SPEED:g} m/s; lower the area, the wind or the time "
-            "step, or raise payload.mass"
+            f"step, or raise payload.mass{hint}"
         )
-    if system.payload_shape == "point":
+
+
+def _check_swing(ranges: RandomizationConfig, system: System) -> None:
+    """Refuse a payload or a drone that turns between its cables faster than a physics step resolves."""
+    swing = fastest_swing(system, ranges)
+    if swing.rate * system.timestep <= 1 and swing.rate <= MAX_SWING:
         return
-    least = system.payload_inertia.min() * (1 - ranges.payload_mass) * (1 - ranges.payload_inertia)
-    reach = np.linalg.norm(system.anchors, axis=1)
-    stiffest = (1 + ranges.payload_mass) * float(reach @ np.linalg.norm(system.formation_force, axis=1))
-    swing = np.sqrt(stiffest / least)
-    if swing * step > 1 or swing > MAX_SWING:
-        fast = f"sim.timestep={step:g} s resolves" if swing * step > 1 else f"{MAX_SWING:g} rad/s"
+    step = system.timestep
+    fast = f"sim.timestep={step:g} s resolves" if swing.rate * step > 1 else f"{MAX_SWING:g} rad/s"
+    lower = "" if swing.rate > MAX_SWING else ", or lower sim.timestep"
+    drone = swing.body - 1
+    nominal = fastest_swing(system, RandomizationConfig()).rate
+    if nominal * step <= 1 and nominal <= MAX_SWING:
         raise ConfigError(
-            f"a payload whose least moment of inertia is {least:.3g} kg m² turns to and fro between its cables at "
-            f"{swing:.3g} rad/s, faster than {fast}; raise payload.inertia or payload.size"
-            + (", or lower sim.timestep" if swing < MAX_SWING else "")
+            f"what randomization draws lets bodies turn between their cables at {swing.rate:.4g} rad/s, faster than "
+            f"{fast}, nominally at {nominal:.4g} rad/s; lower randomization.payload_inertia, "
+            f"randomization.payload_center_of_mass, randomization.payload_mass or randomization.cable_length{lower}"
         )
+    if not swing.turns:
+        body = "the payload" if drone < 0 else f"drone {drone}"
+        moves, cure = f"{body} swings on its cable", "raise cable.length"
+    elif drone < 0:
+        inertia = ", ".join(f"{moment:.3g}" for moment in system.payload_inertia)
+        moves = f"a payload of payload.inertia [{inertia}] kg m² turns to and fro between its cables"
+        cure = "raise payload.inertia or payload.size"
+    else:
+        moves = f"drone {drone} turns to and fro about its cable.hook {system.hooks[drone].tolist()}"
+        cure = "raise vehicle.inertia or move the hook nearer to the centre of mass"
+    raise ConfigError(f"{moves} at {swing.rate:.4g} rad/s, faster than {fast}; {cure}{lower}")
+
+
+def _hook_hint(system: System, i: int) -> str:
+    """Return a hint at the unit of the hook of a drone, "" if it is near it."""
+    away, span = float(np.linalg.norm(system.hooks[i])), system.vehicles[i].span
+    return unit_hint(away, "m", 0.3 * span).replace("that", "cable.hook") if away > 3 * span else ""
 
 
 def _check_cables(ranges: RandomizationConfig, system: System) -> None:
@@ -304,6 +332,7 @@ def _check_cables(ranges: RandomizationConfig, system: System) -> None:
         raise ConfigError(
             f"cable {i} may be {shortest[i]:.3g} m long, less than {least[i]:.3g} m, {MIN_LENGTH:g} × the span of its "
             "drone and the distance of cable.hook; raise cable.length or lower randomization.cable_length"
+            + _hook_hint(system, i)
         )
     if not system.cable_mass.any():
         return
@@ -314,4 +343,18 @@ def _check_cables(ranges: RandomizationConfig, system: System) -> None:
         raise ConfigError(
             f"nodes of {node[i]:.3g} kg in chain {i} are too light for sim.timestep={system.timestep:g} s; raise "
             "cable.density, or lower cable.segments or sim.timestep"
+        )
+
+
+def _check_contact(system: System) -> None:
+    """Refuse a restitution so large that contact, soft enough to last for physics steps, lets bodies through."""
+    stiffness, _ = contact_law(system.contact.restitution, system.timestep)
+    # Of an undamped spring: ½ v² = ½ k x², over the mass.
+    depth = BOUNCING / np.sqrt(stiffness)
+    thinnest = min(system.payload_size.min() / 2, *(vehicle.half_size.min() for vehicle in system.vehicles))
+    if system.contact.restitution > 0 and depth > thinnest:
+        raise ConfigError(
+            f"contact.restitution={system.contact.restitution:g} with sim.timestep={system.timestep:g} s makes contact "
+            f"so soft that bodies which meet at {BOUNCING:g} m/s sink in by {1e3 * depth:.3g} mm, more than half the "
+            f"thickness of the thinnest, {1e3 * thinnest:.3g} mm; lower one of them"
         )

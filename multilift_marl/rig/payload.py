@@ -1,4 +1,4 @@
-"""The rig in numbers: payload and anchors of any team, and the cable forces that hold the payload level."""
+"""The rig in numbers: payload and anchors of any team."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from multilift_marl.config.schema import PayloadConfig, SystemConfig
-from multilift_marl.errors import ConfigError
+from multilift_marl.errors import ConfigError, RigError
 from multilift_marl.rig.mesh import Mesh, read_mesh
+from multilift_marl.schema.sections import PayloadConfig, SystemConfig
+from multilift_marl.schema.values import UNITS
 
 MAX_ANCHOR_DISTANCE = 0.1  # [m] of an anchor from the payload's surface
 REST_SEPARATION = 0.6  # [m] between falcons at rest, by which the standard rig is sized
@@ -16,7 +17,7 @@ REST_SEPARATION = 0.6  # [m] between falcons at rest, by which the standard rig 
 
 def standard_length(config: SystemConfig, scale: float) -> float:
     """Return 1 m for a falcon's span, or more where a ring of drones about one point would be too narrow."""
-    n, spread = config.env.num_drones, np.sin(np.deg2rad(config.cable.angle))
+    n, spread = config.env.num_drones, np.min(np.sin(np.deg2rad(config.cable.angle)))
     if config.payload.shape != "point" or n == 1 or spread == 0:
         return scale
     return scale * max(1.0, REST_SEPARATION / (2 * np.sin(np.pi / n) * spread))
@@ -28,9 +29,15 @@ def find_mesh(payload: PayloadConfig) -> Mesh | None:
         return read_mesh(payload.mesh, payload.size)
     if payload.shape == "mesh":
         raise ConfigError("payload.shape=mesh needs payload.mesh; give the path of an .obj or .stl file")
-    if payload.mesh is not None:
-        raise ConfigError(f"payload.mesh means nothing to a {payload.shape}; drop it or use payload.shape=mesh")
+    for key in ("mesh", "origin"):
+        if getattr(payload, key) not in (None, "center"):
+            raise ConfigError(f"payload.{key} means nothing to a {payload.shape}; drop it or use payload.shape=mesh")
     return None
+
+
+def find_origin(payload: PayloadConfig, mesh: Mesh | None) -> np.ndarray:
+    """Return from where anchors and the centre of mass count (3,) [m], the geometric centre being zero."""
+    return np.zeros(3) if mesh is None or payload.origin == "center" else mesh.middle
 
 
 def place_anchors(
@@ -49,7 +56,7 @@ def place_anchors(
         ConfigError: another number of anchors than of drones, or what means nothing to a point.
     """
     payload = config.payload
-    reach = length.min() * np.sin(np.deg2rad(config.cable.angle))
+    reach = np.min(length * np.sin(np.deg2rad(config.cable.angle)))
     ring = max(0.27 * scale, REST_SEPARATION * scale / (2 * np.sin(np.pi / n)) - reach) if n > 1 else 0.0
     edge = 2 * max(ring, 0.15 * scale)
     rectangle = n == 4 and payload.shape != "cylinder"
@@ -62,6 +69,7 @@ def place_anchors(
         anchors = np.asarray(payload.anchors, float)
         if len(anchors) != n:
             raise ConfigError(f"payload.anchors lists {len(anchors)} anchors for env.num_drones={n}: give one for each")
+        anchors = anchors - find_origin(payload, mesh)
     elif payload.shape == "point":
         anchors = np.zeros((n, 3))
     elif rectangle:
@@ -85,6 +93,7 @@ def place_anchors(
 def uniform_inertia(shape: str, mass: float, size: np.ndarray) -> np.ndarray:
     """Return the principal moments (3,) of a uniform body [kg m²]."""
     if shape == "cylinder":
+        # m (r²/4 + h²/12) and m r²/2, with the diameter 2 r for size[0].
         across = size[0] ** 2 / 16 + size[2] ** 2 / 12
         return mass * np.array([across, across, size[0] ** 2 / 8])
     return mass / 12 * np.array([size[1] ** 2 + size[2] ** 2, size[0] ** 2 + size[2] ** 2, size[0] ** 2 + size[1] ** 2])
@@ -108,76 +117,41 @@ def check_body(shape: str, size: np.ndarray, center_of_mass: np.ndarray, anchors
         )
     if _outside(shape, size, center_of_mass[None])[0] > 1e-9:
         raise ConfigError(
-            f"payload.center_of_mass {center_of_mass.tolist()} lies outside the payload of size {size.tolist()}; "
-            "count it from the geometric centre"
+            f"payload.center_of_mass {center_of_mass.tolist()} lies outside the payload of size {size.tolist()}; count "
+            "it from the geometric centre, or with payload.origin=file from that of the mesh's file"
+            + _unit_hint(shape, size, center_of_mass[None], 0)
         )
     outside = _outside(shape, size, anchors)
     if np.any(outside > MAX_ANCHOR_DISTANCE):
         i = int(np.argmax(outside))
-        raise ConfigError(
+        raise RigError(
             f"payload.anchors: anchor {i} is out of reach, {outside[i]:.2f} m outside the payload; move it onto the "
-            "payload"
+            f"payload{_unit_hint(shape, size, anchors, MAX_ANCHOR_DISTANCE)}",
+            anchors=np.flatnonzero(outside > MAX_ANCHOR_DISTANCE),
         )
+
+
+def _unit_hint(shape: str, size: np.ndarray, points: np.ndarray, most: float) -> str:
+    """Return a hint at the unit in which points (N, 3) would lie within `most` [m] of the body, "" if in none."""
+    inside = []
+    if np.abs(points).max() < 5 * size.max():
+        return ""
+    for name, factor in UNITS["m"].items():
+        meant = points * factor
+        if (_outside(shape, size, meant) <= most).all():
+            inside.append((abs(np.log(np.abs(meant).max() / size.max() * 3)), name))
+    gap, name = min(inside, default=(np.inf, ""))
+    return f", in m and not in {name}" if gap < np.log(5) else ""
 
 
 def _outside(shape: str, size: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return how far (N,) points (N, 3), counted from the geometric centre, lie outside the body [m]."""
     over = np.maximum(np.abs(points) - size / 2, 0)
     if shape == "cylinder":
+        # Beyond the rim, as one distance in the place of two.
         over[:, 0] = np.maximum(np.hypot(points[:, 0], points[:, 1]) - size[0] / 2, 0)
         over[:, 1] = 0
     return np.linalg.norm(over, axis=1)
-
-
-def formation_forces(anchors: np.ndarray, weight: float, angle: float, point: bool, strength: np.ndarray) -> np.ndarray:
-    """Return the cable forces (N, 3) [N] that hold a payload level, as near as possible to `angle` from the vertical.
-
-    The forces nearest to those in proportion to the drones' strength, each measured by its own, in the least-squares
-    sense among all that balance the weight and its moments about the centre of mass.
-
-    Args:
-        anchors: (N, 3) [m] from the centre of mass.
-        weight: of the payload [N].
-        angle: of the cables from the vertical [rad].
-        point: True where the payload has no attitude to hold.
-        strength: of each drone, relative to the mean (N,) [-].
-
-    Raises:
-        ConfigError: no forces balance the payload, or some cable would have to push.
-    """
-    n = len(anchors)
-    centre = anchors[:, :2].mean(axis=0)
-    radial = anchors[:, :2] - centre
-    distance = np.linalg.norm(radial, axis=1, keepdims=True)
-    even = 2 * np.pi * np.arange(n) / n
-    radial = np.where(
-        distance > 1e-6, radial / np.maximum(distance, 1e-6), np.stack([np.cos(even), np.sin(even)], axis=1)
-    )
-    if n == 1:
-        radial = np.zeros((1, 2))
-    strong = strength[:, None]
-    nominal = weight / n * strong * np.concatenate([np.tan(angle) * radial, np.ones((n, 1))], axis=1)
-    balance = np.concatenate([np.eye(3)] * n, axis=1)
-    load = np.array([0, 0, weight, 0, 0, 0])
-    if point:
-        load = load[:3]
-    else:
-        moments = [[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in anchors]
-        balance = np.concatenate([balance, np.concatenate(np.array(moments, float), axis=1)], axis=0)
-    flat, measure = nominal.ravel(), np.repeat(strength, 3)
-    force = (flat + measure * (np.linalg.pinv(balance * measure) @ (load - balance @ flat))).reshape(n, 3)
-    residual = np.abs(balance @ force.ravel() - load).max()
-    if residual > 1e-6 * weight:
-        raise ConfigError(
-            f"payload.anchors {np.round(anchors, 3).tolist()} cannot hold the payload level: place them around its "
-            "centre of mass"
-        )
-    if np.any(force[:, 2] < 0.02 * weight / n * strength):
-        raise ConfigError(
-            f"payload.anchors: cable {int((force[:, 2] / strength).argmin())} would have to push; move the anchors "
-            f"around the centre of mass{'' if np.all(strength == 1) else ', or take drones of more equal lift'}"
-        )
-    return force
 
 
 def mean(values: list[float]) -> float:

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from multilift_marl.config.schema import PushConfig, WindConfig
 from multilift_marl.math3d import quat_to_mat, thrust_frame
+from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.mesh import Mesh
-from multilift_marl.rig.vehicles import GRAVITY, Vehicle
+from multilift_marl.rig.vehicle import Vehicle
+from multilift_marl.schema.sections import ContactConfig, PushConfig, WindConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,7 @@ class System:
         wind: mean wind (3,) [m/s].
         air: what else the air does.
         push: pushes of its bodies.
+        contact: friction and restitution.
         timestep: physics step [s].
         control_interval: physics steps for each control step.
         varied: keys of `randomization` by which environments differ.
@@ -77,6 +79,7 @@ class System:
     wind: np.ndarray
     air: WindConfig
     push: PushConfig
+    contact: ContactConfig
     timestep: float
     control_interval: int
     varied: frozenset[str] = frozenset()
@@ -85,6 +88,11 @@ class System:
     def num_drones(self) -> int:
         """Drones in the team, N."""
         return len(self.anchors)
+
+    @property
+    def inflow(self) -> bool:
+        """Whether the air along the rotors' axes changes their thrust."""
+        return self.air.wash if self.air.inflow is None else self.air.inflow
 
     @property
     def vehicle(self) -> Vehicle:
@@ -137,9 +145,14 @@ class System:
         return resting_rotations(self.vehicles, self.hook_force, self.heading)
 
     @property
+    def principal_axes(self) -> np.ndarray:
+        """The payload's principal axes of inertia in its frame, as columns (3, 3)."""
+        return np.reshape(quat_to_mat(*(float(q) for q in self.payload_axes)), (3, 3))
+
+    @property
     def inertia_matrix(self) -> tuple[float, ...]:
         """Return the payload's nominal inertia about its centre of mass, in its frame, row by row (9,) [kg m²]."""
-        axes = np.reshape(quat_to_mat(*(float(q) for q in self.payload_axes)), (3, 3))
+        axes = self.principal_axes
         return tuple(float(moment) for moment in ((axes * self.payload_inertia) @ axes.T).ravel())
 
 

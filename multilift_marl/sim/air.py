@@ -1,4 +1,4 @@
-"""The air about the drones: their downwash, the ground's effect on their thrust, moments. docs/air.md derives it.
+"""The air about the drones: their downwash, what inflow and ground do to their thrust, moments. See docs/air.md.
 
 What is the same for the whole team, turbulence and gusts, is in `gusts.py`.
 """
@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import column, mat, norm, put, row, scale, sub, tmul, vec
-from multilift_marl.rig.constants import RigConstants, make_constants
+from multilift_marl.physical import AIR_DENSITY
+from multilift_marl.rig.constants import RotorArrays, make_rotors
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import AIR_DENSITY
 
 SPREADING = 0.094  # [-] half-width of a round turbulent jet over the distance (Hussein, Capp and George, JFM 1994)
 GROWTH = SPREADING / sqrt(2.0 * log(2.0))  # half the velocity is where a quarter of the momentum flux is
@@ -35,6 +35,11 @@ class AirConstants(NamedTuple):
     downwash: bool
     payload_breadth: float
     """Radius of a disc as large as the payload's C_d A [m]."""
+    inflow: bool
+    """Whether the air along the rotors' axes changes their thrust."""
+    rotors: np.ndarray
+    """(N, 3) `Vehicle.blade_ratio` [-], `disc_momentum` [kg/m], and the moment of the induced power over its thrust,
+    λ R [m]."""
     ground_effect: bool
     images: np.ndarray
     """(N, M, 2) squared distances between rotor axes [m²], each with its share of the 16 pairs of rotor and image."""
@@ -48,12 +53,12 @@ class AirConstants(NamedTuple):
     """(N,) [m]."""
     rolling_moment: np.ndarray
     """(N,) of a rotor, over its speed and that of the air across it [kg m]."""
-    rig: RigConstants
+    drones: RotorArrays
 
     @property
     def still(self) -> bool:
         """Whether all of it is switched off."""
-        return not (self.gusts or self.downwash or self.ground_effect or self.moments)
+        return not (self.gusts or self.downwash or self.inflow or self.ground_effect or self.moments)
 
 
 def make_air(system: System) -> AirConstants:
@@ -70,6 +75,8 @@ def make_air(system: System) -> AirConstants:
         gust_hold=float(hold),
         downwash=air.wash,
         payload_breadth=sqrt(system.payload_drag_area / pi),
+        inflow=system.inflow,
+        rotors=np.array([(v.blade_ratio, v.disc_momentum, v.induced_ratio * v.rotor_radius) for v in vehicles]),
         ground_effect=air.ground_effect,
         images=_images(system),
         moments=bool(air.roll_moment or any(vehicle.rolling_moment for vehicle in vehicles)),
@@ -77,7 +84,7 @@ def make_air(system: System) -> AirConstants:
         rotor_radius=np.array([vehicle.rotor_radius for vehicle in vehicles]),
         arm=np.array([vehicle.arm for vehicle in vehicles]),
         rolling_moment=np.array([vehicle.rolling_moment for vehicle in vehicles], float),
-        rig=make_constants(system),
+        drones=make_rotors(system),
     )
 
 
@@ -87,6 +94,7 @@ def _images(system: System) -> np.ndarray:
     for vehicle in system.vehicles:
         rotors = vehicle.rotor_positions
         squares = ((rotors[:, None] - rotors[None]) ** 2).sum(axis=-1)
+        # By symmetry of a layout many of the 16 pairs are alike: each distance once, with its share.
         distances, counts = np.unique(squares.round(12), return_counts=True)
         tables.append(np.stack([distances, counts / 16], axis=1))
     images = np.zeros((len(tables), max(map(len, tables)), 2))
@@ -114,6 +122,7 @@ def update_downwash(e, state, air, c):
             breadth = c.arm[i] if i < count else c.payload_breadth
             flux = jet_flux(n, away, breadth, attitude, speed, c)
             if flux > 0.0:
+                # Air goes against the thrust, along -b3.
                 put(wash[i], sub(row(wash, i), scale(flux, column(attitude, 2))))
     # Velocities follow from their sums.
     for i in range(count + 1):
@@ -166,16 +175,46 @@ def jet_flux(n, away, breadth, attitude, speed, c):
     if z >= 0.0:
         return 0.0
     # Width of the jet there, and whether any of it reaches the body.
+    # Momentum theory: far below a rotor the slipstream has half its area, R/√2. Averaging a Gaussian of width a over
+    # another of width b gives one of width √(a² + b²).
     square = max(c.rotor_radius[n] / sqrt(2.0), -GROWTH * z) ** 2 + breadth * breadth
     if x * x + y * y > (c.arm[n] + _REACH * sqrt(square)) ** 2:
         return 0.0
     # Thrusts of the four rotors, each weighted by the distance from its axis.
     thrust = 0.0
     for k in range(4):
-        dx = x - c.rig.rotor_positions[n, k, 0]
-        dy = y - c.rig.rotor_positions[n, k, 1]
-        thrust += c.rig.thrust_coefficient[n] * speed[k] * speed[k] * exp(-(dx * dx + dy * dy) / square)
+        dx = x - c.drones.rotor_positions[n, k, 0]
+        dy = y - c.drones.rotor_positions[n, k, 1]
+        thrust += c.drones.thrust_coefficient[n] * speed[k] * speed[k] * exp(-(dx * dx + dy * dy) / square)
     return thrust / (AIR_DENSITY * pi * square)
+
+
+@kernel
+def axial_thrust(thrust, climb, n, c):
+    """Return the thrust of a rotor that climbs, at the same rotor speed [N], and its further reaction torque [N m].
+
+    Blade elements of constant chord give thrust = still thrust + q 2ρA v (v - w) with the air w through the disc, v the
+    induced velocity in still air and q = σ a / 8 λ; momentum theory gives thrust = 2ρA w (w - climb) (Leishman,
+    Principles of Helicopter Aerodynamics, 2.13 and 3.3; Bangura et al., arXiv 1601.00733). Both hold for one w, a root
+    of a quadratic. The torque changes with the power thrust · w that goes into the air.
+
+    Args:
+        thrust: in still air, b ω² [N].
+        climb: velocity of the rotor through the air along its thrust [m/s].
+        n: the drone.
+        c: AirConstants.
+    """
+    if thrust <= 0.0:
+        return 0.0, 0.0
+    ratio, disc, reach = row(c.rotors, n)
+    # Hover: T = 2ρA v², disc = 2ρA.
+    still = sqrt(thrust / disc)
+    slow = climb - ratio * still
+    # w (w - climb) = v² + q v (v - w): w² - (climb - q v) w - (1 + q) v² = 0. The positive root: air goes down through
+    # it.
+    through = 0.5 * (slow + sqrt(slow * slow + 4.0 * (1.0 + ratio) * still * still))
+    blown = max(still + ratio * (still - through), 0.0)  # beyond that blades would stall
+    return disc * still * blown, disc * reach * (blown * through - still * still)
 
 
 @kernel
@@ -195,6 +234,7 @@ def ground_gain(height, n, c):
     total = 0.0
     z = max(height, 0.5 * radius)
     for i in range(c.images.shape[1]):
+        # An image is as far below the ground as the rotor is above it: 2 z apart, beside the distance of the axes.
         square = c.images[n, i, 0] + 4.0 * z * z
         total += c.images[n, i, 1] * z / (square * sqrt(square))
     return 1.0 / (1.0 - 2.0 * radius * radius * total)
@@ -215,6 +255,6 @@ def air_moment(e, n, through, state, c):
     """
     turning = 0.0
     for k in range(4):
-        turning += c.rig.rotor_spin[n, k] * state.rotor_speed[e, n, k]
+        turning += c.drones.rotor_spin[n, k] * state.rotor_speed[e, n, k]
     turning *= c.rolling_moment[n]
     return turning * through[0] + c.roll_moment * through[1], turning * through[1]

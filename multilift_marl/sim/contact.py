@@ -8,13 +8,12 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import dot, norm, row, sub, vec
+from multilift_marl.rig.restitution import contact_law
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import Vehicle
+from multilift_marl.rig.vehicle import Vehicle
 
-STIFFNESS = 6e4  # [1/s²] over the effective mass; with DAMPING a penetration fades with a time constant of 80 ms
-DAMPING = 5e3  # [1/s] over the effective mass: stops an approach within a step, without bouncing or passing through
 _FAST = 2.0  # [m/s] bodies that approach each other no faster meet before they can pass each other
 _SPECULATIVE = int(mujoco.mjtEnableBit.mjENBL_SPECULATIVE)
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -23,19 +22,25 @@ APART, NEAR, FAST = range(3)
 
 def drone_half_size(vehicle: Vehicle) -> np.ndarray:
     """Return the half edges (3,) of a drone's collision box [m]."""
-    return vehicle.arm * np.array([0.7, 0.7, 0.3])
+    return vehicle.half_size
 
 
-def add_contact(spec: mujoco.MjSpec, num_drones: int) -> None:
+def add_contact(spec: mujoco.MjSpec, system: System) -> None:
     """Let ground, payload and drones touch each other, by pairs: cheaper than MuJoCo's sweep over all bodies.
 
-    The contacts' parameters are in the `pair_*` fields of the compiled model, not in those of its geoms.
+    The contacts' parameters are in the `pair_*` fields of the compiled model, not in those of its geoms. The cone of
+    friction is round, so that it is the same in all directions.
     """
-    names = ("floor", "payload", *(f"drone_{i}" for i in range(num_drones)))
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    stiffness, damping = contact_law(system.contact.restitution, system.timestep)
+    friction = [system.contact.friction] * 2 + [0.005, 1e-4, 1e-4]  # the last three count for other kinds of contact
+    names = ("floor", "payload", *(f"drone_{i}" for i in range(system.num_drones)))
     for name in names:
+        # Without its bits a geom meets others by the pairs below alone.
         spec.geom(name).contype = spec.geom(name).conaffinity = 0
     for one, other in combinations(names, 2):
-        spec.add_pair(geomname1=one, geomname2=other, solref=[-STIFFNESS, -DAMPING])
+        # Direct stiffness and damping, over the mass that the contact moves: MuJoCo's negative solref.
+        spec.add_pair(geomname1=one, geomname2=other, solref=[-stiffness, -damping], friction=friction)
 
 
 def body_radii(system: System) -> np.ndarray:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from math import sqrt
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, clip, cross, mat, matrow, mul, norm, put, row, scale, sub, tmul, vec
-from multilift_marl.sim.air import air_moment, ground_gain, update_downwash
+from multilift_marl.sim.air import air_moment, axial_thrust, ground_gain, update_downwash
 from multilift_marl.sim.gusts import step_gusts
 from multilift_marl.sim.state_io import body_dof
 
@@ -23,14 +23,14 @@ def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
     is the exact mean of b ω² over the step, so the impulse is exact. Reaction torque is κ f (report eqs 5-8). Rotors
     with `rotor_inertia` also exert the torque that changes their speed and that which turns their axes. Drag of a
     drone is linear in its velocity through the air along its body axes (Faessler 2018), drag of the payload quadratic.
-    Gusts, downwash, ground effect and moments of the air are in `gusts.py` and `air.py`.
+    Gusts, downwash, inflow, ground effect and moments of the air are in `gusts.py` and `air.py`.
 
     Args:
         rows: Rows of the environments.
         thrust: commanded thrust of each rotor (E, N, 4) [N].
         hidden_loads: HiddenLoads.
         data: SimData of all environments.
-        constants: RigConstants.
+        constants: RotorArrays.
         air_model: Air of all environments and AirConstants; None where all of it is off, for which Numba compiles
             a version without it.
         varied: RotorVariation of all environments; None where the payload's centre of mass, rotors and drag are
@@ -53,6 +53,15 @@ def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
                 update_downwash(e, state, air, air_constants)
 
         for n in range(thrust.shape[1]):
+            # The drone's velocity through the air, body frame.
+            attitude = mat(state.drone_rotation, e, n)
+            p, q, _ = vec(state.drone_body_rates, e, n)
+            here = wind
+            if air_model is not None:
+                here = add(wind, vec(air.downwash, e, n))
+            # Against still air it is the velocity itself: a wind of v has the drag of flying at -v.
+            through = tmul(attitude, sub(vec(state.drone_velocity, e, n), here))
+
             # Rotors: speeds at the end of the step, mean thrust, torques and power. `turning` and `change` are sums
             # over the rotors, against body z: mean speed, and its growth in the step.
             total = mx = my = mz = power = turning = change = 0.0
@@ -64,33 +73,41 @@ def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
             falling = row(constants.lag[n], 1)
             for k in range(4):
                 before = state.rotor_speed[e, n, k]
+                # f = b ω² (report eq 5): commands are thrusts, what lags is the speed.
                 target = sqrt(max(thrust[e, n, k], 0.0) / b)
                 target = 0.0 if hidden_loads.motors_off[e, n] else clip(target, slowest, fastest)
                 gap = before - target
                 if varied is None:
+                    # `lag_shares` of this step: e^-h/τ, and the means of e^-t/τ and of its square over the step.
                     decay, mean_first, mean_second = falling if gap > 0.0 else rising
                 else:
                     decay, mean_first, mean_second = vec(varied.lag[e], n, 1 if gap > 0.0 else 0)
+                # ω = target + gap e^-t/τ; its square averaged term by term.
                 after = target + gap * decay
                 square = target * target + 2.0 * target * gap * mean_first + gap * gap * mean_second
                 f = b * square
                 if varied is not None:
                     f *= varied.thrust[e, n]
+                reaction = kappa * f
+                if air_model is not None:
+                    if air_constants.inflow:
+                        x, y, _ = vec(constants.rotor_positions, n, k)
+                        # The rotor's own speed along its axis: v_z + (Ω × r)_z, with r = (x, y, 0) as for a hub in the
+                        # drone's plane.
+                        f, further = axial_thrust(f, through[2] + p * y - q * x, n, air_constants)
+                        reaction += further
                 state.rotor_speed[e, n, k] = after
                 total += f
+                # r × f e3 = (y f, -x f, 0); the reaction is about the axis itself.
                 mx += constants.rotor_positions[n, k, 1] * f
                 my -= constants.rotor_positions[n, k, 0] * f
-                mz += constants.rotor_spin[n, k] * kappa * f
+                mz += constants.rotor_spin[n, k] * reaction
                 turning += constants.rotor_spin[n, k] * (target + gap * mean_first)
                 change += constants.rotor_spin[n, k] * (after - before)
-                power += kappa * f * 0.5 * (before + after)
+                # Torque times the mean of the speeds at both ends of the step.
+                power += reaction * 0.5 * (before + after)
 
-            # Air about the drone: its velocity through it, ground effect and moments.
-            attitude = mat(state.drone_rotation, e, n)
-            here = wind
-            if air_model is not None:
-                here = add(wind, vec(air.downwash, e, n))
-            through = tmul(attitude, sub(vec(state.drone_velocity, e, n), here))
+            # Ground effect and moments of the air.
             if air_model is not None:
                 if air_constants.ground_effect:
                     gain = ground_gain(state.drone_position[e, n, 2], n, air_constants)
@@ -106,9 +123,9 @@ def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
 
             # Force and torque of the drone. The rotors' angular momentum is h = -J turning e3; the drone is turned by
             # -dh/dt - Ω × h, the mean over the step.
+            # -R D Rᵀ v; Faessler's D [1/s] is over the mass, here it is [kg/s].
             drag = row(constants.drag, n)
             body = (-drag[0] * through[0], -drag[1] * through[1], total - drag[2] * through[2])
-            p, q, _ = vec(state.drone_body_rates, e, n)
             spin = constants.rotor_inertia[n] * turning
             torque = (mx + spin * q, my - spin * p, mz + constants.rotor_inertia[n] * change / timestep)
             at = rows.force + body_dof(1 + n, rows)

@@ -25,12 +25,13 @@ LAPSE = 0.0065  # [K/m]
 PRESSURE_EXPONENT = 9.80665 * 0.0289644 / (8.31446 * LAPSE)
 
 _SWAP = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_DOWN = np.array([1.0, 1.0, -1.0])
 _FLIP = np.array([1.0, -1.0, -1.0])
 
 
 def swap_enu_ned(vector: np.ndarray) -> np.ndarray:
     """Return ENU vectors (..., 3) in NED, or NED ones in ENU."""
-    return np.asarray(vector, float) @ _SWAP
+    return np.asarray(vector, float)[..., [1, 0, 2]] * _DOWN  # axis by axis: NaN of one stays there
 
 
 def swap_flu_frd(vector: np.ndarray) -> np.ndarray:
@@ -48,6 +49,7 @@ def swap_yaw(yaw: np.ndarray | float) -> np.ndarray:
 
     The results are in [-π, π).
     """
+    # Compass heading = π/2 - yaw, wrapped: remainder of (π/2 - yaw) + π, less π.
     return np.remainder(1.5 * np.pi - np.asarray(yaw, float), 2 * np.pi) - np.pi
 
 
@@ -121,7 +123,9 @@ def project_local(geodetic: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """
     lat, lon = np.radians(geodetic[..., 0]), np.radians(geodetic[..., 1])
     lat0, lon0 = np.radians(origin[0]), np.radians(origin[1])
+    # Round-off may exceed 1 at the origin itself.
     angle = np.arccos(np.clip(np.sin(lat0) * np.sin(lat) + np.cos(lat0) * np.cos(lat) * np.cos(lon - lon0), -1.0, 1.0))
+    # c/sin c; NumPy's sinc(x) is sin(πx)/(πx), and 1 at 0.
     scale = _LOCAL_RADIUS / np.sinc(angle / np.pi)
     north = scale * (np.cos(lat0) * np.sin(lat) - np.sin(lat0) * np.cos(lat) * np.cos(lon - lon0))
     east = scale * np.cos(lat) * np.sin(lon - lon0)
@@ -141,6 +145,7 @@ def _from_earth(earth: np.ndarray) -> np.ndarray:
     """Return geodetic places of Earth-centred, Earth-fixed ones, by Bowring's iteration on the reduced latitude."""
     x, y, z = earth[..., 0], earth[..., 1], earth[..., 2]
     across, semi_minor = np.hypot(x, y), SEMI_MAJOR * (1 - FLATTENING)
+    # tan β = (1 - f) tan φ; the start is exact on the ellipsoid itself.
     reduced = np.arctan2(z * SEMI_MAJOR, across * semi_minor)
     for _ in range(3):  # each makes the error 1e-3 to 1e-5 times as large, near the ground
         lat = np.arctan2(

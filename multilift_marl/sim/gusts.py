@@ -1,55 +1,17 @@
-"""Turbulence and gusts, the same for a whole team: at these heights turbulence is metres to tens of metres long.
-
-Random numbers are each environment's own, by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), one word of state. They
-depend on its seed and how many it has drawn before, so results do not depend on how many are computed together.
-"""
+"""Turbulence and gusts, the same for a whole team: at these heights turbulence is metres to tens of metres long."""
 
 from __future__ import annotations
 
-from math import cos, exp, expm1, hypot, log, pi, sin, sqrt
+from math import cos, exp, expm1, hypot, pi, sqrt
 
-import numpy as np
-
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, clip, norm, put, row, scale, sub
+from multilift_marl.rng import normal_pair
 
 FOOT = 0.3048  # [m]
 MIN_HEIGHT = 3.0  # [m] of the low-altitude model, which is not defined below 10 ft
 MAX_HEIGHT = 1000 * FOOT  # [m] of that model
 MIN_AIRSPEED = 1.0  # [m/s] at which a team that drifts with the wind meets turbulence
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # constants of SplitMix64
-_FIRST = np.uint64(0xBF58476D1CE4E5B9)
-_SECOND = np.uint64(0x94D049BB133111EB)
-_30 = np.uint64(30)
-_27 = np.uint64(27)
-_31 = np.uint64(31)
-_11 = np.uint64(11)
-
-
-@kernel
-def uniform(e, air):
-    """Return the next number of environment e, uniform in (0, 1]."""
-    air.generator[e] += _GOLDEN
-    z = air.generator[e]
-    z = (z ^ (z >> _30)) * _FIRST
-    z = (z ^ (z >> _27)) * _SECOND
-    z = z ^ (z >> _31)
-    return (float(z >> _11) + 1.0) * 2.0**-53
-
-
-@kernel
-def normal_pair(e, air):
-    """Return two independent standard normal numbers of environment e (Box and Muller 1958)."""
-    radius = sqrt(-2.0 * log(uniform(e, air)))
-    angle = 2.0 * pi * uniform(e, air)
-    return radius * cos(angle), radius * sin(angle)
-
-
-@kernel
-def normal_vector(e, air):
-    """Return three independent standard normal numbers of environment e."""
-    (a, b), (c, _) = normal_pair(e, air), normal_pair(e, air)
-    return (a, b, c)
 
 
 @kernel
@@ -63,8 +25,10 @@ def dryden(height, wind_speed):
     Returns:
         σ_u = σ_v, σ_w [m/s], L_u = L_v, L_w [m].
     """
+    # The standard's constants are in feet.
     feet = clip(height, MIN_HEIGHT, MAX_HEIGHT) / FOOT
     shape = 0.177 + 0.000823 * feet
+    # σ_w = 0.1 W_20; σ_u/σ_w = 1/(0.177 + 0.000823 h)^0.4; L_u = h/(0.177 + 0.000823 h)^1.2; L_w = h.
     up = 0.1 * wind_speed
     return up / shape**0.4, up, feet / shape**1.2 * FOOT, feet * FOOT
 
@@ -75,6 +39,7 @@ def start_turbulence(e, air):
     a, b = normal_pair(e, air)
     c, d = normal_pair(e, air)
     f, _ = normal_pair(e, air)
+    # (u; x, y of v): variances 1, 1 and 1/2, covariance of x and y 1/2, as `advance_turbulence` keeps them.
     put(air.filter[e], (a, b, 0.5 * b + 0.5 * c))
     air.filter[e, 3] = d
     air.filter[e, 4] = 0.5 * d + 0.5 * f
@@ -107,6 +72,7 @@ def _step_pair(x, y, h, a, b):
     """Return the two states of a transverse filter after a step h, in units of T, with normal numbers a and b."""
     decay = exp(-h)
     left = exp(-2.0 * h)
+    # `first`, `both`, `second`: the Cholesky factor of the noise's covariance. expm1 keeps the digits of a short step.
     first = sqrt(-expm1(-2.0 * h))
     both = (0.5 - left * (h + 0.5)) / first
     second = sqrt(max(0.0, 0.5 - left * (h * h + h + 0.5) - both * both))
@@ -126,6 +92,7 @@ def turbulence(e, air, across, upward, wind):
     x = air.filter[e]
     root = sqrt(3.0)
     u = across * x[0]
+    # (1 + √3 T s) y = √3 x + (1 - √3) y, because T y' = x - y. Its variance is 2: hence the √2.
     v = across * (root * x[1] + (1.0 - root) * x[2]) / sqrt(2.0)
     w = upward * (root * x[3] + (1.0 - root) * x[4]) / sqrt(2.0)
     speed = hypot(wind[0], wind[1])
@@ -164,6 +131,7 @@ def step_gusts(e, wind, state, air, timestep, c):
     if c.turbulence:
         across, upward, long, high = dryden(state.payload_position[e, 2], hypot(wind[0], wind[1]))
         gust = add(gust, turbulence(e, air, across, upward, wind))
+        # Frozen turbulence (Taylor): time in the filters is the way through the air over the scale length.
         distance = timestep * max(MIN_AIRSPEED, norm(sub(row(state.payload_velocity, e), wind)))
         advance_turbulence(e, air, distance / long, distance / high)
     put(air.gust[e], gust)

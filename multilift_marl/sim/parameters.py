@@ -64,7 +64,7 @@ class RotorVariation(NamedTuple):
     drag: np.ndarray
     """(E, N) [-] over nominal."""
     lag: np.ndarray
-    """(E, N, 2, 3), see `RigConstants`."""
+    """(E, N, 2, 3), see `RotorArrays`."""
 
 
 class Inertias(NamedTuple):
@@ -141,12 +141,14 @@ def update_inertias(
         mass = parameters.payload_mass[mask]
         axes = np.reshape(quat_to_mat(*system.payload_axes.tolist()), (3, 3))
         scale = mass / system.payload_mass * parameters.payload_inertia[mask]
+        # J = A diag(moments) Aᵀ, with the principal axes in the columns of A.
         payload = scale[:, None, None] * (axes * system.payload_inertia @ axes.T)
         inertias.mass[mask, 0], inertias.inertia[mask, 0] = mass, payload
         if system.payload_shape != "point":
             inertias.inverse[mask, 0] = np.linalg.inv(payload)
     if "vehicle_mass" in names:
         mass = parameters.vehicle_mass[mask]
+        # A heavier drone has as much more inertia.
         own = mass / np.array([vehicle.mass for vehicle in system.vehicles])
         drones = own[:, :, None, None] * np.array([np.diag(vehicle.inertia) for vehicle in system.vehicles])
         inertias.mass[mask, 1:], inertias.inertia[mask, 1:] = mass, drones
@@ -220,4 +222,6 @@ def write_masses(
             moments = np.array(vehicle.inertia) * (own / vehicle.mass)[:, None]
             batch.expand("body_mass")[mask, layout.drone_bodies[n]] = own
             batch.expand("body_inertia")[mask, layout.drone_bodies[n]] = moments
+    # MuJoCo's derived constants (invweight0, subtree masses): stale ones would give contacts and cables the stiffness
+    # of other masses. `update_models` follows, because cables' solref depends on them.
     batch.set_const(mask)

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import norm, scale
 from multilift_marl.rig.system import System
-from multilift_marl.sim.gusts import normal_vector, uniform
+from multilift_marl.rng import normal_vector, uniform
 from multilift_marl.sim.state_io import body_dof
 
 
@@ -40,6 +40,7 @@ def make_pushes(system: System, num_envs: int) -> tuple[Pushes, PushConstants] |
     if not (push.payload_velocity or push.drone_velocity or push.drone_rates):
         return None
     inertia = np.array([vehicle.inertia for vehicle in system.vehicles])
+    # Δv/h times the mass: the whole change within one physics step.
     change = np.array([push.payload_velocity, *[push.drone_velocity] * n]) / system.timestep
     constants = PushConstants(
         interval=push.interval / system.timestep,
@@ -59,6 +60,7 @@ def start_pushes(e, pushes, interval):
 @kernel
 def _wait(e, pushes, interval):
     """Return the physics steps until the next push: exponential, so that pushes are a Poisson process."""
+    # `uniform` is in (0, 1], so the logarithm is finite, and the wait at least 0 steps, which counts as the next one.
     return ceil(-interval * log(uniform(e, pushes)))
 
 

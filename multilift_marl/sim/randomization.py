@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from multilift_marl.config.schema import RandomizationConfig
+from multilift_marl.schema.sections import RandomizationConfig
 from multilift_marl.sim.parameters import CONFIGURED, Parameters, nominal_parameters
 from multilift_marl.sim.world import World
 
@@ -50,8 +50,10 @@ class Draw:
             rng: generator of this episode, for the payload's mass and force.
             seed, key: of a stream for what else there is, so that the episode stays what it is without.
         """
+        # From the nominal values, or factors would multiply up from episode to episode.
         for name in self.changing:
             getattr(self.parameters, name)[env] = getattr(self._nominal, name)[0]
+        # In this order for good, and drawn whether or not they are used: the episodes of all seeds depend on it.
         factor = rng.uniform(-1.0, 1.0)
         magnitude = rng.uniform()
         direction = rng.uniform(-np.pi, np.pi)
@@ -95,6 +97,7 @@ class Draw:
         self.values["wind"][env] += speed * np.cos(direction), speed * np.sin(direction), 0.0
         for name in ("action_delay", "observation_delay"):
             low, high = getattr(self.ranges, name)
+            # Drawn even where there is no such delay: what comes after it stays the same.
             delay = rng.integers(low, high + 1)
             if name in self.values:
                 self.values[name][env] = delay

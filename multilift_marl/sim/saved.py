@@ -54,6 +54,26 @@ def check_saved(saved: Mapping[str, Any], expected: Mapping[str, np.ndarray], di
             raise ValueError(f"the saved state does not fit these environments: '{key}' {wrong}")
 
 
+def check_counts(saved: Mapping[str, np.ndarray], limits: Mapping[str, tuple[int, int]]) -> None:
+    """Refuse a saved state, which fits otherwise, with whole numbers that no environment holds.
+
+    Args:
+        saved: as `check_saved` has accepted it.
+        limits: least and largest value by key; keys that are not saved do not count.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    for key, (low, high) in limits.items():
+        array = saved.get(key)
+        if array is not None and ((array < low) | (array > high)).any():
+            odd = array[(array < low) | (array > high)].flat[0]
+            raise ValueError(
+                f"the saved state does not fit these environments: '{key}' holds {odd}, not from {low} to {high}; give "
+                "what state_dict() returned"
+            )
+
+
 def _misfit(
     key: str, saved: Mapping[str, Any], expected: Mapping[str, np.ndarray], diverged: str, same: tuple[str, ...]
 ) -> str:  # fmt: skip

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, cross, mat, mul, norm, put, putmat, row, sub, thrust_frame, tmul, vec
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
 
 
 class SystemState(NamedTuple):
@@ -138,8 +138,9 @@ def hover_drone(e, n, state, cable_force, yaw, drones):
         state: SystemState, written.
         cable_force: that the drone exerts on its cable, world frame [N].
         yaw: heading [rad].
-        drones: `rig.constants.RigConstants`.
+        drones: `rig.constants.RigArrays`.
     """
+    # Thrust holds the weight and the cable, along the body z axis: the drone tilts away from its cable's pull.
     force = add(cable_force, (0.0, 0.0, drones.mass[n] * GRAVITY))
     attitude = thrust_frame(force, yaw)
     putmat(state.drone_rotation[e, n], attitude)
@@ -148,11 +149,13 @@ def hover_drone(e, n, state, cable_force, yaw, drones):
     total = norm(force)
     torque = (0.0, 0.0, 0.0)
     if drones.hooked:
+        # Rotors have to exert hook × P, against the cable's own moment hook × (-P).
         torque = cross(row(drones.hooks, n), tmul(attitude, cable_force))
     for k in range(4):
         square = total / (4.0 * drones.thrust_coefficient[n])
         if drones.hooked:
             a = drones.allocation[n, k]
             thrust = a[0] * total + a[1] * torque[0] + a[2] * torque[1] + a[3] * torque[2]
+            # ω² = f/b; a rotor cannot push down.
             square = max(thrust, 0.0) / drones.thrust_coefficient[n]
         state.rotor_speed[e, n, k] = sqrt(square)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from mujoco.batch import Batch
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import mat, mat_to_quat, matrow, put, putmat, quat_to_mat, row, vec
 
 
@@ -44,6 +44,7 @@ class Rows(NamedTuple):
 
 def make_rows(layout: Layout, batch: Batch, first: int) -> Rows:
     """Return the rows of a batch whose first environment is `first`."""
+    # All fields of a row lie in one buffer: where they begin is the difference of addresses, in numbers of 8 bytes.
     start = batch.state.__array_interface__["data"][0]
 
     def offset(field: str) -> int:
@@ -83,6 +84,7 @@ def write_bodies(e, line, state, rows):
     put(line[at : at + 3], row(state.payload_position, e))
     put(line[v : v + 3], row(state.payload_velocity, e))
     if rows.payload_nv == 6:
+        # MuJoCo's quaternions have the real part first, as ours do; of q and -q either will do.
         line[at + 3], line[at + 4], line[at + 5], line[at + 6] = mat_to_quat(matrow(state.payload_rotation, e))
         put(line[v + 3 : v + 6], row(state.payload_body_rates, e))
 

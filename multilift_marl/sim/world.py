@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from multilift_marl._jit import bind, kernel
 from multilift_marl._platform import cpu_count
-from multilift_marl.rig.constants import make_constants
+from multilift_marl.kernels.jit import bind, kernel
+from multilift_marl.rig.constants import make_rig
 from multilift_marl.rig.system import System
 from multilift_marl.sim.air import make_air
 from multilift_marl.sim.cables import CABLE_MODELS
@@ -55,8 +55,8 @@ class Shard:
     """`apply_loads` of these environments, with the thrusts in `World.thrust`."""
     push: Callable[[], None] | None
     """`apply_pushes` of these environments, where there are any."""
-    advance_cables: Callable[[], None] | None
-    """What the cable model does before MuJoCo's step, if anything."""
+    advance_cables: Callable[[], None]
+    """What the cable model does before MuJoCo's step."""
     read: Callable[[], None]
     """`read_state` of the cable model."""
     broken: np.ndarray
@@ -84,7 +84,7 @@ class World:
         thrust: commanded thrust of each rotor (E, N, 4) [N].
         parameters: true parameters; changed by `set_parameters` alone.
         hidden_loads: true loads; write `wind` and `payload_force` freely.
-        drones: nominal numbers of each drone.
+        rig: RigArrays, nominal numbers of the team.
         air: turbulence, gusts and downwash.
         pushes: when bodies are pushed next; None where they are not.
         stats: statistics since the reset.
@@ -107,7 +107,7 @@ class World:
         self.num_drones = system.num_drones
         self.seed = seed
         self.model, self.layout = build_model(system)
-        self.constants = make_constants(system)
+        self.rig = make_rig(system)
         self.thrust = np.zeros((num_envs, self.num_drones, 4))
         self.state = SystemState.zeros(num_envs, self.num_drones)
         self.parameters = nominal_parameters(system, num_envs)
@@ -143,7 +143,7 @@ class World:
         state.drone_velocity[mask] = state.drone_body_rates[mask] = 0
         for e in np.flatnonzero(mask).tolist():
             for n, force in enumerate(system.hook_force):
-                hover_drone(e, n, state, tuple(force), float(self.system.heading[n]), self.constants)
+                hover_drone(e, n, state, tuple(force), float(self.rig.heading[n]), self.rig)
         self.set_parameters(mask, **nominal_parameters(system, self.num_envs)._asdict())
         self.hidden_loads.payload_force[mask] = 0
         self.hidden_loads.wind[mask] = system.wind
@@ -185,10 +185,10 @@ class World:
             shard.apply()
             if shard.push is not None:
                 shard.push()
+            # Few steps change a flag: only those write to the models.
             if shard.find_close():
                 search_contacts(shard.batch, shard.proximity)
-            if shard.advance_cables is not None:
-                shard.advance_cables()
+            shard.advance_cables()
             try:
                 shard.batch.step()
             except SimulationError as error:
@@ -201,12 +201,14 @@ class World:
         """Call `work` for every shard, each on a thread of its own."""
         if len(self.shards) == 1:
             return work(self.shards[0])
+        # The main thread takes the first shard itself: one thread fewer, and none at all for one shard.
         if self._pool is None or self._pool[0] != os.getpid():  # threads do not survive a fork
             self._pool = os.getpid(), ThreadPoolExecutor(len(self.shards) - 1, thread_name_prefix="multilift")
         others = [self._pool[1].submit(work, shard) for shard in self.shards[1:]]
         try:
             work(self.shards[0])
         finally:
+            # Also where the first shard has failed: no shard may still run when the caller goes on.
             for other in others:
                 other.result()
 
@@ -347,7 +349,7 @@ class World:
             batch = Batch(self.model, hi - lo, nthread=1)
             rows = make_rows(self.layout, batch, lo)
             loads = self.thrust, self.hidden_loads
-            apply = bind(apply_loads, rows, *loads, self._data, air_constants.rig, air, self._varied)
+            apply = bind(apply_loads, rows, *loads, self._data, air_constants.drones, air, self._varied)
             push = None if self._pushing is None else bind(apply_pushes, rows, *self._pushing)
             advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
             proximity = np.full(hi - lo, NEAR, np.int8)

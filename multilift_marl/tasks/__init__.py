@@ -8,9 +8,8 @@ from typing import Any, TypeVar
 
 from multilift_marl.config.load import register_config
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.plugins import load_entry_points
+from multilift_marl.plugins import load_entry_points, registers
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.declared import check_declared
 from multilift_marl.tasks.gate import Gate
 from multilift_marl.tasks.hover import Hover
 from multilift_marl.tasks.land import Land
@@ -18,6 +17,7 @@ from multilift_marl.tasks.loss import Loss
 from multilift_marl.tasks.pose import Pose
 from multilift_marl.tasks.recover import Recover
 from multilift_marl.tasks.takeoff import Takeoff
+from multilift_marl.tasks.task_checks import check_declared
 from multilift_marl.tasks.track import Track
 
 TASKS: dict[str, type[Task]] = {
@@ -61,6 +61,9 @@ def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None)
         register_config(name, {"task": name} if config is None else config)
     TASKS[name] = task
     return task
+
+
+registers.append(register_task)
 
 
 def list_tasks() -> list[str]:

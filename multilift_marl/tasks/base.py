@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from math import radians
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from multilift_marl._jit import compose, inlined, prebind
 from multilift_marl.config.config import Config
-from multilift_marl.config.schema import RewardTerm
-from multilift_marl.config.validate import validate
-from multilift_marl.config.values import Section
-from multilift_marl.control.formation import Goal, Reference, make_rig, place_formation
-from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.control.formation import Goal, Reference, place_formation
+from multilift_marl.errors import ConfigError
+from multilift_marl.kernels.jit import inlined, is_plain, prebind
+from multilift_marl.mdp.criteria import Criterion, rest_criteria
+from multilift_marl.mdp.env_data import INTEGRAL_LIMIT, Errors, View, reduce_view, true_load
+from multilift_marl.mdp.failures import CAUSES, FIRST_OWN, FailureMask, make_limits
+from multilift_marl.mdp.global_state import state_components
+from multilift_marl.mdp.initial_states import true_equilibrium
+from multilift_marl.mdp.numpy_functions import NumpyFunctions
+from multilift_marl.mdp.observation_kernels import check_written, compose_observation, compose_state
+from multilift_marl.mdp.observations import SENSED, Component, kernels_first, list_components
+from multilift_marl.mdp.rewards import RestBounds, Term, compose_reward, is_at_rest, resolve_reward
+from multilift_marl.mdp.rig_features import RIG, describe_rig, observed_units, scale_numbers
+from multilift_marl.mdp.stage_kernels import compose_check, compose_plan
+from multilift_marl.rig.constants import RigArrays
+from multilift_marl.schema.validate import check_magnitudes, validate
+from multilift_marl.schema.values import Section
+from multilift_marl.sensing.measurement import Sensing
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
-from multilift_marl.tasks.failures import FailureMask, find_cause, make_limits
-from multilift_marl.tasks.global_state import state_components
-from multilift_marl.tasks.load_sensing import true_load
-from multilift_marl.tasks.observation_kernels import check_written, compose_observation, compose_state
-from multilift_marl.tasks.observations import SENSED, Component, list_components
-from multilift_marl.tasks.rewards import RestBounds, Term, compose_reward, is_at_rest
-from multilift_marl.tasks.rig_numbers import RIG, describe_rig, observed_units, scale_numbers
-from multilift_marl.tasks.sensing import Sensing
-from multilift_marl.tasks.starts import make_hanging, true_hanging
-from multilift_marl.tasks.view import INTEGRAL_LIMIT, Errors, View, reduce_view, update_errors
 
+_HANDED_ON = (
+    "action", "cause", "errors", "goal", "good_time", "limits", "mask", "min_separation", "own", "planned", "previous",
+    "rig", "settings", "terms", "time",
+)  # fmt: skip
+"""Attributes of a task that its kernels read and write as fields of the view."""
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
 Call = Callable[[int, int], None]  # of environments lo to hi
 
@@ -57,9 +63,14 @@ class Kernels(NamedTuple):
     """Whether the payload is within the success region; `good_time` counts how long."""
     plan: Callable[..., Any] | None = None
     """At every control step, `time` advanced: writes goal and its velocities for that moment. A goal may leap, see
-    `Task.place_goal`: references are smoothed to slots that leap, and move along with those that move."""
+    `Task.place_goal`: references are smoothed to slots that leap, and move along with those that move.
+
+    Or a NumPy function of (View), called at the start of an episode and before every policy step with `time` at its
+    end, that returns a dict of `numpy_functions.GOAL_FIELDS`; control steps lead there by velocity and acceleration."""
     check: Callable[..., Any] | None = None
-    """After every policy step, before failures are looked for."""
+    """After every policy step, errors up to date, before common failures are looked for: finds the task's own.
+
+    A cause other than 0 that it writes into `cause` ends the episode, as one written by any other of these does."""
     update: Callable[..., Any] | None = None
     """After the reward."""
     preview: Callable[..., Any] | None = None
@@ -86,7 +97,11 @@ class Task:
         KERNELS: what it does in a step.
         EXTRA: what its observations have beside the common components.
         EXTRA_STATE: what it adds to the global state.
+        FAILURES: names of failures of its own; the first is cause `failures.FIRST_OWN`. A tuple where `KERNELS` write
+            them, or a dict with what finds each: an inlined kernel of (e, View) that returns a truth value, or a NumPy
+            function of (View) that returns truth values (E,). They count where nothing else has failed.
         MIN_DRONES: with fewer it makes no sense.
+        CAN_PLAN: whether planners can fly it: all cables taut throughout, no drone lost, nothing in the way.
 
     Args:
         config: of the environments; `task_options`, `reward`, `env` and `sim` count.
@@ -97,13 +112,13 @@ class Task:
     Attributes:
         config, world, reference: as given.
         options: `task_options`, checked; a subclass that annotates it with its own `Options` has it typed.
+        numpy: NumpyFunctions, those of its functions that are no kernels.
         view: View, what its kernels read and write; the following are fields of it: goal, planned, errors, mask, rig,
             limits, time, cause, terms, good_time, min_separation, action, previous, dt, control_dt, own, settings.
         weights, margins: of the reward terms (T,), (T, M), in the order of `REWARD`.
         drone_numbers: where the drones' numbers stand in the global state.
         rmse_after: time from which errors count for `payload_rmse_m` [s].
-        hanging: numbers of a hanging team; in `start`, the true ones of the environment, else nominal.
-        nominal_hanging: always nominal, for goals.
+        equilibrium: RigArrays; in `start`, the true ones of the environment, else `rig`, which is nominal.
 
     Raises:
         ConfigError: too few drones, an unknown option or reward term, or one that cannot be.
@@ -116,7 +131,9 @@ class Task:
     KERNELS: ClassVar[Kernels] = Kernels()
     EXTRA: ClassVar[tuple[Component, ...]] = ()
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = ()
+    FAILURES: ClassVar[tuple[str, ...] | dict[str, Callable[..., Any]]] = ()
     MIN_DRONES: ClassVar[int] = 1
+    CAN_PLAN: ClassVar[bool] = True
     own: Any
     settings: Any
 
@@ -126,12 +143,13 @@ class Task:
             raise ConfigError(f"task {self.name} needs more drones; raise env.num_drones to {self.MIN_DRONES} or more")
         self.config, self.world, self.reference, self._sensing = config, world, reference, sensing
         self.options = validate(self.Options, config.task_options, "task_options")
+        check_magnitudes(self.options, "task_options")
         self.weights, self.margins = resolve_reward(self.name, self.REWARD, config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
         self.planned = self.goal
-        self.rig, self.limits, self.mask = make_rig(system), make_limits(system), FailureMask.zeros(e, n)
-        self.nominal_hanging = self.hanging = make_hanging(system)
+        self.rig = self.equilibrium = world.rig
+        self.limits, self.mask = make_limits(system), FailureMask.zeros(e, n)
         size = sensing.action_size
         self.action, self.previous = np.zeros((2, e, n, size))
         self.observation = np.zeros((e, n, sensing.observation_size), np.float32)
@@ -146,11 +164,11 @@ class Task:
         self.prepare()
         self.view = View(
             state=world.state,
-            seen=sensing.state,
-            load=sensing.load,
-            true_load=true_load(world.state),
+            estimated=sensing.state,
+            payload_estimate=sensing.load,
+            payload=true_load(world.state),
             true_errors=self.errors.as_rows(),
-            loads=world.hidden_loads,
+            disturbances=world.hidden_loads,
             parameters=world.parameters,
             gust=world.air.gust,
             action_delay=sensing.memory.action_delay,
@@ -159,11 +177,10 @@ class Task:
             has_plan=self.planned is not self.goal,
             errors=self.errors,
             integral_limit=INTEGRAL_LIMIT * observed_units(config, ("m s", "rad s")),
-            seen_errors=sensing.errors or self.errors.as_rows(),
+            estimated_errors=sensing.errors or self.errors.as_rows(),
             reference=reference,
             rig=self.rig,
             rig_numbers=describe_rig(system, self.dt),
-            nominal=self.nominal_hanging,
             resting_tension=system.resting_tension,
             limits=self.limits,
             mask=self.mask,
@@ -180,13 +197,30 @@ class Task:
             settings=self.settings,
         )
         self._views: dict[Callable[..., Any], View] = {}
-        self.stages = self._compose()
+        true = self.view._replace(
+            estimated=world.state, payload_estimate=self.view.payload, estimated_errors=self.view.true_errors
+        )
+        parts = list_components(config.control.action, self.extra(config))
+        units = [part.unit for part in parts for _ in range(part.size)]
+        listed = self._state.listed(n, size)
+        self.numpy = NumpyFunctions(self, true, parts, 1 / observed_units(config, units), listed)
+        self.stages = self._compose(true)
 
     @classmethod
     def extra(cls, config: Config) -> tuple[Component, ...]:
         """Return what observations have beside the common components: the task's own, and what only sensors tell."""
         rig = () if config.env.units == "si" else (RIG,)
-        return (*cls.EXTRA, *SENSED.get(config.env.sensing, ()), *rig)
+        return kernels_first((*cls.EXTRA, *SENSED.get(config.env.sensing, ()), *rig))
+
+    @classmethod
+    def causes(cls) -> tuple[str, ...]:
+        """Return the names of the values of `cause`: those of all tasks, then the task's own."""
+        return (*CAUSES, *cls.FAILURES)
+
+    @classmethod
+    def own_failures(cls) -> dict[str, Callable[..., Any]]:
+        """Return what finds each of its own failures; none where `KERNELS` write them."""
+        return dict(cls.FAILURES) if isinstance(cls.FAILURES, dict) else {}
 
     def prepare(self) -> None:
         """Check the options, set `settings`, and `own` where the task has arrays of its own."""
@@ -202,6 +236,11 @@ class Task:
         """
         raise NotImplementedError
 
+    @property
+    def hanging(self) -> RigArrays:
+        """`equilibrium` by its name before 0.2."""
+        return self.equilibrium
+
     def view_for(self, kernel: Callable[..., Any]) -> View:
         """Return what a kernel, called by `start`, reads and writes of `view`; see `reduce_view`."""
         if kernel not in self._views:
@@ -212,6 +251,17 @@ class Task:
         """Return which environments (E,) would be successes if they ended now: good for the last seconds, or all."""
         seconds: float = getattr(self.options, "success_seconds", 0.0)
         return self.good_time >= min(seconds, self.config.env.episode_seconds) - 1e-9
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """Return what a success needs beside time, for reports; who overrides `succeeded` overrides this, too."""
+        if self.KERNELS.is_good is not is_within_bounds:
+            return ()
+        return rest_criteria(getattr(self.settings, "bounds", None), self.errors, self.world.state)
+
+    def success_windows(self) -> tuple[tuple[float, float], ...]:
+        """Return from when to when [s] an episode has to be within the success region throughout."""
+        length = self.config.env.episode_seconds
+        return ((length - min(getattr(self.options, "success_seconds", 0.0), length), length),)
 
     def place_goal(self, env: int, position: ArrayLike, rotation: ArrayLike | None = None) -> None:
         """Put the target of one environment elsewhere, the formation with it, at a start or in flight.
@@ -232,6 +282,18 @@ class Task:
         """Return whether errors at `time` [s] of an episode of `length` [s] belong to those that are reported."""
         return time > length - FINAL_SECONDS + 1e-9
 
+    def preview_targets(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the payload is to be, and its attitude, (E, M, 3) [m] and (E, M, 3, 3), at times to come.
+
+        A planner sees ahead by this; here the target is taken to stay where it is.
+
+        Args:
+            times: (E, M) since the start of the episode [s].
+        """
+        shape = times.shape
+        position = np.broadcast_to(self.planned.position[:, None], (*shape, 3))
+        return position, np.broadcast_to(self.planned.rotation[:, None], (*shape, 3, 3))
+
     def target_path(self, env: int) -> np.ndarray:
         """Return points (P, 3) [m] of the path that the target takes in this episode, to draw it; none if it stays."""
         return np.zeros((0, 3))
@@ -245,16 +307,25 @@ class Task:
 
         That is what the core calls, for as many draws as it takes; tasks say by `start` what is drawn.
         """
-        self.hanging = true_hanging(self.nominal_hanging, parameters, env)
+        self.equilibrium = true_equilibrium(self.rig, parameters, env)
         self.start(env, rng, float(parameters.payload_mass[env]))
-        self.hanging = self.nominal_hanging
+        self.numpy.start_goals(env, env + 1)
+        self.equilibrium = self.rig
+        for name in _HANDED_ON:
+            if getattr(self, name) is not getattr(self.view, name):
+                raise ConfigError(
+                    f"task {self.name} replaced `{name}` after prepare(), which its kernels never see; write into its "
+                    "arrays in place"
+                )
         return self.begin(env)
 
     def begin(self, env: int) -> bool:
         """Reset the measurements of one environment to its drawn start; return whether that start is sound."""
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
         self.good_time[env], self.min_separation[env], self.terms[env], self.time[env] = 0.0, 1e9, 0.0, 0.0
+        self.cause[env] = 0
         self.stages["measure"](env, env + 1)
+        self.numpy.find_failures(env, env + 1)
         return bool(self.cause[env] == 0)
 
     def check_written(self, env: int) -> None:
@@ -266,6 +337,10 @@ class Task:
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return copies of the task's arrays that outlive a step."""
         return {name: array.copy() for name, array in self._arrays().items()}
+
+    def count_limits(self) -> dict[str, tuple[int, int]]:
+        """Return the least and largest value of whole numbers in `own` that kernels index by, by dotted name."""
+        return {}
 
     def load_state_dict(self, saved: Mapping[str, np.ndarray]) -> None:
         """Restore what `state_dict` returned."""
@@ -283,8 +358,8 @@ class Task:
             arrays |= {f"{group}.{name}": array for name, array in _flatten(record)}
         return arrays
 
-    def _compose(self) -> dict[str, Call]:
-        """Return the stages of a step that are the task's, each a call of (lo, hi)."""
+    def _compose(self, true: View) -> dict[str, Call]:
+        """Return the stages of a step that are the task's kernels, each a call of (lo, hi)."""
         v, kernels, size = self.view, self.KERNELS, self.action.shape[2]
         extra, action = self.extra(self.config), self.config.control.action
         observe = self._bind(compose_observation(extra, action), v, self.observation)
@@ -292,7 +367,9 @@ class Task:
             units = [part.unit for part in list_components(action, extra) for _ in range(part.size)]
             factors = 1 / observed_units(self.config, units)
             observe = _follow(observe, prebind(scale_numbers, self.observation, factors))
-        check = compose_check(kernels.check)
+        own = enumerate(self.own_failures().values(), FIRST_OWN)
+        failures = {number: has_failed for number, has_failed in own if not is_plain(has_failed)}
+        check = compose_check(kernels.check, kernels.plan is None, failures)
         stages = {
             "measure": self._bind(check, v, 0.0),
             "check": self._bind(check, v, self.dt),
@@ -301,9 +378,10 @@ class Task:
             ),
             "observe": observe,
         }
-        true = v._replace(seen=v.state, load=v.true_load, seen_errors=v.true_errors)
         stages["observe state"] = self._bind(compose_state(self._state, kernels.preview, size), true, self.critic)
-        if kernels.plan is not None:
+        if self.numpy.plans:
+            stages["plan"] = self.numpy.bind_approach()
+        elif kernels.plan is not None:
             stages["plan"] = self._bind(compose_plan(kernels.plan), v)
         return stages
 
@@ -320,59 +398,6 @@ def _follow(first: Call, then: Call) -> Call:
         then(lo, hi)
 
     return call
-
-
-def compose_check(check: Callable[..., Any] | None) -> Callable[..., Any]:
-    """Return the kernel of (lo, hi, View, dt) that measures errors, integrates them over `dt` [s], finds failures.
-
-    Args:
-        check: inlined kernel of (e, View), called first; None for none.
-    """
-    source = """def check(lo, hi, v, dt):
-    for e in range(lo, hi):
-        before(e, v)
-        update_errors(e, 0, v.true_load, v.true_errors, v, dt)
-        v.cause[e] = find_cause(e, v)
-"""
-    functions: dict[str, Callable[..., Any]] = {"update_errors": update_errors, "find_cause": find_cause}
-    if check:
-        functions["before"] = check
-    return compose("check", source if check else source.replace("        before(e, v)\n", ""), functions)
-
-
-def compose_plan(plan: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the kernel of (lo, hi, View) that advances time by a control step, then calls `plan` of (e, View)."""
-    source = """def advance_plan(lo, hi, v):
-    for e in range(lo, hi):
-        v.time[e] += v.control_dt
-        plan(e, v)
-"""
-    return compose("advance_plan", source, {"plan": plan})
-
-
-def resolve_reward(
-    task: str, terms: Mapping[str, Term], values: Mapping[str, RewardTerm]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (T,) and margins (T, M) of a task's terms, angles in radians, with configured `values` in place.
-
-    Raises:
-        ConfigError: an unknown term, or another number of margins than it has.
-    """
-    for name, given in values.items():
-        if name not in terms:
-            hint = nearest(name, terms, lambda near: f"reward.{near}")
-            raise ConfigError(f"unknown key 'reward.{name}' of task {task}{hint}")
-        count = len(terms[name].margins)
-        if given.margin is not None and len(given.margin) != count:
-            raise ConfigError(f"reward.{name}.margin lists {len(given.margin)} numbers, but the term has {count}")
-    weights = np.array([term.weight for term in terms.values()], float)
-    margins = np.ones((len(terms), max((len(term.margins) for term in terms.values()), default=0)))
-    for i, (name, term) in enumerate(terms.items()):
-        given = values.get(name, RewardTerm())
-        weights[i] = term.weight if given.weight is None else given.weight
-        chosen = term.margins if given.margin is None else given.margin
-        margins[i, : len(chosen)] = [radians(margin) if term.unit == "deg" else margin for margin in chosen]
-    return weights, margins
 
 
 def _flatten(record: Any, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:

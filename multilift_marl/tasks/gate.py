@@ -8,16 +8,14 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import drawing, inlined, kernel
-from multilift_marl.config.values import Float, Int, Section, Span
 from multilift_marl.control.formation import place_formation
+from multilift_marl.kernels.jit import drawing, inlined, kernel
 from multilift_marl.math3d import add, ease, mat, matrow, mul, put, putmat, rot_z, row, sub, triple, vec
-from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.tasks.base import Box, Kernels, Task
-from multilift_marl.tasks.failures import WALL
-from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.paths import STEP, differences, set_goal
-from multilift_marl.tasks.rewards import (
+from multilift_marl.mdp.criteria import Criterion, rest_criteria
+from multilift_marl.mdp.failures import WALL
+from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
+from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.rewards import (
     RestBounds,
     Term,
     action_rate,
@@ -29,7 +27,10 @@ from multilift_marl.tasks.rewards import (
     update_peak_tension,
     velocity,
 )
-from multilift_marl.tasks.starts import hang_team, in_ball
+from multilift_marl.planning.paths import STEP, differences, set_goal
+from multilift_marl.schema.values import Float, Int, Section, Span
+from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.tasks.base import Box, Kernels, Task
 
 THICKNESS = 0.1  # [m] of the walls
 SPACING = 1.5  # [m] between walls
@@ -109,6 +110,7 @@ def target_position(e, t, v):
     x = gates.reach * (2.0 * ease(t, gates.begin, gates.duration)[0] - 1.0)
     y, before, last = 0.0, -gates.reach, 0.0
     for g in range(gates.x.shape[0]):
+        # Eased over x in place of time: the same curve, however fast it is followed.
         y += (gap_y[e, g] - last) * ease(x, before, gates.x[g] - 0.25 - before)[0]
         before, last = gates.x[g] + 0.25, gap_y[e, g]
     y -= last * ease(x, before, gates.reach - before)[0]
@@ -132,14 +134,14 @@ def trace(e, seconds, v, points):
 
 
 @drawing
-def start_before_gate(e, rng, v, hanging):
+def start_before_gate(e, rng, v, equilibrium):
     """Write goal and team at the start, the long side of the formation across the path."""
     goal = v.goal
     putmat(goal.rotation[e], rot_z(0.5 * pi))
     move_target(e, 0.0, v)
     moved = in_ball(rng, v.settings.radius)
     pose = add(row(goal.position, e), moved), matrow(goal.rotation, e)
-    hang_team(e, v, goal, hanging, pose, (0.0, 0.0, 0.0), moved)
+    set_equilibrium(e, v, goal, equilibrium, pose, (0.0, 0.0, 0.0), moved)
 
 
 @inlined
@@ -189,6 +191,7 @@ def _cable_room(e, g, low, high, v):
         return 1.0
     room, span = 1.0, high[0] - low[0]
     for side in (begin, end):
+        # y and z are linear along the cable: it is nearest to an edge where it enters or leaves the wall.
         share = 0.0 if abs(span) < 1e-9 else min(max((side - low[0]) / span, 0.0), 1.0)
         y, z = low[1] + share * (high[1] - low[1]), low[2] + share * (high[2] - low[2])
         room = min(room, v.own.half_width[e, g] - abs(y - v.own.gap_y[e, g]), gates.gap_height - z)
@@ -207,7 +210,7 @@ def least_room(e, v):
             drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
             room = min(room, _room(e, g, drone, frame, bodies.drone[n], v))
             anchor = add(payload, mul(attitude, row(rig.anchors, n)))
-            room = min(room, _cable_room(e, g, anchor, add(drone, mul(frame, row(rig.constants.hooks, n))), v))
+            room = min(room, _cable_room(e, g, anchor, add(drone, mul(frame, row(rig.hooks, n))), v))
     return room
 
 
@@ -258,26 +261,26 @@ def target_velocity(e, n, v):
 @inlined
 def gap_offset(e, n, v):
     """Own position from the middle of the own next gap, along the wall; 0 past the last."""
-    g = own_gap(e, n, v.seen, v)
+    g = own_gap(e, n, v.estimated, v)
     if g == v.settings.x.shape[0]:
         return (0.0, 0.0, 0.0)
-    return (0.0, v.seen.drone_position[e, n, 1] - v.own.gap_y[e, g], 0.0)
+    return (0.0, v.estimated.drone_position[e, n, 1] - v.own.gap_y[e, g], 0.0)
 
 
 @inlined
 def gap_distance(e, n, v):
     """Own distance past the wall of the own next gap, or past the last."""
-    g = min(own_gap(e, n, v.seen, v), v.settings.x.shape[0] - 1)
-    return v.seen.drone_position[e, n, 0] - v.settings.x[g]
+    g = min(own_gap(e, n, v.estimated, v), v.settings.x.shape[0] - 1)
+    return v.estimated.drone_position[e, n, 0] - v.settings.x[g]
 
 
 @inlined
 def clearance(e, n, v):
     """Own room to the edges of the own next gap, within ± 0.5 m; past the last 0.5."""
-    g = own_gap(e, n, v.seen, v)
+    g = own_gap(e, n, v.estimated, v)
     if g == v.settings.x.shape[0]:
         return 0.5
-    return min(max(_clearance(e, n, g, v.seen, v), -0.5), 0.5)
+    return min(max(_clearance(e, n, g, v.estimated, v), -0.5), 0.5)
 
 
 @inlined
@@ -317,6 +320,7 @@ class Gate(Task):
         "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
+    CAN_PLAN: ClassVar[bool] = False
     KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, update=find_touch)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("target_velocity", 2, "slot", "m/s", "horizontal velocity of the target", target_velocity, True),
@@ -363,11 +367,17 @@ class Gate(Task):
         self.own.gap_y[env] = rng.uniform(-option.gap_offset, option.gap_offset, option.gates)
         low, high = option.gap_width
         self.own.half_width[env] = 0.5 * (low if low == high else rng.uniform(low, high, option.gates))
-        start_before_gate(env, rng, self.view_for(start_before_gate), self.hanging)
+        start_before_gate(env, rng, self.view_for(start_before_gate), self.equilibrium)
 
     def succeeded(self) -> np.ndarray:
         """At rest at the goal throughout the last moments, and never too large a tension."""
         return super().succeeded() & (self.own.peak_tension <= self.options.success_tension)
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """See `Task.criteria`."""
+        bound, at_rest = self.options.success_tension, self.KERNELS.is_good is has_arrived
+        found = rest_criteria(self.settings.bounds, self.errors, self.world.state) if at_rest else ()
+        return (*found, Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False))
 
     def target_path(self, env: int) -> np.ndarray:
         """Return points of the path through the gaps; see `Task.target_path`."""

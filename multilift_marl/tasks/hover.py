@@ -7,10 +7,10 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from multilift_marl.config.values import Float, Section
+from multilift_marl.mdp.initial_states import StartOptions, make_ranges, start_near_target
+from multilift_marl.mdp.rewards import Term, action_rate, attitude, distance, steadiness
+from multilift_marl.schema.values import Float, Section
 from multilift_marl.tasks.base import Task
-from multilift_marl.tasks.rewards import Term, action_rate, attitude, distance, steadiness
-from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
 
 
 class HoverOptions(StartOptions):
@@ -44,4 +44,4 @@ class Hover(Task):
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, displacement, tilt and velocity; see `Task.start`."""
-        start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.hanging)
+        start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.equilibrium)

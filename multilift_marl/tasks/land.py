@@ -8,14 +8,12 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import drawing, inlined
-from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import place_formation
+from multilift_marl.kernels.jit import drawing, inlined
 from multilift_marl.math3d import add, ease, matrow, norm, put, putmat, rot_z, row, scale, sub, tmul, vec
-from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.tasks.base import Kernels, Task
-from multilift_marl.tasks.failures import LOAD_GROUND, TOUCH, ignore, payload_height
-from multilift_marl.tasks.ground import (
+from multilift_marl.mdp.criteria import CONDITION, Criterion, length
+from multilift_marl.mdp.failures import LOAD_GROUND, TOUCH, Limits, ignore, payload_height
+from multilift_marl.mdp.ground import (
     CARRIED,
     Ground,
     cable_chord,
@@ -26,9 +24,13 @@ from multilift_marl.tasks.ground import (
     scale_cable_force,
     set_resting_goal,
 )
-from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import Term, action_rate, tolerance
-from multilift_marl.tasks.starts import hang_team
+from multilift_marl.mdp.initial_states import set_equilibrium
+from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.rewards import Term, action_rate, tolerance
+from multilift_marl.schema.values import Float, Section
+from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.sim.state import SystemState
+from multilift_marl.tasks.base import Kernels, Task
 
 APPROACH = (0.1, 2.7)  # begin and length of each phase [s], as of the next ones: level to the pad,
 DESCEND = (2.0, 2.8)  # down,
@@ -85,7 +87,7 @@ class LandSettings(NamedTuple):
 
 
 @drawing
-def start_above_origin(e, rng, v, hanging, ranges):
+def start_above_origin(e, rng, v, equilibrium, ranges):
     """Draw the pad; write a team at rest above the origin. Ranges are x and y [m], heading [rad], height [m]."""
     goal, (xy, yaw, height) = v.goal, ranges
     put(v.own.course[e], (rng.uniform(-xy, xy), rng.uniform(-xy, xy), v.settings.ground.payload - height))
@@ -93,7 +95,7 @@ def start_above_origin(e, rng, v, hanging, ranges):
     putmat(goal.rotation[e], rot_z(rng.uniform(-yaw, yaw)))
     place_formation(e, goal, v.rig)
     still = (0.0, 0.0, 0.0)
-    hang_team(e, v, goal, hanging, (row(goal.position, e), matrow(goal.rotation, e)), still, still)
+    set_equilibrium(e, v, goal, equilibrium, (row(goal.position, e), matrow(goal.rotation, e)), still, still)
 
 
 @inlined
@@ -127,6 +129,7 @@ def see_touchdown(e, v):
     own, settings = v.own, v.settings
     speed = norm(row(v.state.payload_velocity, e))
     if own.touch[e] == AIRBORNE and load_height(e, v.state, v.limits) < TOUCH:
+        # The step in which it touches may have stopped it already: the faster of two counts.
         soft = max(speed, own.speed[e]) <= settings.speed
         own.touch[e] = LANDED if soft and off_pad(e, v) <= settings.radius else CRASHED
     own.speed[e] = speed
@@ -152,6 +155,7 @@ def _drone_clear(e, n, v):
     drone = vec(v.state.drone_position, e, n)
     away = tmul(matrow(v.state.payload_rotation, e), sub(drone, row(v.state.payload_position, e)))
     center, half = v.limits.payload_center, v.limits.payload_half  # a cylinder counts as the box about it
+    # Distance of the drone's centre from a box, 0 inside.
     x = max(abs(away[0] - center[0]) - half[0], 0.0)
     y = max(abs(away[1] - center[1]) - half[1], 0.0)
     z = max(abs(away[2] - center[2]) - half[2], 0.0)
@@ -218,9 +222,14 @@ class Land(Task):
         "slack": Term(0.5, slackness, 0.1, "-"),
         "action_rate": Term(-0.05, action_rate),
     }
+    CAN_PLAN: ClassVar[bool] = False
     KERNELS: ClassVar[Kernels] = Kernels(is_good=is_put_down, plan=advance, check=see_touchdown)
     EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")
+
+    def count_limits(self) -> dict[str, tuple[int, int]]:
+        """Bound what kernels index by, see `Task`."""
+        return {"touch": (AIRBORNE, CRASHED)}
 
     def prepare(self) -> None:
         """See `Task.prepare`."""
@@ -240,10 +249,48 @@ class Land(Task):
         """Draw the pad; the team hangs at rest above the origin. See `Task.start`."""
         option = self.options
         ranges = option.pad_xy, radians(option.pad_yaw), option.start_height
-        start_above_origin(env, rng, self.view_for(start_above_origin), self.hanging, ranges)
+        start_above_origin(env, rng, self.view_for(start_above_origin), self.equilibrium, ranges)
         self.own.touch[env], self.own.speed[env], self.time[env] = AIRBORNE, 0.0, 0.0
         advance(env, self.view_for(advance))
 
     def succeeded(self) -> np.ndarray:
         """Touched down softly, and at rest, slack and clear throughout the last seconds."""
         return (self.own.touch == LANDED) & super().succeeded()
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """See `Task.criteria`: a soft landing, and what `is_put_down` asks for."""
+        state, course, settings = self.world.state, self.own.course, self.settings
+        slack, clear = settings.ground.cable_weight, settings.clearance
+        soft = Criterion("soft_landing", CONDITION, lambda: (self.own.touch != LANDED) * 1.0, throughout=False)
+        if self.KERNELS.is_good is not is_put_down:
+            return (soft,)
+        return (
+            soft,
+            Criterion("pad_distance_m", settings.radius, lambda: _level(state, course) - settings.radius),
+            Criterion("speed_m_s", _AT_REST, lambda: length(state.payload_velocity) - _AT_REST),
+            Criterion("height_m", TOUCH, lambda: lowest_points(state, self.limits) - TOUCH),
+            Criterion("cable_force_n", 0.0, lambda: (state.cable_tension - slack).max(axis=1)),
+            Criterion("clearance_m", clear, lambda: clear - _room(state, self.limits) + settings.drone_half),
+        )
+
+
+def _level(state: SystemState, course: np.ndarray) -> np.ndarray:
+    """Return level distances of payloads from the middle of their pad (E,) [m], see `off_pad`."""
+    return np.asarray(np.hypot(*(state.payload_position - course)[:, :2].T))
+
+
+def lowest_points(state: SystemState, limits: Limits) -> np.ndarray:
+    """Return heights of the payloads' lowest points (E,) [m], see `load_height`."""
+    up, half = state.payload_rotation[:, 2], limits.payload_half
+    if limits.payload_round:
+        reach = np.hypot(up[:, 0], up[:, 1]) * half[0] + np.abs(up[:, 2]) * half[2]
+    else:
+        reach = np.abs(up) @ half
+    return np.asarray(state.payload_position[:, 2] + up @ np.array(limits.payload_center) - reach)
+
+
+def _room(state: SystemState, limits: Limits) -> np.ndarray:
+    """Return least distances of drones' centres from payload and ground (E,) [m], see `_drone_clear`."""
+    away = (state.drone_position - state.payload_position[:, None]) @ state.payload_rotation
+    outside = np.maximum(np.abs(away - np.array(limits.payload_center)) - limits.payload_half, 0.0)
+    return np.asarray(np.minimum(np.linalg.norm(outside, axis=2), state.drone_position[..., 2]).min(axis=1))

@@ -8,16 +8,15 @@ from typing import Annotated, ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import inlined
-from multilift_marl.config.values import Between, Float, Section
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.redistribution import RAMP, WAIT, plan_offset, redistributed_slots
 from multilift_marl.errors import ConfigError
+from multilift_marl.kernels.jit import inlined
 from multilift_marl.math3d import scale
-from multilift_marl.tasks.base import Kernels, Task
-from multilift_marl.tasks.loss_notice import LEAST_CHANGE, SETTLED, WINDOW, expect_changes, notice_loss
-from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import (
+from multilift_marl.mdp.criteria import CONDITION, Criterion
+from multilift_marl.mdp.initial_states import StartOptions, make_ranges, start_near_target
+from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.rewards import (
     RestBounds,
     Term,
     action_rate,
@@ -26,7 +25,9 @@ from multilift_marl.tasks.rewards import (
     stillness,
     update_peak_tension,
 )
-from multilift_marl.tasks.starts import StartOptions, make_ranges, start_near_target
+from multilift_marl.schema.values import Between, Float, Section
+from multilift_marl.sensing.loss_detection import LEAST_CHANGE, SETTLED, WINDOW, expect_changes, notice_loss
+from multilift_marl.tasks.base import Kernels, Task
 
 HARMLESS = 0.75  # tensions up to this share of the limit are no snatch
 
@@ -36,11 +37,9 @@ class LossOptions(StartOptions):
 
     loss_time: tuple[Float, Float] = Field((2.0, 4.0), description="[s] earliest and latest stop of the motors")
     snap: bool = Field(False, description="whether the lost drone's cable breaks, so that it is gone")
-    broadcast: bool = Field(
-        True, description="whether all drones are told at once who is lost; else they tell by how the payload tilts"
-    )
+    broadcast: bool = Field(True, description="whether all drones observe a loss at once; otherwise each detects it")
     noticed_angle: Annotated[Float, Between(1, 90, "deg")] = Field(
-        25.0, description="[deg] tilt at which drones that are not told notice a loss"
+        25.0, description="[deg] tilt of the payload at which drones detect a loss without broadcast"
     )
     success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of its target ...")
     success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, as level as can be held ...")
@@ -104,7 +103,7 @@ def stop_motors(e, v):
     who = v.own.who[e]
     if v.time[e] >= v.own.when[e] and not v.mask.lost[e, who]:
         v.mask.lost[e, who] = True
-        v.loads.motors_off[e, who] = True
+        v.disturbances.motors_off[e, who] = True
         if v.settings.snap:
             v.state.cable_broken[e, who] = True
     update_peak_tension(e, v, v.own.peak_tension)
@@ -146,6 +145,7 @@ def knows_loss(e, n, v):
 def lost_direction(e, n, v):
     """Cosine and sine of the lost drone's azimuth from the own one; 0 before, the sine also while it is unsure."""
     angle, known = v.rig.azimuth[v.own.known_who[e, n]] - v.rig.azimuth[n], knows_loss(e, n, v)
+    # Drones that the own cable cannot tell apart are on either side of it: only the sine differs.
     return known * cos(angle), 0.0 if v.own.unsure[e, n] else known * sin(angle)
 
 
@@ -186,10 +186,11 @@ class Loss(Task):
         "snatch": Term(0.0, snatch),
         "action_rate": Term(-0.05, action_rate),
     }
+    CAN_PLAN: ClassVar[bool] = False
     KERNELS: ClassVar[Kernels] = Kernels(plan=stop_motors, update=end_step)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("lost", 1, "-", "-", "1 if the own motors have stopped", lost),
-        Component("team_lost", 1, "-", "-", "1 if those of any drone have, as one knows", knows_loss),
+        Component("team_lost", 1, "-", "-", "1 if those of any drone have, as observed or detected", knows_loss),
         Component(
             "lost_direction", 2, "slot", "-", "cosine and sine of its azimuth from the own one; 0 before",
             lost_direction,
@@ -205,6 +206,10 @@ class Loss(Task):
         Component("progress", 1, "-", "-", "of the planned motion", progress),
     )
     MIN_DRONES: ClassVar[int] = 2
+
+    def count_limits(self) -> dict[str, tuple[int, int]]:
+        """Bound what kernels index by, see `Task`."""
+        return dict.fromkeys(("who", "known_who"), (0, self.world.num_drones - 1))
 
     def prepare(self) -> None:
         """See `Task.prepare`."""
@@ -261,7 +266,7 @@ class Loss(Task):
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, start, drone and time; see `Task.start`."""
-        start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.hanging)
+        start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.equilibrium)
         self.own.who[env] = rng.integers(self.world.num_drones)
         self.own.when[env] = rng.uniform(*self.options.loss_time)
         self.mask.lost[env], self.own.peak_tension[env], self.own.counted_tension[env] = False, 0.0, 0.0
@@ -272,3 +277,12 @@ class Loss(Task):
         """At rest throughout the last seconds, with a drone less, and never too large a tension."""
         rested = super().succeeded() & self.mask.lost.any(axis=1)
         return rested & (self.own.peak_tension <= self.options.success_tension)
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """See `Task.criteria`."""
+        bound = self.options.success_tension
+        return (
+            *super().criteria(),
+            Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False),
+            Criterion("drone_lost", CONDITION, lambda: np.asarray(~self.mask.lost.any(axis=1) * 1.0), throughout=False),
+        )

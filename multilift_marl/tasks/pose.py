@@ -8,17 +8,16 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import inlined, kernel
 from multilift_marl.config.config import Config
-from multilift_marl.config.validate import validate
-from multilift_marl.config.values import Float, Section, Shares
 from multilift_marl.control.cable_forces import WrenchDistribution, make_wrench_distribution
 from multilift_marl.control.formation import Goal
 from multilift_marl.errors import ConfigError
+from multilift_marl.kernels.jit import inlined, kernel
 from multilift_marl.math3d import matmul, matrow, rotation_vector, row, sub, transpose
-from multilift_marl.tasks.base import Kernels, Task
-from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import (
+from multilift_marl.mdp.criteria import Criterion
+from multilift_marl.mdp.initial_states import set_equilibrium
+from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.rewards import (
     RestBounds,
     Term,
     action_rate,
@@ -30,16 +29,19 @@ from multilift_marl.tasks.rewards import (
     spin,
     stillness,
 )
-from multilift_marl.tasks.starts import hang_team
-from multilift_marl.tasks.targets import Bounds, draw_plan, make_bounds
-from multilift_marl.tasks.trajectory import (
+from multilift_marl.planning.targets import Bounds, draw_plan, make_bounds
+from multilift_marl.planning.trajectory import (
     Plan,
     advance_plan,
     hold_plan_pose,
+    preview_plan,
     select_candidate,
     set_goal_from_plan,
     turn_team,
 )
+from multilift_marl.schema.validate import validate
+from multilift_marl.schema.values import Float, Section, Shares
+from multilift_marl.tasks.base import Kernels, Task
 
 
 class PoseOptions(Section):
@@ -54,7 +56,7 @@ class PoseOptions(Section):
     )
     target_seconds: Float = Field(4.0, gt=0, description="[s] until the next target")
     way_seconds: Float = Field(3.0, gt=0, description="[s] that the planned trajectory to a target takes")
-    plan: bool = Field(True, description="a trajectory to each target is planned and followed; False: the goal leaps")
+    plan: bool = Field(True, description="a trajectory to each target is planned and followed; false: the goal jumps")
     success_distance: Float = Field(0.05, gt=0, description="[m] payload within this of each target ...")
     success_angle: Float = Field(5.0, gt=0, description="[deg] ... and within this of its attitude ...")
     success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout its last seconds, or a shorter one's all")
@@ -86,13 +88,13 @@ class PoseSettings(NamedTuple):
 
 
 @kernel
-def start_at_first_pose(e, v, hanging):
+def start_at_first_pose(e, v, equilibrium):
     """Write a team at rest at the first pose of its plan; the next one is its goal."""
     plan, planned, still = v.own.plan, v.planned, (0.0, 0.0, 0.0)
-    hold_plan_pose(e, 0, plan, planned, v.rig, v.nominal)
-    hang_team(e, v, planned, hanging, (row(planned.position, e), matrow(planned.rotation, e)), still, still)
+    hold_plan_pose(e, 0, plan, planned, v.rig)
+    set_equilibrium(e, v, planned, equilibrium, (row(planned.position, e), matrow(planned.rotation, e)), still, still)
     plan.stage[e] = 0
-    set_goal_from_plan(e, 1, plan, v.goal, v.rig, v.nominal)  # last, since it shares the slot frames with the plan
+    set_goal_from_plan(e, 1, plan, v.goal, v.rig)  # last, since it shares the slot frames with the plan
     if not v.has_plan:
         for n in range(v.rig.slots.shape[0]):
             turn_team(e, n, plan.pose[e, 0, 3], v)
@@ -104,6 +106,7 @@ def note_reached(e, v):
     settings, stage = v.settings, v.own.plan.stage[e]
     begin = stage * settings.hold
     end = min(begin + settings.hold, settings.length)
+    # Time is a sum of steps: half a step less, for round-off.
     if v.time[e] > end - 0.5 * v.dt:
         v.own.reached[e, stage] = v.good_time[e] >= min(settings.success_seconds, end - begin) - 1e-9
 
@@ -172,6 +175,10 @@ class Pose(Task):
             return parts
         return tuple(part for part in parts if not part.name.startswith("planned"))
 
+    def count_limits(self) -> dict[str, tuple[int, int]]:
+        """Bound what kernels index by, see `Task`."""
+        return {"plan.stage": (0, self.own.plan.pose.shape[1] - 2)}
+
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, system, e, n = self.options, self.world.system, self.world.num_envs, self.world.num_drones
@@ -211,12 +218,30 @@ class Pose(Task):
             )
         if self.options.plan:
             select_candidate(env, self.view_for(select_candidate))
-        start_at_first_pose(env, self.view_for(start_at_first_pose), self.hanging)
+        start_at_first_pose(env, self.view_for(start_at_first_pose), self.equilibrium)
         self.own.reached[env] = False
+
+    def preview_targets(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the planned poses, without a plan the present target; see `Task.preview_targets`."""
+        if not self.options.plan:
+            return super().preview_targets(times)
+        position, rotation = np.zeros((*times.shape, 3)), np.zeros((*times.shape, 3, 3))
+        preview_plan(times, self.own.plan, self.settings.hold, self.settings.seconds, position, rotation)
+        return position, rotation
 
     def succeeded(self) -> np.ndarray:
         """Within the success region throughout the last second of every target."""
         return np.asarray(self.own.reached.all(axis=1))
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """See `Task.criteria`."""
+        return super().criteria()
+
+    def success_windows(self) -> tuple[tuple[float, float], ...]:
+        """Return the last seconds of every target; see `Task.success_windows`."""
+        option, hold, length = self.settings.success_seconds, self.settings.hold, self.settings.length
+        times = [(k * hold, min((k + 1) * hold, length)) for k in range(self.own.reached.shape[1])]
+        return tuple((end - min(option, end - begin), end) for begin, end in times)
 
     def in_error_window(self, time: float, length: float) -> bool:
         """Count the last second of every target."""

@@ -8,9 +8,8 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import drawing, inlined, kernel
-from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import place_formation
+from multilift_marl.kernels.jit import drawing, inlined, kernel
 from multilift_marl.math3d import (
     add,
     axis_angle,
@@ -28,13 +27,14 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.mdp.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
+from multilift_marl.mdp.initial_states import TargetOptions, check_heights, in_ball
+from multilift_marl.mdp.observations import Component, cable_vector
+from multilift_marl.mdp.rewards import RestBounds, Term, action_rate, attitude, distance, failure, stillness
+from multilift_marl.physical import GRAVITY
+from multilift_marl.schema.values import Float, Section
 from multilift_marl.sim.state import place_at_hook
 from multilift_marl.tasks.base import Kernels, Task
-from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
-from multilift_marl.tasks.observations import Component, cable_vector
-from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, attitude, distance, failure, stillness
-from multilift_marl.tasks.starts import TargetOptions, check_heights, in_ball
 
 
 class RecoverOptions(TargetOptions):
@@ -68,7 +68,7 @@ def _tilted(rng, angle, yaw):
 
 
 @drawing
-def _throw(e, rng, state, goal, rig, hanging, throw):
+def _throw(e, rng, state, goal, rig, throw):
     """Write a team whose cables hang slack, each drone somewhere near its slot's direction."""
     payload = add(row(goal.position, e), in_ball(rng, throw.radius))
     attitude = matrow(goal.rotation, e) if rig.is_point else _tilted(rng, 0.5 * throw.tilt, goal.yaw[e])
@@ -79,16 +79,17 @@ def _throw(e, rng, state, goal, rig, hanging, throw):
         anchor = mul(attitude, (rig.anchors[n, 0], rig.anchors[n, 1], rig.anchors[n, 2]))
         at_rest = add(row(goal.position, e), mul(matrow(goal.rotation, e), row(rig.anchors, n)))
         towards = unit(sub(vec(goal.slots, e, n), at_rest))
+        # asin 0.5 = 30°.
         towards = unit(add(towards, in_ball(rng, 0.5)))  # within 30° of the slot's
-        span = hanging.length[n] * rng.uniform(throw.slack, throw.taut)
+        span = rig.cable_length[n] * rng.uniform(throw.slack, throw.taut)
         put(state.drone_velocity[e, n], in_ball(rng, throw.speed))
         putmat(state.drone_rotation[e, n], _tilted(rng, throw.tilt, goal.drone_yaw[e] + rig.heading[n]))
-        place_at_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.constants.hooks)
+        place_at_hook(e, n, state, add(add(payload, anchor), scale(span, towards)), rig.hooks)
         state.drone_body_rates[e, n] = 0.0
 
 
 @drawing
-def _throw_as_crazymarl(e, rng, state, goal, hooks, hanging):
+def _throw_as_crazymarl(e, rng, state, goal, rig):
     """Write a team as CrazyMARL's sampler draws it (viktorlorentz/crazyMARL, crazymarl/utils/multi_quad_sampling.py,
     commit 8723b9a, and the reset of crazymarl/envs/multi_quad_env.py, commit 02d5761).
 
@@ -97,6 +98,8 @@ def _throw_as_crazymarl(e, rng, state, goal, hooks, hanging):
     19 cm apart and 3 cm from the load; velocities normal, 0.2 m/s and 20°/s; roll and pitch normal (10°), any heading.
     """
     count = state.drone_position.shape[1]
+    # Theirs: min_pz, min_qz. It draws a few teams more than needed and takes the first that are apart, or one that is
+    # not where none is; here a team is drawn until it is.
     low_load, low_drone = 0.0055, 0.008
     apart = False
     while not apart:
@@ -104,10 +107,11 @@ def _throw_as_crazymarl(e, rng, state, goal, hooks, hanging):
         payload = (rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), z)
         turned, apart = rng.uniform(-pi, pi), True
         for n in range(count):
-            span = clip(rng.normal(hanging.length[n], hanging.length[n] / 3.0), 0.05, hanging.length[n])
+            span = clip(rng.normal(rig.cable_length[n], rig.cable_length[n] / 3.0), 0.05, rig.cable_length[n])
             polar = rng.normal(0.25 * pi, 0.125 * pi)
             azimuth = turned + 2.0 * pi * n / count + rng.normal(0.0, pi / (count + 1))
             flat = span * sin(polar)
+            # Clipped after the distance is drawn: cables of drones near the ground are slacker than that.
             height = clip(payload[2] + span * cos(polar), low_drone, 3.0)
             put(
                 state.drone_position[e, n], (payload[0] + flat * cos(azimuth), payload[1] + flat * sin(azimuth), height)
@@ -121,12 +125,16 @@ def _throw_as_crazymarl(e, rng, state, goal, hooks, hanging):
     for n in range(count):
         tilt, limit = radians(10.0), radians(60.0)
         roll, pitch = clip(rng.normal(0.0, tilt), -limit, limit), clip(rng.normal(0.0, tilt), -limit, limit)
+        # Those that stand on the ground stand level.
         if state.drone_position[e, n, 2] < 0.02:
             roll, pitch = 0.0, 0.0
+        # Rz(yaw) Ry(pitch) Rx(roll), as their quaternion has it.
         level = matmul(axis_angle((0.0, 1.0, 0.0), pitch), axis_angle((1.0, 0.0, 0.0), roll))
         putmat(state.drone_rotation[e, n], matmul(rot_z(rng.uniform(-pi, pi)), level))
-        place_at_hook(e, n, state, vec(state.drone_position, e, n), hooks)
+        place_at_hook(e, n, state, vec(state.drone_position, e, n), rig.hooks)
         for k in range(3):
+            # Theirs draws all of these by one key: velocities are the same for all drones, and rates in proportion to
+            # them. Here all are independent.
             state.drone_velocity[e, n, k] = rng.normal(0.0, 0.2)
             state.drone_body_rates[e, n, k] = rng.normal(0.0, radians(20.0))
 
@@ -137,6 +145,7 @@ def _turn_formation(e, state, goal, rig):
     c, s = 0.0, 0.0
     for n in range(rig.slots.shape[0]):
         away = sub(vec(state.drone_position, e, n), row(state.payload_position, e))
+        # The mean of angles by their sines and cosines: their plain mean fails across ±180°.
         turned = atan2(away[1], away[0]) - rig.azimuth[n]
         c, s = c + cos(turned), s + sin(turned)
     putmat(goal.rotation[e], rot_z(atan2(s, c)))
@@ -168,7 +177,7 @@ def grace(e, n, v):
 @inlined
 def slack(e, n, v):
     """Own cable's natural length minus the distance it spans, over the length."""
-    return 1.0 - norm(cable_vector(e, n, v)) / v.nominal.length[n]
+    return 1.0 - norm(cable_vector(e, n, v)) / v.rig.cable_length[n]
 
 
 class Recover(Task):
@@ -185,6 +194,7 @@ class Recover(Task):
         "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
+    CAN_PLAN: ClassVar[bool] = False
     KERNELS: ClassVar[Kernels] = Kernels(plan=end_grace)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("grace", 1, "-", "-", "share of the time left in which tilt and cable angle are no failure", grace),
@@ -215,12 +225,12 @@ class Recover(Task):
         self.mask.ignored[env] = self._early
         throw = SlackStart(option.start_radius, radians(option.start_tilt), option.start_speed, *self._slack)
         if option.start == "slack":
-            _throw(env, rng, state, goal, self.rig, self.hanging, throw)
+            _throw(env, rng, state, goal, self.equilibrium, throw)
         else:
-            _throw_as_crazymarl(env, rng, state, goal, self.rig.constants.hooks, self.hanging)
+            _throw_as_crazymarl(env, rng, state, goal, self.equilibrium)
         if not self.rig.anchors.any():
             _turn_formation(env, state, goal, self.rig)
-        constants = self.hanging.constants
-        carried = constants.mass + mass / self.world.num_drones
-        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / constants.thrust_coefficient)[:, None]
+        rig = self.equilibrium
+        carried = rig.mass + mass / self.world.num_drones
+        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / rig.thrust_coefficient)[:, None]
         state.payload_body_rates[env] = 0.0

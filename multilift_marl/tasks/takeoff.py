@@ -8,13 +8,12 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import drawing, inlined
-from multilift_marl.config.values import Float, Section
 from multilift_marl.control.formation import place_formation
+from multilift_marl.kernels.jit import drawing, inlined
 from multilift_marl.math3d import add, clip, ease, matrow, put, putmat, rot_z, row, scale, sub, vec
-from multilift_marl.tasks.base import Kernels, Task
-from multilift_marl.tasks.failures import BELOW, CABLE, GROUND, LOAD_GROUND, ignore, payload_height
-from multilift_marl.tasks.ground import (
+from multilift_marl.mdp.criteria import Criterion, rest_criteria
+from multilift_marl.mdp.failures import BELOW, CABLE, GROUND, LOAD_GROUND, ignore, payload_height
+from multilift_marl.mdp.ground import (
     CARRIED,
     Ground,
     cable_chord,
@@ -28,8 +27,10 @@ from multilift_marl.tasks.ground import (
     scale_cable_force,
     set_resting_goal,
 )
-from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.rewards import RestBounds, Term, action_rate, is_at_rest
+from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.rewards import RestBounds, Term, action_rate, is_at_rest
+from multilift_marl.schema.values import Float, Section
+from multilift_marl.tasks.base import Kernels, Task
 
 RISE = (0.1, 1.6)  # begin and length of each phase [s], as of the next ones: drones rise,
 TIGHTEN = (1.7, 1.2)  # cables become taut,
@@ -109,6 +110,8 @@ def advance(e, v):
         # from its place on the ground: up first, inward faster and faster
         under = sub(vec(own.drone_place, e, n), add(vec(goal.slots, e, n), scale(-SLACK, chord)))
         put(goal.slots[e, n], add(slot, _stretched(under, 1.0 - risen[0] ** 2, 1.0 - risen[0])))
+        # Derivatives of 1 - s² and 1 - s: of the way from the ground alone. What tightening the cable adds is not fed
+        # forward.
         put(goal.slot_velocity[e, n], _stretched(under, -2.0 * risen[0] * risen[1], -risen[1]))
         curved = risen[1] ** 2 + risen[0] * risen[2]
         put(goal.slot_acceleration[e, n], _stretched(under, -2.0 * curved, -risen[2]))
@@ -183,6 +186,7 @@ class Takeoff(Task):
         "snatch": Term(-0.5, snatch),
         "action_rate": Term(-0.05, action_rate),
     }
+    CAN_PLAN: ClassVar[bool] = False
     KERNELS: ClassVar[Kernels] = Kernels(is_good=is_lifted, plan=advance, update=forget_peak)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component(
@@ -193,6 +197,10 @@ class Takeoff(Task):
         Component("climb_rate", 1, "world", "m/s", "vertical velocity of the target", climb_rate),
     )  # fmt: skip
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = EXTRA
+
+    def count_limits(self) -> dict[str, tuple[int, int]]:
+        """Bound what kernels index by, see `Task`."""
+        return {"stage": (RESTING, LIFTED)}
 
     def prepare(self) -> None:
         """See `Task.prepare`."""
@@ -216,6 +224,17 @@ class Takeoff(Task):
 
     def succeeded(self) -> np.ndarray:
         """At the final target throughout the last seconds, and never too large a tension."""
-        load = self.world.hidden_loads.payload_mass / self.world.system.payload_mass
-        gentle = self.world.stats.tension_max <= self.options.success_tension * self.view.resting_tension.max() * load
+        gentle = self.world.stats.tension_max <= self.options.success_tension * self._resting_tension()
         return gentle & super().succeeded()
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """See `Task.criteria`."""
+        bound, stats, lifted = self.options.success_tension, self.world.stats, self.KERNELS.is_good is is_lifted
+        found = rest_criteria(self.settings.bounds, self.errors, self.world.state) if lifted else ()
+        tension = Criterion("tension", bound, lambda: stats.tension_max / self._resting_tension() - bound, False)
+        return (*found, tension)
+
+    def _resting_tension(self) -> np.ndarray:
+        """Return the largest tension at rest with the true payload (E,) [N]."""
+        load = self.world.hidden_loads.payload_mass / self.world.system.payload_mass
+        return np.asarray(self.view.resting_tension.max() * load)

@@ -8,17 +8,17 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._jit import drawing, inlined, kernel
 from multilift_marl.config.config import Config
-from multilift_marl.config.validate import validate
-from multilift_marl.config.values import Choice, Float, Section, Span, Vector
 from multilift_marl.control.formation import place_formation, set_heading
 from multilift_marl.errors import ConfigError
+from multilift_marl.kernels.jit import drawing, inlined, kernel
 from multilift_marl.math3d import add, matrow, put, putmat, rot_z, row, scale, sub, vec
-from multilift_marl.tasks.base import Kernels, Task
-from multilift_marl.tasks.observations import Component
-from multilift_marl.tasks.path_file import load_path
-from multilift_marl.tasks.paths import (
+from multilift_marl.mdp.criteria import Criterion
+from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
+from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.rewards import Term, action_rate, attitude, distance, failure, tolerance, velocity
+from multilift_marl.planning.path_file import load_path
+from multilift_marl.planning.paths import (
     CIRCLE,
     FIGURE8,
     FILE,
@@ -37,9 +37,10 @@ from multilift_marl.tasks.paths import (
     place,
     set_goal,
 )  # fmt: skip
-from multilift_marl.tasks.rewards import Term, action_rate, attitude, distance, failure, tolerance, velocity
-from multilift_marl.tasks.spline import NO_FILE, spline_yaw
-from multilift_marl.tasks.starts import hang_team, in_ball
+from multilift_marl.planning.spline import NO_FILE, spline_yaw
+from multilift_marl.schema.validate import validate
+from multilift_marl.schema.values import Between, Choice, Float, Section, Span, Vector
+from multilift_marl.tasks.base import Kernels, Task
 
 AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
 _DRAWN = 400  # points of a path that is drawn
@@ -59,6 +60,12 @@ class TrackOptions(Section):
     file: str | None = Field(None, description="of path=file: CSV, .npy or .npz with t [s], x, y, z [m], yaw [rad]")
     file_spacing: Float = Field(
         0.1, ge=0, description="[s] closer rows of a file are smoothed and thinned out to this; 0: none are"
+    )
+    file_ramp: Annotated[Float, Between(0, 60, "s")] = Field(
+        0.0, description="[s] in which the target of a file gathers its speed, and loses it at the end; 0: as written"
+    )
+    file_offset: Annotated[Vector, Between(-1e6, 1e6, "m")] = Field(
+        (0.0, 0.0, 0.0), description="[m] added to the positions of a file"
     )
     speed: Span = Field((1.0, 1.0), description="[m/s] peak speed v of figure8, lemniscate and random, or its range")
     acceleration: Span = Field((0.5, 0.5), description="[m/s²] their peak acceleration a, or its range")
@@ -108,6 +115,7 @@ def _turn_target(e, t, table, goal, rig):
     put(goal.angular_velocity[e], (0.0, 0.0, w))
     goal.drone_yaw_rate[e] = w
     for n in range(rig.slots.shape[0]):  # derivatives of a level arm that turns about the vertical
+        # level' = w across, across' = -w level.
         arm = sub(vec(goal.slots, e, n), row(goal.position, e))
         level, across = (arm[0], arm[1], 0.0), (-arm[1], arm[0], 0.0)
         put(goal.slot_velocity[e, n], scale(w, across))
@@ -130,7 +138,7 @@ def aim(e, t, v):
 
 
 @drawing
-def start_on_path(e, rng, v, hanging):
+def start_on_path(e, rng, v, equilibrium):
     """Write goal and team at the start of the path, with the target's velocity."""
     goal, path = v.goal, v.own.path
     put(path.centre[e], (0.0, 0.0, 0.0))
@@ -145,7 +153,7 @@ def start_on_path(e, rng, v, hanging):
     aim(e, 0.0, v)
     moved = in_ball(rng, v.settings.radius)
     pose = add(row(goal.position, e), moved), matrow(goal.rotation, e)
-    hang_team(e, v, goal, hanging, pose, row(goal.velocity, e), moved)
+    set_equilibrium(e, v, goal, equilibrium, pose, row(goal.velocity, e), moved)
 
 
 @inlined
@@ -163,7 +171,7 @@ def preview_target(e, v):
 
 
 @inlined
-def note_worst(e, v):
+def update_max_error(e, v):
     """Note the largest distance from the target."""
     v.own.worst[e] = max(v.own.worst[e], v.errors.distance[e])
 
@@ -217,6 +225,17 @@ def target_ahead_3(e, n, v):
 
 
 @kernel
+def _preview(times, path, table, position, rotation):
+    """Write places (E, M, 3) and attitudes (E, M, 3, 3) of the targets at times (E, M)."""
+    for e in range(times.shape[0]):
+        for m in range(times.shape[1]):
+            t = max(times[e, m], 0.0)
+            put(position[e, m], place(e, t, path, table))
+            yaw = spline_yaw(table, t)[0] if path.kind[e] == FILE else path.heading[e]
+            putmat(rotation[e, m], rot_z(yaw))
+
+
+@kernel
 def _trace(e, seconds, path, table, points):
     for i in range(points.shape[0]):
         put(points[i], place(e, seconds * i / (points.shape[0] - 1), path, table))
@@ -254,7 +273,7 @@ class Track(Task):
         "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
-    KERNELS: ClassVar[Kernels] = Kernels(never, plan=advance_target, update=note_worst, preview=preview_target)
+    KERNELS: ClassVar[Kernels] = Kernels(never, plan=advance_target, update=update_max_error, preview=preview_target)
     EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")
 
@@ -266,13 +285,20 @@ class Track(Task):
             return parts
         return tuple(part for part in parts if not part.name.startswith("target_ahead"))
 
+    def count_limits(self) -> dict[str, tuple[int, int]]:
+        """Bound what kernels index by, see `Task`."""
+        return {"path.kind": (0, len(PATHS) - 1)}
+
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, world, e = self.options, self.world, self.world.num_envs
         seconds = self.config.env.episode_seconds
         self.rmse_after = option.rmse_from if option.rmse_from < seconds else 0.0
         file = self._file()
-        table = load_path(file, option.file_spacing, world.system, self.config.randomization) if file else NO_FILE
+        table = NO_FILE
+        if file:
+            smoothing = option.file_spacing, option.file_ramp, option.file_offset
+            table = load_path(file, *smoothing, seconds, world.system, self.config.randomization)
         self.own = TrackArrays(Path.zeros(e), np.zeros(e), np.zeros((e, len(AHEAD), 3)))
         self.settings = TrackSettings(table, option.height, option.start_radius)
 
@@ -309,12 +335,19 @@ class Track(Task):
             path.curve[env] = draw_curve(rng, np.array(option.room))
             fastest, hardest = largest_rates(path.curve[env])
             path.rate[env] = min(v / fastest, sqrt(a / hardest))
-        start_on_path(env, rng, self.view_for(start_on_path), self.hanging)
+        start_on_path(env, rng, self.view_for(start_on_path), self.equilibrium)
         self.own.worst[env] = 0.0
+
+    def preview_targets(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the path's places and the target's headings; see `Task.preview_targets`."""
+        position, rotation = np.zeros((*times.shape, 3)), np.zeros((*times.shape, 3, 3))
+        _preview(times, self.own.path, self.settings.table, position, rotation)
+        return position, rotation
 
     def target_path(self, env: int) -> np.ndarray:
         """Return the path, one round of it if it repeats; see `Task.target_path`."""
         path, table, length = self.own.path, self.settings.table, self.config.env.episode_seconds
+        # A helix goes up and down by the sine of a quarter of its angle: four rounds until it repeats.
         points, kind = np.zeros((_DRAWN, 3)), path.kind[env]
         turns = 4 if kind == HELIX else 1
         if kind == FILE:
@@ -327,6 +360,15 @@ class Track(Task):
     def succeeded(self) -> np.ndarray:
         """Never too far from the target."""
         return self.own.worst <= self.options.success_distance
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """See `Task.criteria`."""
+        bound = self.options.success_distance
+        return (Criterion("distance_m", bound, lambda: self.own.worst - bound, throughout=False),)
+
+    def success_windows(self) -> tuple[tuple[float, float], ...]:
+        """Return none: all of the episode counts."""
+        return ()
 
 
 def _draw(rng: np.random.Generator, span: tuple[float, float]) -> float:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from multilift_marl.errors import nearest, pip_install
+from multilift_marl._interrupt import end_quiet_import
+from multilift_marl.command import make_folder
+from multilift_marl.errors import ConfigError, nearest, pip_install
 from multilift_marl.validation import air, bodies, cables, conservation, flight, symmetry
+from multilift_marl.validation.document import write_document
 from multilift_marl.validation.experiment import Experiment, Result
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -33,21 +35,22 @@ EXPERIMENTS: dict[str, Experiment] = {
     "turbulence": air.turbulence_spectra,
     "gust": air.gust,
     "wash": air.wash,
+    "inflow": air.inflow,
     "ground_effect": air.ground_effect,
     "flight": flight.flight,
     "flight_in_wind": flight.flight_in_wind,
 }
-MARKER = "<!-- results -->\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run experiments; return 0 if all passed, 1 if one failed, 2 for wrong arguments, 130 after Ctrl-C."""
+    end_quiet_import()
     parser = argparse.ArgumentParser(prog="python -m multilift_marl.validation", description=__doc__)
     parser.add_argument("--only", metavar="NAME", help=f"one experiment: {', '.join(EXPERIMENTS)}")
     parser.add_argument("--fast", action="store_true", help="shorter flights, under a minute in all")
     parser.add_argument("--out", type=Path, default=Path("validation"), help="folder for results (default: validation)")
     parser.add_argument(
-        "--document", type=Path, help="also write the results into this Markdown file, after its marker"
+        "--document", type=Path, help="also record the results beside this Markdown file, and their table in it"
     )
     given = parser.parse_args(arguments)
     if given.only is not None and given.only not in EXPERIMENTS:
@@ -55,6 +58,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     if given.document is not None and not given.document.is_file():
         print(f"error: there is no {given.document}; give a Markdown file that exists", file=sys.stderr)
+        return 2
+    try:
+        make_folder(given.out, "--out <folder>")
+        if given.document is not None:
+            given.document.open("r+b").close()
+    except (ConfigError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
         return 2
     try:
         import matplotlib  # noqa: F401  (the experiments draw with it)
@@ -85,7 +95,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def write(results: dict[str, Result], out: Path) -> list[dict[str, Any]]:
     """Write validation.json and the plots into a folder, and return the rows."""
-    out.mkdir(parents=True, exist_ok=True)
     rows = [row.as_dict() for result in results.values() for row in result.rows]
     text = json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False)
     (out / "validation.json").write_text(text + "\n", encoding="utf-8")
@@ -103,26 +112,6 @@ def format_table(rows: list[dict[str, Any]]) -> str:
         cells = [row["experiment"], row["quantity"], *numbers, "yes" if row["pass"] else "NO"]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def write_document(path: Path, results: dict[str, Result], out: Path) -> None:
-    """Replace everything after the line "<!-- results -->" of a Markdown file by tables and pictures.
-
-    Pictures are copied from the folder `out` to images/<name of the file> beside it.
-    """
-    images = path.parent / "images" / path.stem
-    images.mkdir(parents=True, exist_ok=True)
-    passed = [row.passed for result in results.values() for row in result.rows]
-    parts = [f"{sum(passed)} of {len(passed)} rows pass."]
-    for name, result in results.items():
-        about = " ".join((EXPERIMENTS[name].__doc__ or "").split("\n\n")[0].split())
-        command = f"python -m multilift_marl.validation --only {name}"
-        parts += [f"### {name}", about, f"```\n{command}\n```", format_table([row.as_dict() for row in result.rows])]
-        for plot in result.plots:
-            shutil.copyfile(out / f"{plot.name}.png", images / f"{plot.name}.png")
-            parts.append(f"![{plot.caption}](images/{path.stem}/{plot.name}.png)\\\n*{plot.caption}*")
-    head = path.read_text(encoding="utf-8").partition(MARKER)[0]
-    path.write_text(head + MARKER + "\n" + "\n\n".join(parts) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,15 +1,17 @@
-"""Turbulence, gusts, rotor wash, ground effect and roll moments against their formulas (docs/air.md)."""
+"""Turbulence, gusts, rotor wash, inflow and ground effect against their formulas (docs/air.md)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
+from multilift_marl.physical import AIR_DENSITY, GRAVITY, LIFT_SLOPE
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import AIR_DENSITY, GRAVITY
+from multilift_marl.rig.vehicle import Vehicle
 from multilift_marl.sim.air import GROWTH, SPREADING, ground_gain, make_air, wash_at
 from multilift_marl.sim.gusts import advance_turbulence, dryden, start_turbulence, turbulence
 from multilift_marl.sim.state import Air
@@ -64,6 +66,7 @@ def correlation(component: str, height: float, lag: float | np.ndarray) -> np.nd
 def spectrum(component: str, height: float, frequency: np.ndarray) -> np.ndarray:
     """Return MIL-F-8785C's one-sided spectral density of a component [m²/s² per Hz] at a frequency [Hz]."""
     sigma, seconds = _scale(component, height)
+    # Each integrates to σ² over the positive frequencies.
     x = (2 * np.pi * frequency * seconds) ** 2
     shape = 2 / (1 + x) if component == "u" else (1 + 3 * x) / (1 + x) ** 2
     return 2 * sigma**2 * seconds * shape
@@ -101,6 +104,7 @@ def _add_spectra(result: Result, height: float, fast: bool) -> None:
     window = np.hanning(steps)[:, None]
     interval = every * timestep
     power = np.abs(np.fft.rfft(samples * window, axis=1)) ** 2
+    # Periodogram, one-sided, over the mean square of the window.
     density = 2 * interval * power.mean(axis=0) / (window**2).sum()
     frequency = np.fft.rfftfreq(steps, interval)
     edges = np.geomspace(0.02, 5.0, 25)
@@ -207,6 +211,7 @@ def wash(fast: bool) -> Result:
     result.compare("wash", quantity, far, -velocity(0.0, 0.0, 20.0)[2], 0.01)
     world.step(np.full((1, 1, 4), thrust / 4))
     square = (2.0 * GROWTH) ** 2 + system.payload_drag_area / np.pi  # of a Gaussian jet, averaged over the payload
+    # Four jets, each an arm's length from the middle.
     squared = thrust / (AIR_DENSITY * np.pi * square) * np.exp(-(vehicle.arm**2) / square)
     pushed = 0.5 * AIR_DENSITY * system.payload_drag_area * squared / system.payload_mass
     found = -world.state.payload_velocity[0, 2] / system.timestep - GRAVITY
@@ -217,6 +222,81 @@ def wash(fast: bool) -> Result:
     for depth in (0.3, 1.0, 2.0, 4.0):
         line = [-velocity(x / 2**0.5, x / 2**0.5, depth)[2] for x in across]
         plot.add(f"{depth:g} m below", across, np.array(line))
+    result.plots.append(plot)
+    return result
+
+
+def blade_elements(vehicle: Vehicle, speed: float, climb: float, twist: float = -0.2) -> tuple[float, float]:
+    """Return the thrust of a climbing rotor [N] and the velocity of the air through its disc [m/s].
+
+    Elements along blades of constant chord, summed, and the momentum of the air that they drive, solved by bisection.
+
+    Args:
+        vehicle: whose rotor it is; in still air its thrust is b ω², by which the pitch of its blades is chosen.
+        speed: of the rotor [rad/s].
+        climb: velocity of the rotor through the air along its thrust [m/s].
+        twist: of a blade from root to tip [rad]; the thrust does not depend on it.
+    """
+    share = (np.arange(2000) + 0.5) / 2000  # of the radius, where elements are
+    tangential = speed * vehicle.rotor_radius * share
+    chords = vehicle.rotor_solidity * np.pi * vehicle.rotor_radius  # of all blades [m]
+    disc = 2 * AIR_DENSITY * np.pi * vehicle.rotor_radius**2
+    still = vehicle.thrust_coefficient * speed**2
+
+    def thrust(pitch: float, through: float) -> float:
+        # Small angles: the air through the disc lowers the angle of attack by its ratio to the blade's speed.
+        angle = pitch + twist * share - through / tangential
+        lift = 0.5 * AIR_DENSITY * tangential**2 * chords * LIFT_SLOPE * angle
+        return float(lift.mean() * vehicle.rotor_radius)
+
+    pitch = _bisect(lambda angle: thrust(angle, np.sqrt(still / disc)) - still, -3.0, 3.0)
+    through = _bisect(lambda w: disc * w * (w - climb) - thrust(pitch, w), max(0.5 * climb, 0.0), 100.0)
+    return thrust(pitch, through), through
+
+
+def _bisect(f: Callable[[float], float], low: float, high: float) -> float:
+    """Return where f, which rises, is zero."""
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if f(middle) < 0 else (low, middle)
+    return low
+
+
+def inflow(fast: bool) -> Result:
+    """Thrust at constant rotor speed in a climb, from a drone's acceleration, against blade elements and momentum."""
+    result = Result()
+    caption = "Thrust at the rotor speed of hover over the speed of climb, or of air from above."
+    title = "thrust in a climb"
+    plot = Plot("inflow", title, "climb [m/s]", "thrust over thrust in still air", caption=caption)
+    for preset in ("falcon", "hummingbird", "crazyflie_id"):
+        still_drag = {"vehicle__drag": [0.0, 0.0, 0.0]}
+        system = _system(vehicle__preset=preset, wind__inflow=True, **still_drag)
+        vehicle = system.vehicle
+        hover = vehicle.mass * GRAVITY
+        speed = float(np.sqrt(hover / 4 / vehicle.thrust_coefficient))
+        climbs = np.array([-2.0, -0.001, 0.001, 2.0, 4.0, 7.0])
+        found = []
+        for climb in climbs:
+            world = _apart(system)
+            world.state.drone_velocity[0, 0, 2] = climb
+            world.load(np.ones(1, bool))
+            world.step(np.full((1, 1, 4), hover / 4))
+            gained = (world.state.drone_velocity[0, 0, 2] - climb) / system.timestep
+            found.append(1 + gained / GRAVITY)
+        theory = np.array([blade_elements(vehicle, speed, climb)[0] for climb in climbs]) / (hover / 4)
+        for climb, expected, simulated in zip(climbs, theory, found, strict=True):
+            if abs(climb) > 0.01:
+                quantity = f"thrust in a climb of {climb:g} m/s over that at rest, relative error"
+                result.compare(f"inflow, {preset}", quantity, float(expected), simulated, 1e-4)
+        induced = np.sqrt(hover / 4 / (2 * AIR_DENSITY * np.pi * vehicle.rotor_radius**2))
+        lift = vehicle.rotor_solidity * LIFT_SLOPE / 4
+        slope = -lift / (4 * induced / (speed * vehicle.rotor_radius) + lift) / induced
+        steepness = (found[2] - found[1]) / 0.002
+        result.compare(f"inflow, {preset}", "slope at hover [s/m], relative error", float(slope), steepness, 1e-4)
+        fine = np.linspace(-2.0, 7.0, 19)
+        curve = np.array([blade_elements(vehicle, speed, climb)[0] for climb in fine]) / (hover / 4)
+        plot.add(preset, climbs, np.array(found))
+        plot.add("" if preset != "falcon" else "blade elements and momentum", fine, curve, theory=True)
     result.plots.append(plot)
     return result
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
+from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables.massless import IMPEDANCE, limit_solref
 from multilift_marl.sim.scene import set_options
 from multilift_marl.sim.world import World
@@ -87,6 +87,7 @@ def second_order(mass: float, stiffness: float, damping: float, t: np.ndarray) -
     """Return the depth (T,) of a mass let go on a spring and damper at natural length, m ẍ = m g - k x - c ẋ."""
     rest = mass * GRAVITY / stiffness
     roots = np.roots([1, damping / mass, stiffness / mass]).astype(complex)
+    # x = rest + Σ w e^(root t) with x = ẋ = 0 at first.
     weights = np.linalg.solve(np.stack([np.ones(2), roots]), [-rest, 0])
     return rest + np.real(weights @ np.exp(roots[:, None] * t))
 
@@ -337,6 +338,7 @@ def bounce(system: System, speed: float) -> float:
     k = system.cable_stiffness[0]
     c = system.cable_damping[0]
     slow, fast = np.roots([m * p / (m + p), c, k])[::-1]
+    # (k + c s) e^(s t) = (k + c f) e^(f t), with the slow and the fast root s and f.
     leave = np.log((k + c * fast) / (k + c * slow)) / (slow - fast)
     return float(speed * (slow * np.exp(slow * leave) - fast * np.exp(fast * leave)) / (slow - fast))
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
 from multilift_marl.sim.world import REST_HEIGHT, World
 
 ROPE = 0.01  # [kg/m]
@@ -37,8 +37,8 @@ def hanging_chain(
         "env.num_drones": cables, "cable.model": "chain", "cable.length": 1.0, "cable.angle": float(np.rad2deg(angle)),
         "cable.density": ROPE, "cable.segments": SEGMENTS, "cable.bending_damping": 0.0, "payload.shape": "point",
         "payload.mass": mass, "payload.drag_area": 0.0, "vehicle.mass": _ANCHOR_MASS,
-        "vehicle.rotor_thrust_max": 100 * _ANCHOR_MASS, "vehicle.inertia": (_ANCHOR_MASS,) * 3,
-        "vehicle.drag": (0.0, 0.0, 0.0), "vehicle.rotor_inertia": 0.0,
+        "vehicle.inertia": (_ANCHOR_MASS,) * 3, "vehicle.rotor_thrust_max": 10 * _ANCHOR_MASS,
+        "vehicle.thrust_coefficient": 1.0, "vehicle.drag": (0.0, 0.0, 0.0), "vehicle.rotor_inertia": 0.0,
         "sim.timestep": timestep, "sim.control_hz": 1 / timestep,
     }  # fmt: skip
     system = load_config("hover", values | {key.replace("__", "."): value for key, value in overrides.items()}).system
@@ -98,6 +98,7 @@ def straight_chain(mass: float, stiffness: float, damping: float, gravity: float
     n = SEGMENTS
     masses = np.full(n, ROPE / (n - 1))  # of the nodes between the segments
     masses[-1] = mass
+    # Fixed above, free below.
     springs = np.diag(np.r_[np.full(n - 1, 2.0), 1.0]) - np.eye(n, k=1) - np.eye(n, k=-1)
     rest = np.linalg.solve(n * stiffness * springs, gravity * masses)
     inverse = 1 / masses[:, None]
@@ -105,6 +106,7 @@ def straight_chain(mass: float, stiffness: float, damping: float, gravity: float
         [[np.zeros((n, n)), np.eye(n)], [-n * stiffness * springs * inverse, -n * damping * springs * inverse]]
     )
     propagator = exponential(flow * t[0])
+    # Counted from the equilibrium, `rest` below the natural length.
     state = np.r_[-rest, np.zeros(n)]
     depth = []
     for _ in t:
@@ -148,6 +150,7 @@ def inclined_chains(
             speed = velocity + 0.5 * change
             force, by_place, by_speed = _cable_forces(middle, speed, top, link, n * stiffness, n * damping)
             gap = (masses * change - step * (force - masses * [0, GRAVITY])).ravel()
+            # A change of velocity moves the middle by h/4 of it, and the velocity there by half of it.
             slope = np.diag(masses.ravel()) + step * (0.25 * step * by_place + 0.5 * by_speed)
             correction = np.zeros(2 * n)
             correction[free] = np.linalg.solve(slope[np.ix_(free, free)], gap[free])
@@ -176,6 +179,7 @@ def _cable_forces(
     total = force.copy()
     total[1:] -= force[:-1]
     outer = along[:, :, None] * along[:, None, :]
+    # A tense link that turns resists by T/l.
     across = (tension / size)[..., None] * (np.eye(2) - outer)
     by_place, by_speed = np.zeros((2, n, 2, n, 2))
     for blocks, sums in ((stiffness * outer + across, by_place), (damping * outer, by_speed)):

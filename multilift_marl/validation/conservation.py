@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
 from multilift_marl.sim.contact import APART, search_contacts
 from multilift_marl.sim.state_io import body_dof
 from multilift_marl.sim.world import World
@@ -51,6 +51,7 @@ def totals(world: World, env: int = 0) -> Totals:
         points = world.cable_points(env, n)
         links = int(system.cable_segments[n])
         stretch = np.linalg.norm(np.diff(points, axis=0), axis=1) - p.cable_length[env, n] / links
+        # Links of chains resist being pushed together, massless cables do not.
         stretch = stretch if world.nodes is not None else np.maximum(stretch, 0.0)
         stored += 0.5 * links * p.cable_stiffness[env, n] * float((stretch**2).sum())
         if world.nodes is not None:
@@ -214,7 +215,7 @@ def massless_balance(team: Team, seconds: float) -> tuple[float, float]:
     A step changes velocities at the place and attitude where it began, so the balance is taken there. The gyroscopic
     torque enters as the integrator takes it: with its value at the start of the step, and with its linear change over
     the step as well for a body without a stretched cable ("Gyroscopic derivatives for free bodies" in MuJoCo's
-    computation chapter).
+    computation chapter), less what `sim/rotation.py` adds to make a midpoint rule of it.
     """
     (world, steer), worst = take_off(team), np.zeros(2)
     system, h = world.system, world.system.timestep
@@ -230,7 +231,8 @@ def massless_balance(team: Team, seconds: float) -> tuple[float, float]:
         span = np.linalg.norm(r[1:] - r[0] - system.anchors @ attitude[0].T, axis=1)
         tied = span > system.cable_length
         free = np.concatenate([[not tied.any()], ~tied])[:, None]
-        gyroscopic = np.cross(w, inertia * w) + free * (np.cross(turned, inertia * w) + np.cross(w, inertia * turned))
+        gyroscopic = np.cross(w, inertia * w) - world.cables.gyroscopic[0]
+        gyroscopic += free * (np.cross(turned, inertia * w) + np.cross(w, inertia * turned))
         linear = (mass[:, None] * pushed - h * force).sum(axis=0)
         spin = np.einsum("nij,nj->i", attitude, inertia * turned - h * (torque - gyroscopic))
         angular = np.cross(r, mass[:, None] * pushed - h * force).sum(axis=0) + spin
@@ -271,14 +273,15 @@ def momentum_drift(team: Team, seconds: float) -> np.ndarray:
 def loads(world: World) -> tuple[np.ndarray, np.ndarray]:
     """Return force (1 + N, 3) [N] and torque (1 + N, 3) [N m] on payload and drones in the last step.
 
-    The torques are in the frames of the bodies. What chains add for MuJoCo is taken off again.
+    The torques are in the frames of the bodies. What cable models add for MuJoCo is taken off again.
     """
     shard = world.shards[0]
     first = shard.rows.force + np.array([body_dof(b, shard.rows) for b in range(1 + world.num_drones)])
     applied = shard.rows.state[0][first[:, None] + np.arange(6)]
     if world.nodes is not None:
         applied = applied - world.cables.motion.impulse[0] / world.system.timestep
-    return applied[:, :3], applied[:, 3:]
+        return applied[:, :3], applied[:, 3:]
+    return applied[:, :3], applied[:, 3:] - world.cables.gyroscopic[0]
 
 
 def _masses(world: World) -> tuple[np.ndarray, np.ndarray]:

@@ -12,8 +12,8 @@ from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rej
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import fly
+from multilift_marl.physical import AIR_DENSITY
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import AIR_DENSITY
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Plot, Result, Row
@@ -93,7 +93,7 @@ class Flight(NamedTuple):
     tension: np.ndarray
     """(T, N) of the first team [N]."""
     yaw_error: np.ndarray
-    """(T, N) of the first team [deg]."""
+    """(T, N) of the first team [deg]: of ψ = atan2(-R01, R11), which eq 29 prescribes, not of atan2(R10, R00)."""
     payload: np.ndarray
     """(T, 2, 3) of both teams [m]."""
 
@@ -241,6 +241,8 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
     gains = make_gains(config.control, system)
     rejection = None if kind == "none" else make_rejection(config.control, system, gains, dt)
     gains = gains._replace(load_share=np.zeros(system.num_drones))  # the cable forces hold the load's inertia
+    if rejection is not None:
+        rejection = rejection._replace(gains=gains)
     payload = []
     drones = []
     tension = []
@@ -257,7 +259,7 @@ def fly_rig(rig: str, plan: Plan, **overrides: Any) -> Flight:
             world.thrust[:] = 0.0  # at rest the rotors idle
         else:
             if rejection is not None:
-                REJECTIONS[kind](0, 2, state, reference, cable_force, disturbance, gains, rejection)
+                REJECTIONS[kind](0, 2, state, reference, cable_force, disturbance, rejection)
                 cable_force = disturbance.cable_force
             fly(0, 2, state, reference, cable_force, world.thrust, gains)
         world.step(world.thrust, system.control_interval)

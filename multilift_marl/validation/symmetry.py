@@ -13,13 +13,13 @@ from multilift_marl.control.formation import (
     Goal,
     Reference,
     Smoothing,
-    make_rig,
     place_formation,
     smooth,
     start_reference,
 )
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import fly
+from multilift_marl.rig.constants import make_rig
 from multilift_marl.sim.world import World
 from multilift_marl.validation.experiment import Plot, Result
 
@@ -193,6 +193,7 @@ def mirrored(team: Team) -> Team:
     """Return the team behind a mirror in the x-z plane: y, the rotors' sense and all rotation reversed."""
     m = _MIRROR
     return replace(
+        # Body rates are an axial vector, of which a mirror reverses the other components: -M Ω.
         team, anchors=team.anchors @ m, middle=m @ team.middle, azimuth=-team.azimuth, spin=-team.spin,
         wind=m @ team.wind, force=m @ team.force, target=m @ team.target, yaw=-team.yaw,
         position=team.position @ m, rotation=m @ team.rotation @ m, velocity=team.velocity @ m, rates=-team.rates @ m,

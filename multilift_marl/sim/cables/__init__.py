@@ -1,6 +1,6 @@
 """Cable models by name: modules with the same functions, those of `CableModel`.
 
-A model of one's own is a module here, a line in `CABLE_MODELS` and its name in `config/schema.py`.
+A model of one's own is a module here, a line in `CABLE_MODELS` and its name in `schema/sections.py`.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class CableModel(Protocol):
 
     def bind_steps(
         self, batch: Batch, rows: Rows, data: SimData, cables: Any
-    ) -> tuple[Callable[[], None] | None, Callable[[], None]]:
-        """Return what to call before MuJoCo's step of a batch, if anything, and what reads the state after it."""
+    ) -> tuple[Callable[[], None], Callable[[], None]]:
+        """Return what to call before MuJoCo's step of a batch, and what reads the state after it."""
 
     def write_state(self, rows: Rows, mask: np.ndarray, data: SimData, cables: Any) -> None:
         """Write the state of the environments in `mask` (E,) into rows, and start their statistics anew."""

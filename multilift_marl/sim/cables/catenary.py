@@ -6,7 +6,7 @@ from math import cos, sin
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, cross, dot, norm, put, row, scale, sub, unit
 
 SLACK = 0.98  # [-] of its length: a chain whose ends are closer is laid in an arc, else it hangs by its weight
@@ -26,6 +26,8 @@ def cable_end(direction, tension, length, stiffness, segments, weight):
         return scale(length + tension / stiffness, direction)
     end = (0.0, 0.0, 0.0)
     for j in range(segments):
+        # The nodes between segments weigh weight/(segments - 1) each: the lowest segment carries half less than the
+        # middle, the topmost half more.
         force = add(scale(tension, direction), (0.0, 0.0, weight * (j / (segments - 1) - 0.5)))
         size = norm(force)
         end = add(end, scale((length / size + 1.0 / stiffness) / segments, force))
@@ -92,10 +94,12 @@ def _complementary(chord, force, length, stiffness, weight, n):
     for j in range(n):
         cable_force = add(force, (0.0, 0.0, j * weight))
         size = max(norm(cable_force), 1e-9)
+        # d/dF of l |F| + |F|²/2k is F (l/|F| + 1/k), the segment that F stretches: the gradient is -gap.
         energy += length * size + 0.5 * size * size / stiffness
         gap = sub(gap, scale(length / size + 1.0 / stiffness, cable_force))
         flat = length / size + 1.0 / stiffness
         bend = length / size**3
+        # Its Hessian, the sum of (l/|F| + 1/k) 1 - l F Fᵀ/|F|³: flexibility across a segment, 1/k along it.
         xx += flat - bend * cable_force[0] * cable_force[0]
         yy += flat - bend * cable_force[1] * cable_force[1]
         zz += flat - bend * cable_force[2] * cable_force[2]
@@ -114,6 +118,8 @@ def _hang_slack(chord, distance, length, links):
     if norm(below) < 1e-3:
         below = sub((1.0, 0.0, 0.0), scale(along[0], along))
     below = unit(below)
+    # n links of length l on a circle, turned by b from one to the next, span l sin(n b/2)/sin(b/2): bisected for b,
+    # from a straight chain to one that closes on itself.
     low = 1e-9
     high = 2.0 * np.pi / n
     for _ in range(60):
@@ -123,6 +129,7 @@ def _hang_slack(chord, distance, length, links):
         else:
             high = bend
     for j in range(n):
+        # From the first link, which leads below, to the last, which leads up to the chord's end.
         angle = (0.5 * (n - 1) - j) * bend
         put(links[j], add(scale(cos(angle), along), scale(sin(angle), below)))
         links[j, 3] = 0.0

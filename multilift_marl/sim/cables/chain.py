@@ -6,7 +6,7 @@ in MuJoCo, as with massless cables. `chain_dynamics` advances nodes and bodies t
 1. `apply_loads` writes the loads of the physics step into `batch.state`.
 2. `advance_chains` moves the nodes, and copies of the bodies, through the step, and adds each cable's mean force.
 3. MuJoCo steps, for contact.
-4. `read_state` takes the bodies from `advance_chains`, and where they touch something what contact changes.
+4. `read_state` takes the bodies from `advance_chains`, and where they hit something it repeats that with the impact.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from multilift_marl._jit import bind, kernel
+from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import (
     IDENTITY,
     add,
@@ -29,18 +29,18 @@ from multilift_marl.math3d import (
     matrow,
     mul,
     put,
-    putmat,
     row,
     scale,
     sub,
     vec,
 )
+from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.system import System
-from multilift_marl.rig.vehicles import GRAVITY
 from multilift_marl.sim.cables import catenary
 from multilift_marl.sim.cables.catenary import hang
 from multilift_marl.sim.cables.chain_arrays import Chain, Motion, Nodes, Workspace, largest_substep
-from multilift_marl.sim.cables.chain_dynamics import advance_chains, turned
+from multilift_marl.sim.cables.chain_contact import add_contact
+from multilift_marl.sim.cables.chain_dynamics import advance_chains
 from multilift_marl.sim.cables.common import (
     MAX_RATE,
     MAX_SPEED,
@@ -52,7 +52,7 @@ from multilift_marl.sim.cables.common import (
 )
 from multilift_marl.sim.parameters import Inertias, Parameters
 from multilift_marl.sim.state import SimData
-from multilift_marl.sim.state_io import Rows, body_dof, read_payload, write_bodies
+from multilift_marl.sim.state_io import Rows, read_payload, write_bodies
 
 SLACK = catenary.SLACK
 
@@ -74,6 +74,7 @@ def make_cables(system: System, parameters: Parameters, inertias: Inertias) -> C
         segments=system.cable_segments,
         length=np.zeros((e, n)),
         stiffness=np.zeros((e, n)),
+        # Dampers and springs of links in series: n times those of the whole cable each.
         damping=system.cable_segments * system.cable_damping,
         node_mass=np.zeros((e, n)),
         bending_stiffness=system.bending_stiffness,
@@ -94,6 +95,7 @@ def update_cables(cables: Chain, system: System, parameters: Parameters) -> None
     cables.largest[:] = largest_substep(system, parameters.cable_length)
     cables.length[:] = parameters.cable_length / n
     cables.stiffness[:] = n * parameters.cable_stiffness
+    # A cable that is drawn longer is heavier; all its mass is in the n - 1 nodes.
     cables.node_mass[:] = system.cable_mass * (parameters.cable_length / system.cable_length) / (n - 1)
 
 
@@ -105,12 +107,13 @@ def update_models(
 
 def bind_steps(batch: Batch, rows: Rows, data: SimData, cables: Chain) -> tuple[Callable[[], None], Callable[[], None]]:
     """Return what to call before and after MuJoCo's step of a batch."""
-    advance = bind(advance_chains, rows, data, cables, Workspace.zeros(cables.segments))
-    return advance, bind(read_state, rows, batch.bind("qfrc_constraint"), data, cables)
+    work = Workspace.zeros(cables.segments)
+    advance = bind(advance_chains, rows, data, cables, work)
+    return advance, bind(read_state, rows, batch.bind("qfrc_constraint"), data, cables, work)
 
 
 @kernel
-def read_state(rows, contact, data, cables):
+def read_state(rows, contact, data, cables, work):
     """Read the physical state after MuJoCo's step, and write the bodies' into `batch.state`.
 
     Args:
@@ -118,6 +121,7 @@ def read_state(rows, contact, data, cables):
         contact: `qfrc_constraint` of the step (environments, nv), which is contact alone.
         data: SimData, written.
         cables: Chain with the motion that `advance_chains` left; its nodes' contact is written.
+        work: Workspace.
     """
     state = data.state
     stats = data.stats
@@ -126,7 +130,7 @@ def read_state(rows, contact, data, cables):
         e = rows.first + i
         if data.diverged[e]:
             continue
-        _add_contact(e, rows.state[i], contact[i], cables, rows)
+        add_contact(e, rows.state[i], contact[i], state, cables, rows, work)
         if not _is_sound(e, state.cable_broken[e], cables):
             data.diverged[e] = True
             continue
@@ -152,48 +156,6 @@ def read_state(rows, contact, data, cables):
         if slack:
             stats.slack_time[e] += cables.cables.timestep
     update_tension_stats(rows, data.diverged, False, data, cables.cables)
-
-
-@kernel
-def _add_contact(e, line, contact, chain, rows):
-    """Bring the bodies of environment e from their centres of mass to their frames' origins, and let contact act.
-
-    MuJoCo stepped with the same loads and the cables' mean forces. Where it found contact, velocities are its own, and
-    what they differ by from those without counts for the place at the end of the step, too.
-    """
-    motion = chain.motion
-    h = chain.cables.timestep
-    for b in range(motion.position.shape[1]):
-        # From the centre of mass to the origin of the body's frame.
-        turns = b > 0 or rows.payload_nv == 6
-        attitude = matrow(motion.rotation[e], b)
-        center = row(chain.bodies.center[e], b)
-        rates = row(motion.rates[e], b)
-        position = sub(row(motion.position[e], b), mul(attitude, center))
-        velocity = sub(row(motion.velocity[e], b), mul(attitude, cross(rates, center)))
-
-        # Contact forces of this step and of the one before.
-        first = body_dof(b, rows)
-        touched = False
-        for j in range(6 if turns else 3):
-            chain.nodes.contact[e, b, 1, j] = chain.nodes.contact[e, b, 0, j]
-            chain.nodes.contact[e, b, 0, j] = contact[first + j]
-            touched = touched or contact[first + j] != 0.0
-
-        # MuJoCo's velocities where there is contact.
-        if touched:
-            v = rows.qvel + first
-            changed = (line[v], line[v + 1], line[v + 2])
-            position = add(position, scale(h, sub(changed, velocity)))
-            velocity = changed
-            if turns:
-                changed = (line[v + 3], line[v + 4], line[v + 5])
-                attitude = turned(attitude, scale(h, sub(changed, rates)))
-                rates = changed
-        put(motion.position[e, b], position)
-        put(motion.velocity[e, b], velocity)
-        put(motion.rates[e, b], rates)
-        putmat(motion.rotation[e, b], attitude)
 
 
 @kernel
@@ -272,6 +234,7 @@ def write_state(rows, mask, data, cables):
             # The nodes between them.
             length = cables.length[e, n]
             stiffness = cables.stiffness[e, n]
+            # `end` is the hook's velocity: less the anchor's, the rate of the chord.
             hang(chord, sub(end, velocity), length, stiffness, GRAVITY * cables.node_mass[e, n], links[:count])
             for j in range(count - 1):
                 place = add(place, scale(length + links[j, 3], row(links, j)))

@@ -54,6 +54,12 @@ class Motion(NamedTuple):
     """(E,) energy that dampers, along the links and of bending, took in the physics step [J]."""
     impulse: np.ndarray
     """(E, B, 6) of the cables in the physics step: linear in the world frame, angular about the body frame's origin."""
+    first_position: np.ndarray
+    """(E, N, S - 1, 3) of the nodes at the start of the physics step [m]."""
+    first_velocity: np.ndarray
+    """(E, N, S - 1, 3) [m/s]."""
+    first_broken: np.ndarray
+    """(E, N) bool, cables that were broken then."""
 
     @classmethod
     def zeros(cls, num_envs: int, system: System) -> Motion:
@@ -63,7 +69,10 @@ class Motion(NamedTuple):
         s = int(system.cable_segments.max())
         b = 1 + n
         bodies = (e, b, 3), (e, b, 3), (e, b, 3, 3), (e, b, 3)
-        return cls(*(np.zeros(shape) for shape in (*bodies, (e, n, s), (e, n), (e, n), (e,), (e, b, 6))))
+        nodes = (e, n, s - 1, 3)
+        shapes = (*bodies, (e, n, s), (e, n), (e, n), (e,), (e, b, 6), nodes, nodes)
+        arrays = [np.zeros(shape) for shape in shapes]
+        return cls(*arrays, *[np.zeros((e, n), bool)])
 
 
 class Chain(NamedTuple):
@@ -126,6 +135,8 @@ class Workspace(NamedTuple):
     """(N, S) by how much a link stretches faster because it turns [m/s]."""
     tension: np.ndarray
     """(N, S) of each link [N]."""
+    steady: np.ndarray
+    """(N, S) that it would have if its stretch did not change in the substep [N]."""
     diagonal: np.ndarray
     """(N, S) of the tridiagonal matrices [1/kg]."""
     coupling: np.ndarray
@@ -144,7 +155,7 @@ class Workspace(NamedTuple):
         links = (n, s)
         shapes = (
             bodies, bodies, bodies, bodies, bodies, (n, 2, 3), (n, 3), (n, s, 3), (n, s - 1, 3),
-            bodies, bodies, (1,), links, links, links, links, links, (n, n),
+            bodies, bodies, (1,), links, links, links, links, links, links, (n, n),
         )  # fmt: skip
         return cls(*(np.zeros(shape) for shape in shapes))
 
@@ -159,5 +170,6 @@ def largest_substep(system: System, cable_length: np.ndarray) -> np.ndarray:
     Returns:
         (...) int.
     """
+    # Symplectic steps are stable up to 2/ω, those of a damper alone up to 2/rate: a quarter and a half of that.
     longest = np.minimum(min(_SUBSTEP, system.timestep), 1 / np.maximum(system.bending_rate(cable_length), 1e-9))
     return 2 ** np.maximum(0, np.log2(longest * UNITS / system.timestep).astype(int))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from math import atan2
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import (
     IDENTITY,
     add,
@@ -32,7 +32,7 @@ from multilift_marl.math3d import (
     tmul,
     unit,
 )
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
 from multilift_marl.sim.cables.chain_arrays import UNITS
 from multilift_marl.sim.cables.chain_solver import (
     add_turning,
@@ -41,6 +41,7 @@ from multilift_marl.sim.cables.chain_solver import (
     node_velocity,
     solve_tensions,
     steepness,
+    stretch_gain,
 )
 from multilift_marl.sim.state_io import body_dof
 
@@ -59,46 +60,64 @@ def advance_chains(rows, data, chain, work):
     """
     state = data.state
     motion = chain.motion
-    timestep = chain.cables.timestep
     for i in range(rows.state.shape[0]):
         e = rows.first + i
         if data.diverged[e]:
             continue
-        _gather_bodies(e, rows.state[i], state, chain, rows, work)
-        motion.dissipated[e] = 0.0
         for n in range(chain.segments.shape[0]):
-            motion.peak[e, n] = 0.0
-
-        # Substeps, each halved until it is stable, and doubled again where the next one would be.
-        left = UNITS
-        size = chain.largest[e]
-        while left > 0:
-            size = min(size, left)
-            if chain.bends:
-                _find_bending(e, state, chain, work)
-            while True:
-                h = size * timestep / UNITS
-                find_links(e, h, state, chain, work)
-                factorize(e, state, chain, work)
-                solve_tensions(e, h, state, chain, work)
-                if size == 1 or steepness(e, h, chain, work) <= _MARGIN:
-                    break
-                size //= 2
-            add_turning(e, h, state, chain, work)
-            _move(e, h, state, chain, work)
-            left -= size
-            if size < chain.largest[e] and steepness(e, 2.0 * h, chain, work) < _MARGIN:
-                size *= 2
-
-        # The cables' mean forces, for MuJoCo.
-        for b in range(motion.position.shape[1]):
-            at = rows.force + body_dof(b, rows)
-            for j in range(6 if b > 0 or rows.payload_nv == 6 else 3):
-                rows.state[i, at + j] += motion.impulse[e, b, j] / timestep
+            motion.first_broken[e, n] = state.cable_broken[e, n]
+            for j in range(chain.segments[n] - 1):
+                put(motion.first_position[e, n, j], row(chain.nodes.position[e, n], j))
+                put(motion.first_velocity[e, n, j], row(chain.nodes.velocity[e, n], j))
+        gather_bodies(e, rows.state[i], state, chain, rows, work)
+        take_substeps(e, state, chain, work)
+        add_cables(e, rows.state[i], 1.0, chain, rows)
 
 
 @kernel
-def _gather_bodies(e, line, state, chain, rows, work):
+def take_substeps(e, state, chain, work):
+    """Advance nodes and bodies in substeps, each halved until it is stable, and doubled where the next one would be."""
+    motion = chain.motion
+    timestep = chain.cables.timestep
+    motion.dissipated[e] = 0.0
+    for n in range(chain.segments.shape[0]):
+        motion.peak[e, n] = 0.0
+    left = UNITS
+    size = chain.largest[e]
+    while left > 0:
+        size = min(size, left)
+        if chain.bends:
+            _find_bending(e, state, chain, work)
+        while True:
+            h = size * timestep / UNITS
+            find_links(e, h, state, chain, work)
+            factorize(e, state, chain, work)
+            solve_tensions(e, h, state, chain, work)
+            # At a 1024th of a step the cable is taken as it is: MAX_SPEED and MAX_STRETCH find what is beyond that.
+            if size == 1 or steepness(e, h, chain, work) <= _MARGIN:
+                break
+            size //= 2
+        # Only for the substep that is taken: it is a correction, and halving needs no more than T.
+        add_turning(e, h, state, chain, work)
+        _move(e, h, state, chain, work)
+        left -= size
+        if size < chain.largest[e] and steepness(e, 2.0 * h, chain, work) < _MARGIN:
+            size *= 2
+
+
+@kernel
+def add_cables(e, line, sign, chain, rows):
+    """Add the cables' mean forces in the physics step to the loads of MuJoCo's bodies; sign -1 takes them off."""
+    motion = chain.motion
+    for b in range(motion.position.shape[1]):
+        at = rows.force + body_dof(b, rows)
+        for j in range(6 if b > 0 or rows.payload_nv == 6 else 3):
+            # The step's impulse over its length: MuJoCo moves its bodies by the same momentum, in one step.
+            line[at + j] += sign * motion.impulse[e, b, j] / chain.cables.timestep
+
+
+@kernel
+def gather_bodies(e, line, state, chain, rows, work):
     """Take the bodies at the start of a physics step and the forces on them: gravity, loads, lasting contact.
 
     Contact is there so that cables do not have to hold for a moment what rests on the ground: as much of it as the
@@ -121,6 +140,8 @@ def _gather_bodies(e, line, state, chain, rows, work):
             rates = row(state.drone_body_rates[e], b - 1)
         center = row(bodies.center[e], b)
         put(motion.position[e, b], add(position, mul(attitude, center)))
+        # Of the centre of mass, about which bodies turn: v + R (Ω × c). `chain_contact` goes back at the end of the
+        # step.
         put(motion.velocity[e, b], add(velocity, mul(attitude, cross(rates, center))))
         put(motion.rates[e, b], rates)
         putmat(motion.rotation[e, b], attitude)
@@ -135,6 +156,8 @@ def _gather_bodies(e, line, state, chain, rows, work):
         if turns:
             torque = (line[at + 3], line[at + 4], line[at + 5])
             torque = add(torque, (common_force(touch, 3), common_force(touch, 4), common_force(touch, 5)))
+            # About the centre of mass: what the loads' force exerts about the origin is taken off. Gravity has no
+            # moment there.
             put(work.torque[b], sub(torque, cross(center, tmul(attitude, force))))
         for j in range(6):
             motion.impulse[e, b, j] = 0.0
@@ -168,10 +191,12 @@ def _move(e, h, state, chain, work):
     for n in range(chain.segments.shape[0]):
         # Energy that the dampers along the links take: their rate of stretch follows from the implicit law.
         links = chain.segments[n]
-        k = chain.stiffness[e, n]
         c = chain.damping[n]
+        gain = stretch_gain(chain.stiffness[e, n], c, h)
         for j in range(links - (1 if state.cable_broken[e, n] else 0)):
-            rate = (work.tension[n, j] - k * motion.stretch[e, n, j]) / (k * h + c)
+            # From T = steady + g rate. A link between a broken cable's last node and the drone has neither tension nor
+            # damper.
+            rate = (work.tension[n, j] - work.steady[n, j]) / gain
             motion.dissipated[e] += h * c * rate * rate
 
         # Nodes.
@@ -195,11 +220,13 @@ def _move(e, h, state, chain, work):
     # Places of the bodies. The attitude follows the momentum by the midpoint rule.
     for b in range(motion.position.shape[1]):
         put(motion.position[e, b], add(row(motion.position[e], b), scale(h, row(motion.velocity[e], b))))
+        # A point payload has no inertia, and 0 for its inverse.
         if bodies.inverse[e, b, 0, 0] > 0.0:
             attitude = matrow(motion.rotation[e], b)
             inverse = matrow(bodies.inverse[e], b)
             momentum = row(work.momentum, b)
             rates = mul(inverse, tmul(attitude, momentum))
+            # The momentum L stays in the world frame. Rates of the middle: by the attitude half a substep on.
             rates = mul(inverse, tmul(turned(attitude, scale(0.5 * h, rates)), momentum))
             attitude = turned(attitude, scale(h, rates))
             putmat(motion.rotation[e, b], attitude)
@@ -270,15 +297,19 @@ def _find_bending(e, state, chain, work):
             d2 = scale(1.0 / size2, second)
             sine = norm(cross(d1, d2))
             cosine = dot(d1, d2)
+            # A straight bend has no plane and no moment. Nor has one that is folded flat, where its moment has no
+            # direction.
             if sine > 1e-9:
                 # The angle shrinks as d1 moves along e1 and d2 along e2, unit vectors across the links in the bend.
                 e1 = scale(1.0 / (sine * size1), sub(d2, scale(cosine, d1)))
                 e2 = scale(1.0 / (sine * size2), sub(d1, scale(cosine, d2)))
                 closing = dot(e1, sub(middle_velocity, low_velocity)) + dot(e2, sub(high_velocity, middle_velocity))
+                # closing = -θ̇: hence the moment κ θ + β θ̇ = κ θ - β closing.
                 work.bend_power[0] += chain.bending_damping[n] * closing * closing
                 moment = chain.bending_stiffness[n] * atan2(sine, cosine) - chain.bending_damping[n] * closing
                 on_low = scale(-moment, e1)
                 on_high = scale(moment, e2)
+                # The three forces add up to zero, and so do their moments: bending leaves both momenta as they are.
                 on_middle = sub((0.0, 0.0, 0.0), add(on_low, on_high))
                 # On nodes, and on the bodies at the cable's ends.
                 put(work.bending[n, j], add(row(work.bending[n], j), on_middle))

@@ -2,9 +2,11 @@
 
 In a substep h, the force of link j is along its direction d_j at the start of the substep, with the tension
 
-    T_j = k s_j' + c (s_j' - s_j)/h
+    T_j = k (s_j + ½ (1 + η) (s_j' - s_j) - ½ (1 - η) (s_j - s_j°)) + c (s_j' - s_j)/h
 
-of its stretch s_j before and s_j' after it. With the velocities u, w of the ends of a link after the substep,
+of its stretch s_j before and s_j' after it, and s_j° one substep earlier. η = 1 would be backward Euler, which takes
+the energy of a bounce, η = 0 a symplectic rule that keeps it, with that of waves that no substep resolves; a small η
+leaves slow motion alone and calms those in time. With the velocities u, w of the ends of a link after the substep,
 
     s_j' = s_j + h d_j · (u - w) + h r_j,
 
@@ -17,10 +19,11 @@ from __future__ import annotations
 
 from math import sqrt
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, cross, dot, matrow, mul, norm, put, row, scale, sub, tmul
-from multilift_marl.rig.vehicles import GRAVITY
+from multilift_marl.physical import GRAVITY
 
+_CALMING = 0.01  # [-] η: it damps a bounce of frequency ω [rad/s] by η ω² h/2 [1/s], 5e-3 at 10 Hz
 _PASSES = 2  # at most, over what the links' turning adds: docs/cables.md compares with none
 _SETTLED = 1e-6  # [m/s] change of that which needs no further pass: 2.5e-10 m of stretch in a substep
 
@@ -29,8 +32,8 @@ _SETTLED = 1e-6  # [m/s] change of that which needs no further pass: 2.5e-10 m o
 def find_links(e, h, state, chain, work):
     """Find direction and stretch of every link, the bodies' motion without cables, and the linear system of a substep.
 
-    Row j of a cable, over h (k h + c): (1/(h (k h + c)) + 1/m_upper + 1/m_lower) T_j less the effect of its neighbours
-    on the nodes between them equals (k s_j/(k h + c) + rate of stretch without cables)/h.
+    With g = ½ (1 + η) k h + c, row j of a cable, over h g: (1/(h g) + 1/m_upper + 1/m_lower) T_j less the effect of its
+    neighbours on the nodes between them equals (T_j at an unchanged stretch over g + rate of stretch without cables)/h.
     """
     bodies = chain.bodies
     motion = chain.motion
@@ -38,10 +41,12 @@ def find_links(e, h, state, chain, work):
     # Bodies without cables. The momentum is in the world frame, so the gyroscopic torque needs no term.
     for b in range(bodies.mass.shape[1]):
         attitude = matrow(motion.rotation[e], b)
+        # Forces in the world frame, loads' torques in the body frame, moments of bending in the world frame.
         force = add(row(work.force, b), row(work.bend_force, b))
         put(work.free_velocity[b], add(row(motion.velocity[e], b), scale(h / bodies.mass[e, b], force)))
         torque = add(mul(attitude, row(work.torque, b)), row(work.bend_moment, b))
         momentum = add(row(work.momentum, b), scale(h, torque))
+        # Ω = J⁻¹ Rᵀ L in the body frame, then turned to the world.
         turning = mul(matrow(bodies.inverse[e], b), tmul(attitude, momentum))
         put(work.free_rates[b], mul(attitude, turning))
 
@@ -50,7 +55,9 @@ def find_links(e, h, state, chain, work):
     for n in range(chain.segments.shape[0]):
         links = chain.segments[n]
         k = chain.stiffness[e, n]
-        gain = k * h + chain.damping[n]
+        gain = stretch_gain(k, chain.damping[n], h)
+        # The part of T_j that remembers: ½ (1 - η) k (s_j - s_j°), with the rate of a substep ago times h.
+        memory = 0.5 * (1.0 - _CALMING) * k * h
         node = 1.0 / chain.node_mass[e, n]
 
         # Along the cable, from the anchor on the payload up.
@@ -58,7 +65,10 @@ def find_links(e, h, state, chain, work):
         put(work.ends[n, 0], arm)
         low = add(row(motion.position[e], 0), arm)
         low_velocity = add(row(work.free_velocity, 0), cross(row(work.free_rates, 0), arm))
+        low_last = _last_velocity(e, 0, payload, arm, motion)
         before = (0.0, 0.0, 0.0)  # direction of the link below
+        # The first link's lower end is the payload, which all cables share: its mobility is in the matrix of
+        # `factorize`.
         weight = 0.0  # that a unit impulse of this link gives its lower end along it [1/kg]
         for j in range(links):
             # The upper end: a node, or the hook.
@@ -66,18 +76,23 @@ def find_links(e, h, state, chain, work):
                 high = row(nodes.position[e, n], j)
                 weight_up = node
                 high_velocity = _free_velocity(e, n, j, h, chain, work)
+                high_last = row(nodes.velocity[e, n], j)
             else:
                 drone = matrow(motion.rotation[e], 1 + n)
                 arm = mul(drone, row(chain.cables.hooks, n))
                 put(work.ends[n, 1], arm)
                 high = add(row(motion.position[e], 1 + n), arm)
                 high_velocity = add(row(work.free_velocity, 1 + n), cross(row(work.free_rates, 1 + n), arm))
+                high_last = _last_velocity(e, 1 + n, drone, arm, motion)
                 weight_up = 1.0 / bodies.mass[e, 1 + n]
 
             # Direction, stretch and the row of the link.
             link = sub(high, low)
-            size = norm(link)
-            d = scale(1.0 / max(size, 1e-9), link)
+            # Two nodes in one place have no direction between them: the floor leaves d = 0 and no force, in place of
+            # NaN.
+            size = max(norm(link), 1e-9)
+            per_size = 1.0 / size
+            d = scale(per_size, link)
             if j == links - 1:  # a force at the hook turns the drone, too
                 moment = tmul(drone, cross(arm, d))
                 weight_up += dot(moment, mul(matrow(bodies.inverse[e], 1 + n), moment))
@@ -86,16 +101,39 @@ def find_links(e, h, state, chain, work):
             opening = sub(high_velocity, low_velocity)
             work.turning[n, j] = _turning(d, size, opening, h)
             rate = dot(d, opening)
+            last = sub(high_last, low_last)
+            # (s_j - s_j°)/h, to second order in h: the link's velocity across it lengthens it by h² |across|²/2 l in a
+            # substep.
+            past = dot(d, last)
+            past -= 0.5 * h * per_size * max(dot(last, last) - past * past, 0.0)  # rate of stretch one substep ago
+            # T_j = steady + g times the rate of stretch in the substep, and the rate is that without cables less h
+            # times what the tensions take of it: divided by h g, row j of the system.
+            work.steady[n, j] = k * (size - chain.length[e, n]) - memory * past
             work.diagonal[n, j] = 1.0 / (h * gain) + weight_up + weight
-            work.right[n, j] = (k * (size - chain.length[e, n]) / gain + rate) / h
+            work.right[n, j] = (work.steady[n, j] / gain + rate) / h
+            # T_j draws the node below it up, which stretches the link below by d · before of that; row j - 1 has the
+            # same number.
             work.coupling[n, j] = -weight * dot(d, before)
             if j == 0:
                 turning = mul(payload_inverse, tmul(payload, cross(row(work.ends[n], 0), d)))
                 put(work.twist[n], mul(payload, turning))
             low = high
             low_velocity = high_velocity
+            low_last = high_last
             before = d
             weight = weight_up
+
+
+@kernel
+def stretch_gain(stiffness, damping, h):
+    """Return by how much a link's tension grows with the rate of its stretch in a substep [N s/m]."""
+    return 0.5 * (1.0 + _CALMING) * stiffness * h + damping
+
+
+@kernel
+def _last_velocity(e, b, attitude, arm, motion):
+    """Return the velocity of a point of body b at the start of a substep, `arm` from its centre of mass."""
+    return add(row(motion.velocity[e], b), cross(mul(attitude, row(motion.rates[e], b)), arm))
 
 
 @kernel
@@ -104,16 +142,21 @@ def factorize(e, state, chain, work):
     count = chain.segments.shape[0]
     for n in range(count):
         for j in range(_top(e, n, state, chain), 0, -1):
+            # From the drone down: what is left at the first link depends on the payload alone, and a broken cable just
+            # begins one link lower. The diagonal keeps the pivots for `solve_tensions`.
             factor = work.coupling[n, j] / work.diagonal[n, j]
             work.diagonal[n, j - 1] -= factor * work.coupling[n, j]
     for n in range(count):
         d = row(work.direction[n], 0)
         arm = row(work.ends[n], 0)
         for m in range(n + 1):
+            # Velocity at anchor n along link n for a unit impulse along link m: of the shift d_m/M, and of the turn J⁻¹
+            # (r_m × d_m).
             there = scale(1.0 / chain.bodies.mass[e, 0], row(work.direction[m], 0))
             total = dot(d, add(there, cross(row(work.twist, m), arm)))
             if m == n:
                 total += work.diagonal[n, 0]
+            # Cholesky, row by row; the matrix is positive definite, since every diagonal has 1/(h g) > 0.
             for k in range(m):
                 total -= work.matrix[n, k] * work.matrix[m, k]
             work.matrix[n, m] = sqrt(total) if m == n else total / work.matrix[m, m]
@@ -127,6 +170,7 @@ def solve_tensions(e, h, state, chain, work):
     for n in range(count):
         top = _top(e, n, state, chain)
         for j in range(chain.segments[n]):
+            # r_j of the last pass; the first has it from velocities without cables (`find_links`).
             work.tension[n, j] = work.right[n, j] + work.turning[n, j] / h
         for j in range(top, 0, -1):
             work.tension[n, j - 1] -= work.coupling[n, j] / work.diagonal[n, j] * work.tension[n, j]
@@ -160,6 +204,7 @@ def _top(e, n, state, chain):
 def add_turning(e, h, state, chain, work):
     """Solve again for the tensions, with what the links' turning adds to their stretch, until that has settled."""
     for _ in range(_PASSES):
+        # The directions d_j stay those of the start of the substep: only their effect on lengths is brought up to date.
         if _find_turning(e, h, chain, work) < _SETTLED:
             break
         solve_tensions(e, h, state, chain, work)
@@ -188,6 +233,9 @@ def _find_turning(e, h, chain, work):
 @kernel
 def _turning(d, size, opening, h):
     """Return how much faster than d · opening a link of a given size along d stretches in time h [m/s]."""
+    # The link after the substep has the part size + h d · opening along d, and h times the rest of `opening` across it.
+    # Its length less `along`, over h, is (√(along² + across) - along)/h; written as a quotient, because the difference
+    # of two nearly equal lengths loses all digits where a link hardly turns.
     rate = dot(d, opening)
     along = size + h * rate
     across = h * h * max(dot(opening, opening) - rate * rate, 0.0)
@@ -203,11 +251,13 @@ def _end_velocity(e, n, end, h, chain, work):
     moment = (0.0, 0.0, 0.0)
     if end == 0:
         for m in range(chain.segments.shape[0]):
+            # The payload feels all cables: each draws it up along its first link.
             size = h * work.tension[m, 0]
             impulse = add(impulse, scale(size, row(work.direction[m], 0)))
             moment = add(moment, scale(size, row(work.twist, m)))
     else:
         last = chain.segments[n] - 1
+        # The drone feels its own cable, which draws it down.
         impulse = scale(-h * work.tension[n, last], row(work.direction[n], last))
         attitude = matrow(chain.motion.rotation[e], b)
         moment = mul(attitude, mul(matrow(chain.bodies.inverse[e], b), tmul(attitude, cross(arm, impulse))))
@@ -237,5 +287,6 @@ def steepness(e, h, chain, work):
     for n in range(chain.segments.shape[0]):
         inertia = chain.node_mass[e, n] * chain.length[e, n]
         for j in range(chain.segments[n]):
+            # Of pushed links too: compression drives the motion across it apart, a tension makes it swing.
             worst = max(worst, abs(work.tension[n, j]) / inertia)
     return worst * h * h

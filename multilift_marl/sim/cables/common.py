@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl._jit import kernel
+from multilift_marl.kernels.jit import kernel
+from multilift_marl.rig.constants import make_rig
 from multilift_marl.rig.system import System
 from multilift_marl.sim.parameters import Parameters
 
@@ -36,10 +37,11 @@ class Cables(NamedTuple):
 
 def make_common(system: System, parameters: Parameters) -> Cables:
     """Return the cables of `system` with live parameters."""
+    rig = make_rig(system)
     return Cables(
         timestep=system.timestep,
-        anchors=np.ascontiguousarray(system.anchors),
-        hooks=np.ascontiguousarray(system.hooks),
+        anchors=rig.anchors,
+        hooks=rig.hooks,
         length=parameters.cable_length,
         stiffness=parameters.cable_stiffness,
         damping=np.ascontiguousarray(system.cable_damping),
@@ -86,4 +88,5 @@ def update_tension_stats(rows, mask, value, data, cables):
             stats.tension_min[e] = min(stats.tension_min[e], tension)
             stats.tension_max[e] = max(stats.tension_max[e], tension)
             stats.tension_peak[e] = max(stats.tension_peak[e], tension)
+            # Of a cable at rest under this tension: T/(k L).
             stats.stretch_max[e] = max(stats.stretch_max[e], tension / (cables.stiffness[e, n] * cables.length[e, n]))

@@ -4,7 +4,7 @@ With direct solref (-A, -B) and constant impedance I, a stretched limit's row wa
 -(A r + B v)/I for stretch r and stretch rate v, softened by the regulariser R = (1 - I)/I · tendon_invweight0. For
 small I its force is (A r + B v)/(I R), the Kelvin-Voigt law k r + c v if A = k I R and B = c I R, and the force of a
 limit never pushes. See "Solver parameters" in MuJoCo's computation chapter. At rest the law is exact; in motion the
-softening acts like a little extra mass along the cable, about 1 % of what the cable couples.
+softening of each cable acts like a little extra mass along it, about 1 % of the mass that it couples.
 
 MuJoCo's tension is the mean over a physics step. A snatch, of a slack cable that goes taut between moving ends, is
 shorter: for the default cable and 1 m/s the force is 1000 N when it goes taut and down to a half after 0.3 ms, so that
@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from multilift_marl._jit import bind, kernel
+from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import (
     IDENTITY,
     add,
@@ -51,7 +51,9 @@ from multilift_marl.sim.cables.common import (
     make_common,
     update_tension_stats,
 )
+from multilift_marl.sim.contact import body_radii
 from multilift_marl.sim.parameters import MASSES, Inertias, Parameters
+from multilift_marl.sim.rotation import add_gyroscopic
 from multilift_marl.sim.state import SimData, hook_position
 from multilift_marl.sim.state_io import Rows, read_payload, write_bodies
 
@@ -66,6 +68,7 @@ def add_cable(spec: mujoco.MjSpec, system: System, index: int) -> None:
     cable = spec.add_tendon(name=name, limited=True, range=[0, system.cable_length[index]])
     cable.wrap_site(f"drone_{index}/hook")
     cable.wrap_site(f"payload/anchor_{index}")
+    # (d0, d_width, width, midpoint, power): with d0 = d_width the impedance is I at any stretch, the other three idle.
     cable.solimp_limit = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2]
     cable.width = 0.006
     cable.rgba = [0.08, 0.08, 0.1, 1]
@@ -92,7 +95,9 @@ def limit_solref(stiffness: np.ndarray, damping: np.ndarray, tendon_invweight0: 
     Returns:
         (..., N, 2).
     """
+    # R of the module's law. With A = k I R and B = c I R the force (A r + B v)/(I R) is k r + c v.
     regulariser = (1 - IMPEDANCE) / IMPEDANCE * tendon_invweight0
+    # Negative numbers are MuJoCo's direct stiffness and damping; positive ones would be a time constant and a ratio.
     law = np.broadcast_arrays(stiffness * regulariser * IMPEDANCE, damping * regulariser * IMPEDANCE)
     return -np.stack(law, axis=-1)
 
@@ -102,12 +107,16 @@ class MasslessCables(NamedTuple):
 
     cables: Cables
     bodies: Inertias
+    gyroscopic: np.ndarray
+    """(E, 1 + N, 3) torque that `rotation.add_gyroscopic` added to the loads of the last step [N m]."""
+    radii: np.ndarray
+    """(1 + N,) of spheres about payload and drones [m]."""
     nodes: None = None
 
 
 def make_cables(system: System, parameters: Parameters, inertias: Inertias) -> MasslessCables:
     """Return the cables of `system`, which follow parameters and inertias."""
-    return MasslessCables(make_common(system, parameters), inertias)
+    return MasslessCables(make_common(system, parameters), inertias, np.zeros_like(inertias.center), body_radii(system))
 
 
 def update_cables(cables: MasslessCables, system: System, parameters: Parameters) -> None:
@@ -119,6 +128,7 @@ def update_models(
 ) -> None:
     """Write lengths, stiffnesses and broken cables into a batch's models; see `CableModel.update_models`."""
     if names & {"cable_length", "cable_broken"}:
+        # A compiled model cannot lose a tendon: that of a broken cable gets a limit that it never reaches.
         batch.expand("tendon_range")[..., 1] = np.where(broken, _FAR, parameters.cable_length)
     if names & {*MASSES, "cable_stiffness"}:
         inverse_weight = batch.expand("tendon_invweight0")[mask]
@@ -126,9 +136,12 @@ def update_models(
         batch.expand("tendon_solref_lim")[mask] = solref
 
 
-def bind_steps(batch: Batch, rows: Rows, data: SimData, cables: MasslessCables) -> tuple[None, Callable[[], None]]:
+def bind_steps(
+    batch: Batch, rows: Rows, data: SimData, cables: MasslessCables
+) -> tuple[Callable[[], None], Callable[[], None]]:
     """Return what to call before and after MuJoCo's step of a batch."""
-    return None, bind(read_state, rows, batch.bind("sensordata"), batch.bind("ten_length"), data, cables)
+    read = bind(read_state, rows, batch.bind("sensordata"), batch.bind("ten_length"), data, cables)
+    return bind(add_gyroscopic, rows, data, cables), read
 
 
 @kernel
@@ -153,6 +166,8 @@ def read_state(rows, tension, length, data, cables):
         if diverged[e] or not _is_sound(e, line, tension[i], length[i], cables, rows):
             diverged[e] = True
             continue
+        # `at` and `v` are places in the row, of the next drone's coordinates (3 + 4) and velocities (3 + 3). Here `v`
+        # is no view of a task's arrays, as it is in kernels of tasks, nor a speed.
         at = rows.qpos + rows.payload_nq
         v = rows.qvel + rows.payload_nv
         slack = False
@@ -184,6 +199,7 @@ def _is_sound(e, line, tension, length, cables, rows):
     v = rows.qvel
     for j in range(rows.payload_nv):
         bound = MAX_SPEED if j < 3 else MAX_RATE
+        # `not a < b`, for NaN must not pass: every comparison with it is False.
         if not abs(line[v + j]) < bound:
             return False
     v += rows.payload_nv
@@ -214,6 +230,7 @@ def _step_peak(e, n, line, tension, state, cables, rows):
     payload = matrow(state.payload_rotation, e) if rows.payload_nv == 6 else IDENTITY
     drone = mat(state.drone_rotation, e, n)
     low = add(row(state.payload_position, e), mul(payload, anchor))
+    # Free joints have linear velocities in the world frame and body rates in the body frame: Ω × r is turned after.
     low_velocity = row(state.payload_velocity, e)
     low_velocity = add(low_velocity, mul(payload, cross(row(state.payload_body_rates, e), anchor)))
     high = add(vec(state.drone_position, e, n), mul(drone, hook))
@@ -235,9 +252,12 @@ def _step_peak(e, n, line, tension, state, cables, rows):
     ending = add((line[v], line[v + 1], line[v + 2]), mul(drone, cross(rates, hook)))
     inverse_mass = _mobility(e, 0, payload, anchor, direction, cables.bodies)
     inverse_mass += _mobility(e, 1 + n, drone, hook, direction, cables.bodies)
+    # MuJoCo's tension has slowed the parting by (1/m) T already: what it took is added back, the others' effect is
+    # left.
     acceleration = (dot(direction, sub(ending, after)) - speed) / cables.cables.timestep + inverse_mass * tension
 
     # The speed at the moment when the cable was at its natural length, by that acceleration.
+    # Where the cable was stretched at first, v² - 2 a s is the square of the speed at s = 0.
     speed = sqrt(max(speed * speed - 2.0 * acceleration * max(stretch, 0.0), 0.0)) if speed > 0.0 else 0.0
     if speed == 0.0:
         return 0.0
@@ -274,6 +294,7 @@ def snatch_peak(speed, acceleration, mass, stiffness, damping):
     """
     # F falls from the first moment on.
     first = cable_tension(stiffness, damping, 0.0, speed)
+    # y_0 = a - c v/m, and ẏ_0 = -(k v + c y_0)/m: F falls at first where ẏ_0 is positive.
     start = acceleration - damping * speed / mass
     slope = -(stiffness * speed + damping * start) / mass
     if slope >= 0.0:
@@ -284,9 +305,11 @@ def snatch_peak(speed, acceleration, mass, stiffness, damping):
     square = stiffness / mass
     decay = 0.5 * damping / mass
     fall = decay * slope + square * start
+    # ω² = k/m - σ²: positive below critical damping. The band of 1e-9 about 0 keeps S/ω from 0/0.
     gap = square - decay * decay
     if gap > 1e-9 * square:
         rate = sqrt(gap)
+        # tan ω t = ω ẏ_0/(σ ẏ_0 + k/m y_0). As ẏ_0 < 0, atan2 is negative: the first root after 0 is half a turn on.
         time = atan2(slope * rate, fall) / rate
         if time < 0.0:
             time += pi / rate
@@ -294,6 +317,7 @@ def snatch_peak(speed, acceleration, mass, stiffness, damping):
         odd = sin(rate * time) / rate
     elif gap < -1e-9 * square:
         rate = sqrt(-gap)
+        # tanh is in (-1, 1), and of positive times positive: elsewhere ẏ keeps its sign, y dies out and F tends to m a.
         if fall >= 0.0 or slope * rate <= fall:
             return first if acceleration <= 0.0 else max(first, mass * acceleration)
         time = atanh(slope * rate / fall) / rate

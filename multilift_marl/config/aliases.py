@@ -1,0 +1,33 @@
+"""Keys that have two names: `train.base_policy` is `train.residual`, by which it is stored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from multilift_marl.errors import ConfigError
+
+_ALIASES = {"train.base_policy": "train.residual"}
+
+
+def stored_names(values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Return configuration values, nested, by dotted names or both, with every key by the name that is stored.
+
+    Call it before `review`, which looks for the stored names.
+
+    Raises:
+        ConfigError: a key is given by both of its names.
+    """
+    renamed = dict(values)
+    for alias, key in _ALIASES.items():
+        section, name, stored = *alias.split("."), key.rpartition(".")[2]
+        if isinstance(nested := renamed.get(section), Mapping):
+            renamed[section] = _rename(nested, name, stored, alias, key)
+        renamed = _rename(renamed, alias, key, alias, key)
+    return renamed
+
+
+def _rename(values: Mapping[Any, Any], name: str, stored: str, alias: str, key: str) -> dict[Any, Any]:
+    if name in values and stored in values:
+        raise ConfigError(f"{alias} and {key} are two names of one key, and both are given; leave out one of them")
+    return {stored if each == name else each: value for each, value in values.items()}

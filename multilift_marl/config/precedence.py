@@ -1,0 +1,65 @@
+"""What is asked for goes before what a recipe changes in training alone (`train.overrides`, `.rigs`, `.stages`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+_FREE = ("reward", "task_options")
+"""Sections of free names: an empty mapping asks for none of them, where elsewhere it asks for nothing."""
+
+
+def give_way(values: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a configuration, less what it changes in training alone of what is asked for.
+
+    Args:
+        values: by section.
+        asked: by section or dotted name; what it says of `train` itself is no matter here.
+    """
+    train = values.get("train")
+    if not isinstance(train, Mapping):
+        return dict(values)
+    names = [
+        name for name, value in leaves(asked) if name.partition(".")[0] != "train" and (value != {} or name in _FREE)
+    ]
+    kept = dict(train)
+    if isinstance(overrides := kept.get("overrides"), Mapping):
+        kept["overrides"] = _without(overrides, names)
+    if isinstance(rigs := kept.get("rigs"), list | tuple):
+        kept["rigs"] = [_without(rig, names) if isinstance(rig, Mapping) else rig for rig in rigs]
+    if isinstance(stages := kept.get("stages"), list | tuple):
+        kept["stages"] = [
+            {**stage, "overrides": _without(changes, names)}
+            if isinstance(stage, Mapping) and isinstance(changes := stage.get("overrides"), Mapping)
+            else stage
+            for stage in stages
+        ]
+    return {**values, "train": kept}
+
+
+def _without(overrides: Mapping[str, Any], asked: list[str]) -> dict[str, Any]:
+    """Return overrides as they are, but for those that are asked for; of a term's numbers each for itself."""
+    kept = {}
+    for key, value in overrides.items():
+        parts = {name: part for name, part in leaves({key: value}) if not _is_asked(name, asked)}
+        if len(parts) == len(list(leaves({key: value}))):
+            kept[key] = value
+        else:
+            kept |= parts
+    return kept
+
+
+def _is_asked(name: str, asked: list[str]) -> bool:
+    return any(f"{name}.".startswith(f"{each}.") for each in asked)
+
+
+def leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested sections by dotted name; a reward term's bare number is its weight."""
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, f"{name}.")
+        elif name.startswith("reward.") and name.count(".") == 1 and isinstance(value, int | float | str):
+            yield f"{name}.weight", value
+        else:
+            yield name, value

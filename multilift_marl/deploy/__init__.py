@@ -1,0 +1,1 @@
+"""Teams of other software: PX4 autopilots, and ROS 2."""

@@ -1,0 +1,176 @@
+"""`python -m multilift_marl.px4 config=hover px4=DIR`: PX4 autopilots fly a team in the simulation."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
+
+from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
+from multilift_marl.agents.policy import NamedPolicy, find_policy
+from multilift_marl.command import CommandOptions, limit_torch_threads, make_folder, run_command, split_options, title
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import build_config, load_config
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.metrics import format_table, make_report, write_report
+from multilift_marl.schema.values import Between, Float, Int
+
+if TYPE_CHECKING:
+    from multilift_marl.deploy.px4.flight import Flight, FlightResult
+
+_USAGE = """Fly one episode of a task by PX4 autopilots, in lockstep with the simulation: from slack cables on the
+ground to the task, back, and down again; then the same task by the controller of this package.
+
+  python -m multilift_marl.px4 config=hover policy=formation_integral px4=~/PX4-Autopilot [key=value ...]
+
+Everything stays on this machine (127.0.0.1). Any configuration key changes the environment: env.num_drones=6."""
+OURS = "geometric controller"
+
+
+class Options(CommandOptions):
+    """Keys of the command beside those of the configuration."""
+
+    config: str | None = Field(None, description="the task, name or path; None: what a policy was trained in, or hover")
+    policy: str = Field("formation_integral", description="a baseline, a run, module:Class, .onnx, .pt")
+    px4: str | None = Field(None, description="PX4's folder, with a build of px4_sitl_default; None: PX4_DIR")
+    seed: Int = Field(1000, ge=0, description="evaluation seed: the episode is the first of evaluate.py")
+    speed: Annotated[Float, Between(0, 100, "-")] = Field(
+        0.0, description="largest real-time factor; 0 for as fast as it goes"
+    )
+    instance: Annotated[Int, Between(0, 9)] = Field(
+        0, description="of the first PX4, which makes the ports: 4560, 14540, 14580 + instance"
+    )
+    timeout: Annotated[Float, Between(0.1, 600, "s")] = Field(30.0, description="[s] for a PX4 to connect or to answer")
+    parameters: dict[Annotated[str, Field(pattern="^[A-Z][A-Z0-9_]{1,15}$")], Float] = Field(
+        {}, description="of PX4, in place of ours: parameters={MPC_XY_P: 1.2}"
+    )
+    bag: str | None = Field(None, description="folder of a ROS 2 bag of the task, see docs/ros.md")
+    ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of that bag")
+    names: Literal["multilift", "report"] = Field("multilift", description="of its topics: ours or the report's")
+    log: bool = Field(False, description="also the flight logs of PX4, .ulg")
+    out: str | None = Field(None, description="folder for metrics.json, plots and logs; None: runs/px4-...")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly; return the exit status."""
+    return run_command(_fly, _USAGE, Options, arguments)
+
+
+def _fly(values: dict[str, Any]) -> int:
+    from multilift_marl.deploy.px4.flight import Flight, check_config
+    from multilift_marl.deploy.px4.launch import find_px4
+    from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
+
+    options, overrides = split_options(Options, values)
+    policy = find_policy(options.policy)
+    config = check_config(_find_config(options, policy.config, overrides))
+    policy.check(config, "policy")
+    folder = options.px4 or os.environ.get("PX4_DIR")
+    if not folder:
+        raise ConfigError(
+            "no PX4 is given; clone PX4-Autopilot, run `make px4_sitl_default` there, and give px4=<folder> or PX4_DIR"
+        )
+    build = find_px4(folder)
+    if (count := options.instance + config.env.num_drones) > 10:
+        raise ConfigError(
+            f"instance={options.instance} and {config.env.num_drones} drones need PX4 instances up to {count - 1}, but "
+            "PX4's start-up knows 0 to 9; lower one of them"
+        )
+    if options.bag is not None:
+        from multilift_marl.deploy.ros.bag import check_free
+
+        check_free(Path(options.bag))
+    limit_torch_threads()
+    with ending_at_once():
+        policy.bind(MultiliftVec(config))  # refuses what does not fit, before anything starts
+    name = f"px4-{title({'config': options.config or config.task})}-{Path(options.policy).stem}"
+    out = make_folder(Path(options.out) if options.out else Path("runs") / name / time.strftime("%Y%m%d-%H%M%S"))
+
+    begin = time.perf_counter()
+    settings = Settings(
+        build=build, first=options.instance, timeout=options.timeout, speed=options.speed, seed=options.seed,
+        log=options.log, parameters=options.parameters,
+    )  # fmt: skip
+    with interrupted_by_signals(), AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
+        flight = Flight(config, team, options.seed, lambda text: print(text, flush=True))
+        try:
+            result = _record(flight, policy, options)
+        finally:
+            if options.log:
+                _keep_logs(team.autopilots.folder if team.autopilots else None, out)
+        factor = team.time / (time.perf_counter() - begin)
+    ours = flight.fly_ours(policy.bind)
+    report = make_report(config, options.seed, result.metrics, {OURS: ours.metrics})
+    report["px4"] = {
+        "drone_error_m": result.drone_error, "estimate_error_m": result.estimate_error,
+        "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
+    }  # fmt: skip
+    if options.speed:
+        report["px4"]["lateness_s"] = dict(zip(("50 %", "99 %", "99.9 %"), team.clock.lateness().tolist(), strict=True))
+    report["baselines"][OURS]["drone_error_m"] = ours.drone_error
+    print(f"\n{options.policy} on {config.task}, seed {options.seed}\n\n{format_table(report, 'PX4')}")
+    print(
+        f"drones from their references: {100 * result.drone_error:.1f} cm, with our controller "
+        f"{100 * ours.drone_error:.1f} cm (RMS); PX4's estimates of their places: "
+        f"{100 * result.estimate_error:.1f} cm; {factor:.1f} times real time"
+    )
+    if options.speed:
+        late = " / ".join(f"{1e3 * seconds:.2f}" for seconds in team.clock.lateness())
+        print(f"steps began late by {late} ms (50 / 99 / 99.9 %)")
+    write_report(out / "metrics.json", report)
+    _draw(out, {"PX4": result.trace, OURS: ours.trace})
+    print(f"wrote {out / 'metrics.json'} and plots beside it")
+    return 0
+
+
+def _record(flight: Flight, policy: NamedPolicy, options: Options) -> FlightResult:
+    """Fly, with a bag of the task if asked."""
+    if options.bag is None:
+        return flight.fly(policy.bind)
+    from multilift_marl.deploy.ros.bag import BagWriter
+
+    bags: list[BagWriter] = []
+    with ExitStack() as stack:
+
+        def record(vec: MultiliftVec) -> None:
+            if not bags:  # no bag of a flight that does not reach its task
+                folder = Path(str(options.bag))
+                bags.append(stack.enter_context(BagWriter(folder, vec, options.ros, options.names)))
+            else:
+                bags[0].write(vec.steps[0] * vec.task.dt)
+
+        result = flight.fly(policy.bind, record)
+    print(f"wrote {options.bag}")
+    return result
+
+
+def _find_config(options: Options, own: Config | None, overrides: dict[str, Any]) -> Config:
+    if options.config is None and own is not None:
+        return build_config(own.model_dump(), overrides)
+    return load_config(options.config or "hover", overrides)
+
+
+def _keep_logs(folder: Path | None, out: Path) -> None:
+    for i, path in enumerate(sorted(folder.glob("*/log/*/*.ulg")) if folder else []):
+        shutil.copyfile(path, out / f"px4_{i}.ulg")
+        print(f"wrote {out / f'px4_{i}.ulg'}")
+
+
+def _draw(out: Path, traces: dict[str, Any]) -> None:
+    from multilift_marl.evaluation import plots
+
+    plots.plot_errors(out / "errors.png", traces)
+    plots.plot_tensions(out / "tensions.png", traces["PX4"], "PX4")
+    plots.plot_paths(out / "paths.png", traces["PX4"], "PX4")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

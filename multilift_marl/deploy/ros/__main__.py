@@ -1,0 +1,149 @@
+"""`python -m multilift_marl.ros policy=hover`: a live simulation on ROS 2 topics, or a policy that flies one."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from multilift_marl._interrupt import ending_at_once
+from multilift_marl.agents.policy import NamedPolicy, find_policy
+from multilift_marl.command import CommandOptions, limit_torch_threads, run_command, split_options
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import build_config, load_config
+from multilift_marl.envs.core import EVALUATION, MultiliftVec
+from multilift_marl.errors import ConfigError
+from multilift_marl.realtime import QUANTILES, RealTime
+from multilift_marl.schema.values import Between, Float, Int
+
+if TYPE_CHECKING:
+    from multilift_marl.deploy.ros.dds import Node
+
+_USAGE = """Simulate a team live on ROS 2 topics, by DDS, without ROS 2: docs/ros.md lists the topics.
+
+  python -m multilift_marl.ros config=hover policy=formation [key=value ...]
+  python -m multilift_marl.ros config=hover policy=none      # others fly it, by /drone_<i>/setpoint
+  python -m multilift_marl.ros role=policy policy=hover.onnx # from odometry to set-points, of what flies elsewhere
+
+Only this machine hears it (interface lo, no multicast), unless allow_network=true. Any configuration key changes the
+environment: env.num_drones=6."""
+
+
+class Options(CommandOptions):
+    """Keys of the command beside those of the configuration."""
+
+    config: str | None = Field(None, description="the task, name or path; None: the policy's own, or hover")
+    role: Literal["simulation", "policy"] = Field(
+        "simulation", description="what this is: a team in simulation, or the policy of a team elsewhere"
+    )
+    policy: str = Field(
+        "formation", description="a baseline, a run, module:Class, .onnx, .pt; none: others' set-points"
+    )
+    start: Literal["at_once", "topic"] = Field(
+        "at_once", description="when a policy begins: as soon as all is heard, or when true comes on /fly"
+    )
+    seed: Int = Field(1000, ge=0, description="evaluation seed: the episodes are those of evaluate.py")
+    speed: Annotated[Float, Between(0, 100, "-")] = Field(1.0, description="real-time factor; 0: as fast as it goes")
+    seconds: Annotated[Float, Between(0, 1e9, "s")] = Field(
+        0.0, description="[s] of the simulation, of a policy by the clock; 0: until Ctrl-C"
+    )
+    ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of the peers")
+    names: Literal["multilift", "report"] = Field("multilift", description="of the topics: ours or the report's")
+    domain: Annotated[Int, Between(0, 232)] = Field(0, description="ROS_DOMAIN_ID of the peers")
+    allow_network: bool = Field(False, description="whether other machines may hear and fly it, by multicast")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Simulate or fly until interrupted; return the exit status."""
+    return run_command(_run, _USAGE, Options, arguments)
+
+
+def _run(values: dict[str, Any]) -> int:
+    from multilift_marl.deploy.ros.bag import DISTRIBUTIONS
+    from multilift_marl.deploy.ros.dds import Node
+
+    options, overrides = split_options(Options, values)
+    policy = None if options.policy == "none" else find_policy(options.policy, others=["none"])
+    overrides |= {"env.num_envs": 1, "env.num_threads": 1}
+    if options.config is None and policy is not None and policy.config is not None:
+        config = build_config(policy.config.model_dump(), overrides)
+    else:
+        config = load_config(options.config or "hover", overrides)
+    if policy is not None:
+        policy.check(config, "policy")
+    limit_torch_threads()
+    node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
+    where = "all networks" if options.allow_network else "this machine alone"
+    ending = f"in domain {options.domain}, for {where} (Ctrl-C ends it)"
+    if options.role == "policy":
+        _fly(options, config, policy, node, ending)
+    else:
+        _simulate(options, config, policy, node, ending)
+    return 0
+
+
+def _simulate(options: Options, config: Config, policy: NamedPolicy | None, node: Node, ending: str) -> None:
+    """Simulate a team, flown by a policy, or by others where there is none."""
+    from multilift_marl.deploy.ros.live import LiveFlight
+
+    with ending_at_once():
+        vec = MultiliftVec(config, EVALUATION)
+    flight = LiveFlight(vec, node, options.names, None if policy is None else policy.bind(vec))
+    clock, begin = RealTime(options.speed), time.perf_counter()
+    flight.begin(options.seed)
+    print(f"publishing {ending}", flush=True)
+    with suppress(KeyboardInterrupt):
+        while not options.seconds or flight.time_ns < options.seconds * 1e9:
+            flight.step()
+            clock.wait(flight.time_ns * 1e-9)
+    simulated, real = flight.time_ns * 1e-9, time.perf_counter() - begin
+    print(f"simulated {simulated:.1f} s in {real:.1f} s")
+    if options.speed:
+        print(f"steps began late by {_describe(clock.lateness())}, {clock.slips} too late to catch up")
+    if flight.setpoints is not None:
+        print(f"steps without a fresh set-point, by drone: {flight.setpoints.late.tolist()}")
+    _report_left_out(node)
+
+
+def _fly(options: Options, config: Config, policy: NamedPolicy | None, node: Node, ending: str) -> None:
+    """Fly a team that others measure."""
+    from multilift_marl.deploy.ros.policy_node import PolicyNode
+
+    if policy is None:
+        raise ConfigError("role=policy needs a policy: give policy=<a run, an .onnx file or a baseline>")
+    at_once, say = options.start == "at_once", partial(print, flush=True)
+    flown = PolicyNode(config, policy.bind, node, options.names, options.seed, at_once, say)
+    print(f"listening {ending}", flush=True)
+    try:
+        flown.spin(options.seconds or float("inf"))
+    except KeyboardInterrupt:
+        flown.land("Ctrl-C; once more ends this at once")
+        with suppress(KeyboardInterrupt):
+            while not flown.landed:
+                flown.spin_once(1.0)
+    print(f"flew {flown.steps} steps")
+    if flown.latency:
+        print(f"set-points followed odometry by {_describe(np.percentile(flown.latency, QUANTILES))}")
+    _report_left_out(node)
+
+
+def _report_left_out(node: Node) -> None:
+    """Say how many messages could not be read, where any could not."""
+    if left_out := node.reader.left_out:
+        counts = ", ".join(f"{count} on {name}" for name, count in sorted(left_out.items()))
+        print(f"messages that could not be read: {counts}")
+
+
+def _describe(late: np.ndarray) -> str:
+    """Return quantiles of a time [s] in words."""
+    return " / ".join(f"{1e3 * seconds:.2f}" for seconds in late) + " ms (50 / 99 / 99.9 %)"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""Bags of a flight, for `ros2 bag`, Foxglove, PlotJuggler and RViz."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores
+
+from multilift_marl._files import check_writable
+from multilift_marl.deploy.ros.messages import FlightMessages, Topic
+from multilift_marl.deploy.ros.types import typestore
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError, reason
+
+DISTRIBUTIONS = {
+    "humble": (Stores.ROS2_HUMBLE, StoragePlugin.SQLITE3, 8),
+    "jazzy": (Stores.ROS2_JAZZY, StoragePlugin.MCAP, 9),
+    "kilted": (Stores.ROS2_KILTED, StoragePlugin.MCAP, 9),
+    "lyrical": (Stores.ROS2_LYRICAL, StoragePlugin.MCAP, 9),
+}
+"""Types, storage and version of the bags of each ROS distribution: what its `ros2 bag` reads without a plugin."""
+
+
+class BagWriter:
+    """Writes a flight of environment 0, its start at once; a context that closes the bag.
+
+    Args:
+        folder: of the bag, which must not be there yet.
+        vec: the environments, after a reset.
+        distribution: a key of `DISTRIBUTIONS`.
+        names: a key of `messages.NAMES`.
+
+    Raises:
+        ConfigError: the folder is there already, or cannot be made.
+    """
+
+    def __init__(self, folder: Path, vec: MultiliftVec, distribution: str = "jazzy", names: str = "multilift"):
+        types, storage, version = DISTRIBUTIONS[distribution]
+        self._store = typestore(types)
+        self._messages = FlightMessages(vec, self._store, names)
+        check_free(folder)
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = Writer(folder, version=version, storage_plugin=storage)  # type: ignore[arg-type]
+            self._writer.open()
+        except OSError as error:
+            raise ConfigError(f"cannot write bag={folder} ({reason(error)}); give another folder") from error
+        self._connections = {
+            topic.name: self._writer.add_connection(
+                topic.name, topic.kind, typestore=self._store, offered_qos_profiles=[_qos(topic)]
+            )
+            for topic in self._messages.topics()
+        }
+        self.write(0.0)
+
+    def write(self, seconds: float) -> None:
+        """Write the state as it is, at a time since the start [s]."""
+        time_ns = round(seconds * 1e9)
+        for topic, message in self._messages.messages(time_ns):
+            connection = self._connections[topic]
+            self._writer.write(connection, time_ns, self._store.serialize_cdr(message, connection.msgtype))
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._writer.close()
+
+
+def check_free(folder: Path) -> None:
+    """Refuse, by a ConfigError, a folder that is there already, as bags are never overwritten, or cannot be made."""
+    if folder.exists():
+        raise ConfigError(f"bag={folder} is there already; give a folder that is not")
+    try:
+        check_writable(folder.parent)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"bag={folder} cannot be written ({reason(error)}); give another folder") from error
+
+
+def _qos(topic: Topic) -> Qos:
+    """Return the quality of service that a topic is offered with: the last message, as simulations publish."""
+    forever = QosTime(2147483647, 4294967295)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        1 if topic.latched or not topic.reliable else 10,
+        QosReliability.RELIABLE if topic.reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if topic.latched else QosDurability.VOLATILE,
+        forever,
+        forever,
+        QosLiveliness.AUTOMATIC,
+        forever,
+        False,
+    )

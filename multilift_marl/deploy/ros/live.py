@@ -1,0 +1,134 @@
+"""A live simulation on ROS 2 topics: what it publishes, and the set-points that it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from multilift_marl.deploy.ros.autopilots import TopicAutopilots
+from multilift_marl.deploy.ros.dds import Node
+from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, is_landing, sink
+from multilift_marl.deploy.ros.messages import NAMES, FlightMessages, setpoint_topics
+from multilift_marl.deploy.ros.types import read_place
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
+from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.policy import Policy
+
+
+class SetPoints:
+    """Set-points of others for each drone, in place of a policy: places, of which actions are made.
+
+    A drone without a fresh one holds the last one, and sinks later, down to the ground.
+
+    Args:
+        vec: one environment, of the action interface `reference`.
+        take: for each drone, the call that returns the places and attitudes that have come, see `read_place`.
+
+    Attributes:
+        age: of each drone's last set-point (N,) [s], infinite before the first.
+        late: steps in which a drone had none that was fresh (N,).
+    """
+
+    def __init__(self, vec: MultiliftVec, take: list[Callable[[], list[Any]]]):
+        if vec.config.control.action != "reference":
+            raise ConfigError(
+                f"set-points are places, for control.action=reference, not {vec.config.control.action}; change it"
+            )
+        self._vec, self._take = vec, take
+        self._place = np.zeros((vec.num_drones, 3))
+        self._yaw = np.zeros(vec.num_drones)
+        self.age = np.full(vec.num_drones, np.inf)
+        self.late = np.zeros(vec.num_drones, int)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Hold where the drones are."""
+        self._place[:] = self._vec.world.state.drone_position[0]
+        self._yaw[:] = self._vec.task.goal.drone_yaw[0] + self._vec.world.system.heading
+        self.age[:] = np.inf
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the actions (1, N, 4) whose references are the set-points, as far as offsets go."""
+        dt = self._vec.task.dt
+        for n, take in enumerate(self._take):
+            self.age[n] += dt
+            for place, rotation in take():
+                self._place[n], self.age[n] = place, 0.0
+                self._yaw[n] = np.arctan2(rotation[1, 0], rotation[0, 0])
+        self.late += self.age > HOLD_AFTER
+        sink(self._place, is_landing(self.age), dt)
+        return self._actions()
+
+    def _actions(self) -> np.ndarray:
+        goal, control = self._vec.task.planned, self._vec.config.acting
+        offset = self._place - goal.slots[0]
+        c, s = goal.slot_frame[0].T
+        turned = self._yaw - goal.drone_yaw[0] - self._vec.world.system.heading
+        # To [-π, π), or a heading just past 180° would be a turn away.
+        turned = np.remainder(turned + np.pi, 2 * np.pi) - np.pi
+        # From the world into the slot frame, where actions are.
+        numbers = [c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]]
+        action = np.stack([*(number / control.max_offset for number in numbers), turned / control.max_yaw], axis=-1)
+        return np.clip(action, -1, 1)[None].astype(np.float32)
+
+
+class LiveFlight:
+    """Environment 0 on topics, episode after episode.
+
+    Args:
+        vec: one environment.
+        node: publishes and subscribes.
+        names: of the topics, a key of `messages.NAMES`.
+        policy: of these environments; None: set-points of others, on /drone_<i>/setpoint or as PX4s hear them.
+
+    Attributes:
+        time_ns: of the simulation, over all episodes [ns].
+        setpoints: of others, where there is no policy.
+    """
+
+    def __init__(self, vec: MultiliftVec, node: Node, names: str = "multilift", policy: Policy | None = None):
+        self._vec, self._node = vec, node
+        by_motion = policy is None and NAMES[names].is_report
+        self._messages = FlightMessages(vec, node.store, names, acts=not by_motion)
+        self._publish = {topic.name: node.publisher(topic) for topic in self._messages.topics()}
+        self.setpoints: SetPoints | TopicAutopilots | None = None
+        if by_motion:
+            self.setpoints = TopicAutopilots(vec.config, vec.world, node)
+            vec.use_controller(self.setpoints)
+            policy = make_scripted("formation", vec)  # whose actions do not count
+        elif policy is None:
+            topics = [setpoint_topics(NAMES[names], i)[0]._replace(reliable=False) for i in range(vec.num_drones)]
+            self.setpoints = policy = SetPoints(vec, [node.subscription(topic, read_place) for topic in topics])
+        self._policy: Policy = policy
+        self.time_ns = 0
+
+    def begin(self, seed: int) -> None:
+        """Begin an episode, and publish its start."""
+        self._observation, _ = self._vec.reset(seed=seed)
+        self._policy.reset()
+        self._send()
+
+    def step(self) -> bool:
+        """Make a policy step and publish; return whether the episode goes on.
+
+        After its end the next one begins, a policy step later, and its start is published.
+        """
+        self._observation, _, terminated, truncated, _ = self._vec.step(self._policy.act(self._observation))
+        self.time_ns += round(self._vec.task.dt * 1e9)
+        self._node.check_publishers()
+        self._send()
+        if terminated[0] or truncated[0]:
+            self._observation, _ = self._vec.reset()
+            self._policy.reset()
+            self.time_ns += round(self._vec.task.dt * 1e9)
+            self._send()
+            return False
+        return True
+
+    def _send(self) -> None:
+        if self.setpoints is not None:
+            self._messages.landing = is_landing(self.setpoints.age)
+        for topic, message in self._messages.messages(self.time_ns):
+            self._publish[topic](message)

@@ -1,0 +1,311 @@
+"""The other half of a live flight: a node that hears odometry, flies a policy and publishes set-points, for hardware.
+
+Nothing is simulated: observations, targets and references are those of the task, of what is measured.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from multilift_marl.config.config import Config
+from multilift_marl.control.autopilot import LoadFeedforward
+from multilift_marl.deploy.ros.bodies import Bodies, Source
+from multilift_marl.deploy.ros.dds import Node
+from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER, sink
+from multilift_marl.deploy.ros.messages import (
+    BOOL,
+    NAMES,
+    ODOMETRY,
+    POSE,
+    Topic,
+    level,
+    pose_stamped,
+    setpoint_topics,
+)
+from multilift_marl.deploy.ros.types import (
+    VEHICLE_ODOMETRY,
+    control_mode,
+    px4_namespace,
+    read_measurement,
+    read_odometry,
+    read_place,
+    read_vehicle_odometry,
+    trajectory_setpoint,
+)
+from multilift_marl.envs.measured import MeasuredTeam
+from multilift_marl.errors import ConfigError
+from multilift_marl.mdp.failures import MAX_DISTANCE
+from multilift_marl.policies.policy import Policy
+
+WAITING, READY, FLYING, HOLDING, LANDING = "waiting", "ready", "flying", "holding", "landing"
+_LEAP, _LEAP_ACCELERATION = 0.1, 20.0  # [m], [m/s²]: what is farther off than these was put elsewhere
+_LEAPS = 5  # steps in a row of that, after which the task begins anew
+_SAME = 1e-9  # [m], and of a rotation's numbers, by which targets differ only in rounding
+_REMIND = 2.0  # [s] between words about what is waited for
+_REMEMBERED = 1_000_000  # steps of which the latency is known
+Say = Callable[[str], None]
+
+
+class PolicyNode:
+    """Flies a team that others measure.
+
+    A policy step begins when all bodies have been measured a period after the last one, each by its own clock. Where
+    no step can be made for 0.25 s, whatever the reason, the last set-points are held; after 2 s they sink to the
+    ground, for good. They also sink when the task or the policy fails, or when it is asked to land.
+
+    Args:
+        config: the task, its rig and control.
+        make_policy: returns the policy for its environment.
+        node: publishes and subscribes.
+        names: of the topics, a key of `messages.NAMES`; the report's drones are PX4s.
+        seed: of the episode, which a task that plans its target draws it from.
+        at_once: whether to fly as soon as all is heard; else when `true` comes on /fly.
+        say: called with what happens.
+
+    Attributes:
+        team: the task as measured.
+        mode: waiting, ready, flying, holding or landing.
+        steps: that it has flown.
+        latency: of each, from waking up for its last measurement to its last set-point [s].
+
+    Raises:
+        ConfigError: a task or an action interface that it cannot fly.
+    """
+
+    def __init__(
+        self, config: Config, make_policy: Callable[[MeasuredTeam], Policy], node: Node, names: str = "multilift",
+        seed: int = 1000, at_once: bool = True, say: Say = print,
+    ):  # fmt: skip
+        check_flyable(config)
+        self.team = MeasuredTeam(config)
+        self._policy, self._seed, self._say = make_policy(self.team), seed, say
+        self._node, self._names, self._wanted = node, NAMES[names], at_once
+        self.mode, self.steps, self.latency = WAITING, 0, deque[float](maxlen=_REMEMBERED)
+        self._plans = self.team.task.KERNELS.plan is not None
+        self._target: tuple[np.ndarray, np.ndarray] | None = None
+        self._before: tuple[np.ndarray, np.ndarray, int] | None = None  # positions, velocities, stamp of the last step
+        self._woken = self._flown = self._sent = self._reminded = self._refused = 0.0  # [s]
+        self._leaps, self._why = 0, ""
+        drones = self.team.num_drones
+        self._setpoints = np.zeros((drones, 3)), np.zeros(drones)  # the last places [m] and headings [rad]
+        self._feedforward = LoadFeedforward(config.system)
+        self._subscribe()
+        self._warm_up()
+
+    def _subscribe(self) -> None:
+        names, drones, node = self._names, range(self.team.num_drones), self._node
+        topics: list[Topic] = []
+        measured = partial(read_measurement, read_odometry)
+        for drone in drones:
+            if names.is_report:
+                topics.append(Topic(f"{px4_namespace(drone)}/out/vehicle_odometry", VEHICLE_ODOMETRY, False))
+            else:
+                topics.append(Topic(names.drone.format(drone), ODOMETRY, False))
+        topics.append(Topic(names.payload, ODOMETRY, False))
+        reported = partial(read_measurement, read_vehicle_odometry)
+        sources: list[Source] = [
+            node.subscription(topic, reported if topic.kind == VEHICLE_ODOMETRY else measured) for topic in topics
+        ]
+        self._topics = [topic.name for topic in topics]  # of each body
+        self._bodies = Bodies(sources, self.team.task.dt)
+        self._take_target = node.subscription(Topic("/target", POSE, False), read_place)
+        self._take_wish = node.subscription(Topic("/fly", BOOL, False))
+        self._publishers = [[node.publisher(topic) for topic in setpoint_topics(names, drone)] for drone in drones]
+
+    def _warm_up(self) -> None:
+        """Make a step in the task's own start, so that no step in flight is the first."""
+        self.team.command(self._policy.act(self.team.begin({}, self._seed)))
+        self.team.advance()
+        self.team.observe({})
+        self._policy.reset()
+
+    @property
+    def landed(self) -> bool:
+        """Whether it has let all drones sink to the ground, or never flew."""
+        return self.mode in (WAITING, READY) or (self.mode == LANDING and bool((self._setpoints[0][:, 2] <= 0).all()))
+
+    def land(self, why: str) -> None:
+        """Let the drones sink, for good."""
+        if self.mode not in (WAITING, READY):
+            self._change(LANDING, why)
+
+    def spin(self, seconds: float) -> None:
+        """Hear and fly for some seconds of real time."""
+        end = time.perf_counter() + seconds
+        while (left := end - time.perf_counter()) > 0:
+            self.spin_once(left)
+
+    def spin_once(self, seconds: float) -> None:
+        """Wait for something new, for some seconds or a policy step at most, and do what is due."""
+        self._node.wait(min(seconds, self.team.task.dt))
+        self._woken = now = time.perf_counter()
+        self._node.check_publishers()
+        self._bodies.poll(now)
+        self._hear_wishes()
+        if self.mode != LANDING and self._bodies.are_due() and not self._bodies.missing(now, HOLD_AFTER):
+            self._bodies.take_step()
+            self._step()
+        if self.mode in (FLYING, HOLDING, LANDING):
+            self._check_age(now)
+        elif now > self._reminded + _REMIND:
+            self._remind(now)
+
+    def _check_age(self, now: float) -> None:
+        """Hold or land where no step was made for too long."""
+        since = now - self._flown
+        if self.mode != LANDING and since > HOLD_AFTER:
+            silent = " and ".join(self._bodies.missing(now, HOLD_AFTER))
+            why = f"nothing new is heard of {silent}" if silent else self._why or "measurements are too far apart"
+            self._change(LANDING if since > LAND_AFTER else HOLDING, why)
+        if self.mode in (HOLDING, LANDING):
+            self._hold(now)
+
+    def _remind(self, now: float) -> None:
+        """Say what is waited for."""
+        self._reminded = now
+        silent = self._bodies.missing(now, HOLD_AFTER)
+        if silent:
+            left_out, bodies = self._node.reader.left_out, self._bodies.silent(now, HOLD_AFTER)
+            came = any(self._bodies.refused[body] or left_out[self._topics[body]] for body in bodies)
+            refused = " (messages came, but none was finite and newer than the last)" if came else ""
+            self._say(f"{self.mode}: nothing is heard of {', '.join(silent)}{refused}")
+        elif self._target is None and not self._plans:
+            self._say(f"{self.mode}: no /target is heard")
+        else:
+            self._say(f"{self.mode}: {self._why or 'true on /fly lets it fly'}")
+
+    def _hear_wishes(self) -> None:
+        """Take in targets, unless the task plans its own, and whether to fly."""
+        for position, rotation in self._take_target():
+            if self._plans:
+                continue
+            away = float(np.linalg.norm(position - self._bodies.measured["payload_position"]))
+            if self.mode in (FLYING, HOLDING) and away > MAX_DISTANCE:
+                self._refuse_target(away)
+            else:
+                self._target = position, rotation
+        for message in self._take_wish():
+            self._wanted = bool(message.data)
+            if not self._wanted:
+                self.land("false on /fly")
+
+    def _refuse_target(self, away: float) -> None:
+        """Say that a target is too far away [m], not for every one that comes."""
+        if self._woken > self._refused + _REMIND:
+            self._refused = self._woken
+            self._say(f"a target {away:.1f} m away is not taken: {MAX_DISTANCE:g} m is the most")
+
+    def _step(self) -> None:
+        """Make a policy step with what is measured, if one can be made."""
+        positions, velocities = self._bodies.positions()
+        stamp = int(self._bodies.stamps[-1])
+        if self._before is not None:
+            elapsed = max(1e-9 * (stamp - self._before[2]), 0.0)
+            off = np.linalg.norm(positions - self._before[0] - elapsed * self._before[1], axis=1).max()
+            # Farther than the last velocity and the largest acceleration lead.
+            self._leaps = self._leaps + 1 if off > _LEAP + 0.5 * _LEAP_ACCELERATION * elapsed**2 else 0
+            self._why = "the team has been put elsewhere" if self._leaps else ""
+            if 0 < self._leaps < _LEAPS:
+                return
+        observation = self._begin() if self._before is None or self._leaps else self._observe()
+        if observation is not None and self._fly(observation):
+            self._before, self._flown = (positions, velocities, stamp), self._woken
+            self._leaps, self._why = 0, ""
+            self._change(FLYING, "all is heard")
+            self.latency.append(time.perf_counter() - self._woken)
+            self.steps += 1
+
+    def _begin(self) -> np.ndarray | None:
+        """Return the first observation; None where the task cannot begin, or is not to."""
+        if self._target is None and not self._plans:
+            self._why = "no /target is heard"
+            return None
+        observation = self.team.begin(self._bodies.measured, self._seed, self._target)
+        self._why = f"the task has failed where the team is, {self.team.failure}" if self.team.failure else ""
+        if not self._wanted and not self._why:
+            self._change(READY, "true on /fly lets it fly")
+            reference = self.team.reference  # which begins where the drones are
+            self._publish(reference.position[0], reference.yaw[0])
+        if self._why or not self._wanted:
+            return None
+        self._policy.reset()
+        return observation
+
+    def _observe(self) -> np.ndarray | None:
+        """Return the observation; None where the task has failed."""
+        goal = self.team.task.goal
+        if self._target is not None:
+            position, rotation = self._target
+            if max(np.abs(goal.position[0] - position).max(), np.abs(goal.rotation[0] - rotation).max()) > _SAME:
+                self.team.task.place_goal(0, position, rotation)
+        observation = self.team.observe(self._bodies.measured)
+        if self.team.failure:
+            self.land(f"the task has failed, {self.team.failure}")
+            return None
+        return observation
+
+    def _fly(self, observation: np.ndarray) -> bool:
+        """Let the policy act, and publish what it wants; return whether it could."""
+        try:
+            reference = self.team.command(self._policy.act(observation))
+        except Exception as error:  # a policy of others may fail in any way, and drones are in the air
+            self.land(f"the policy has failed ({type(error).__name__}: {error})")
+            return False
+        if not self._names.is_report:
+            self._publish(reference.command[0], reference.command_yaw[0])
+            return True
+        self.team.advance()
+        self._publish(reference.position[0], reference.yaw[0], reference.velocity[0], reference.acceleration[0])
+        return True
+
+    def _hold(self, now: float) -> None:
+        """Publish the last places once more, a policy step after the last time; lower ones while it lands."""
+        elapsed = now - self._sent
+        if elapsed > 0.9 * self.team.task.dt:
+            places, yaws = self._setpoints
+            sink(places, self.mode == LANDING, min(elapsed, HOLD_AFTER))
+            self._publish(places, yaws)
+
+    def _publish(
+        self, places: np.ndarray, yaws: np.ndarray, velocities: np.ndarray | None = None,
+        accelerations: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        """Publish set-points; of PX4s with what the drones carry added to their accelerations."""
+        still = np.zeros_like(places)
+        velocities, accelerations = (still if each is None else each for each in (velocities, accelerations))
+        store, force = self._node.store, self.team.task.goal.cable_force[0]
+        newest = int(self._bodies.arrivals.argmax())
+        # By the clock of the measurements, carried on by this machine's since the newest came.
+        now = int(self._bodies.stamps[newest] + 1e9 * (self._woken - self._bodies.arrivals[newest]))
+        for i, publishers in enumerate(self._publishers):
+            if self._names.is_report:
+                rise = self._feedforward.acceleration(i, velocities[i], accelerations[i], force[i], yaws[i])
+                setpoint = trajectory_setpoint(store, now, places[i], velocities[i], rise, yaws[i])
+                messages = [control_mode(store, now), setpoint]
+            else:
+                messages = [pose_stamped(store, now, places[i], level(yaws[i]))]
+            for publish, message in zip(publishers, messages, strict=True):
+                publish(message)
+        self._setpoints, self._sent = (places.copy(), yaws.copy()), self._woken
+
+    def _change(self, mode: str, why: str) -> None:
+        if mode != self.mode:
+            self._say(f"{mode}: {why}")
+            self.mode = mode
+
+
+def check_flyable(config: Config) -> None:
+    """Refuse, by a ConfigError, what the node cannot fly."""
+    if config.control.action != "reference":
+        raise ConfigError(
+            f"set-points are places, of control.action=reference, not of {config.control.action}; take a policy of that"
+        )
+    if config.env.sensing == "onboard":
+        raise ConfigError("role=policy cannot fly policies of env.sensing=onboard: nobody measures the cables' tension")
+    if config.task == "loss":
+        raise ConfigError("role=policy cannot fly config=loss: nobody measures whose motors have stopped")

@@ -1,0 +1,40 @@
+"""The payload's surface as triangles, for plots."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from multilift_marl.rig.system import System
+
+_SIDES = 48  # of what stands for a cylinder
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+_BOX = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+     [1, 5, 7], [1, 7, 3]]
+)  # fmt: skip
+"""Triangles of the corners, counter-clockwise as seen from outside."""
+
+
+def payload_surface(system: System) -> np.ndarray:
+    """Return the triangles (F, 3, 3) of the payload's surface from its centre of mass, in its frame [m].
+
+    They are counter-clockwise as seen from outside; a point payload has none.
+    """
+    half, mesh = system.payload_size / 2, system.payload_mesh
+    if system.payload_shape == "point":
+        return np.zeros((0, 3, 3))
+    if mesh is not None:
+        return mesh.points[mesh.faces] - mesh.middle + system.payload_center
+    if system.payload_shape == "cylinder":
+        return _cylinder(half[0], half[2]) + system.payload_center
+    return (half * _CORNERS)[_BOX] + system.payload_center
+
+
+def _cylinder(radius: float, half_height: float) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    low = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(_SIDES, -half_height)])
+    high = low * [1, 1, -1]
+    after_low, after_high = np.roll(low, -1, 0), np.roll(high, -1, 0)
+    bottom, top = np.tile([0, 0, -half_height], (_SIDES, 1)), np.tile([0, 0, half_height], (_SIDES, 1))
+    sides = [(low, after_low, after_high), (low, after_high, high), (bottom, after_low, low), (top, high, after_high)]
+    return np.concatenate([np.stack(corners, axis=1) for corners in sides])

@@ -1,0 +1,202 @@
+"""Evaluation by several processes: each flies some of the episodes, as actors of Ray."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from multilift_marl import _ray
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import build_config
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.evaluation.trajectories import Recording, TrajectoryWriter, make_arrays
+from multilift_marl.policies.policy import Policy
+
+_PART, _RECORDED = 256, 32  # episodes of one task at most; of one that returns trajectories
+
+_idle: list[_Worker] | None = None
+"""Workers of earlier evaluations in a `cluster`, which keeps them."""
+
+
+@contextmanager
+def cluster(address: str, workers: int) -> Iterator[None]:
+    """Be connected to Ray meanwhile, see `_ray.connect`; processes go from one evaluation to the next."""
+    global _idle
+    owns = _ray.connect(address, workers, "ray")
+    _idle = []
+    try:
+        yield
+    finally:
+        for worker in _idle:
+            worker.end()
+        _idle = None
+        if owns:
+            _ray.disconnect()
+
+
+class _Job(NamedTuple):
+    """What all parts of an evaluation have in common."""
+
+    values: dict[str, Any]
+    """Configuration."""
+    seed: int
+    factors: Mapping[str, Any] | None
+    """See `run_episodes`."""
+    folder: str
+    """Working directory of the process that asks."""
+    path: list[str]
+    """Its `sys.path`."""
+    records: bool
+    """Whether trajectories are returned."""
+
+
+def evaluate_parallel(
+    config: Config, make_policy: Callable[[MultiliftVec], Policy], episodes: int, seed: int, workers: int,
+    progress: Callable[[int], Any] | None = None, factors: Mapping[str, Any] | None = None,
+    writer: TrajectoryWriter | None = None,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Do as `run_episodes`, by actors of Ray, to which this process is connected; the metrics are the same.
+
+    `writer` gets the trajectories, part by part.
+
+    Raises:
+        ConfigError, ValueError: see `run_episodes`.
+    """
+    import ray
+    from ray import cloudpickle
+
+    size = min(_PART if writer is None else _RECORDED, -(-episodes // workers))
+    parts = [(first, min(size, episodes - first)) for first in range(0, episodes, size)]
+    values = build_config(config.model_dump(), {"env.num_threads": 1}).model_dump(mode="json")
+    task = ray.put(cloudpickle.dumps((values, make_policy, seed, factors, writer is not None)))
+    crew = [_idle.pop() if _idle else _Worker() for _ in parts[:workers]]
+    waiting, flown, head = list(parts), dict[int, dict[str, np.ndarray]](), _ray.Head()
+    try:
+        while len(flown) < len(parts):
+            for worker in crew:
+                if worker.part is None and waiting:
+                    worker.fly(task, waiting.pop(0))
+            ray.wait([worker.result for worker in crew if worker.part is not None], timeout=1.0)
+            head.check()
+            for worker in crew:
+                if worker.part is None or (found := worker.take()) is None:
+                    continue
+                (first, _), worker.part = worker.part, None
+                flown[first], recorded = found
+                if writer is not None:
+                    writer.put(first, recorded)
+                if progress is not None:
+                    progress(sum(count for begin, count in parts if begin in flown))
+    except BaseException:
+        for worker in crew:
+            worker.end()
+        raise
+    for worker in crew:
+        if _idle is None:
+            worker.end()
+        else:
+            _idle.append(worker)
+    return {name: np.concatenate([flown[first][name] for first, _ in parts]) for name in flown[0]}
+
+
+class _Worker:
+    """A process of Ray that flies parts of evaluations; where it dies or falls silent, another one does its part.
+
+    Attributes:
+        part: that it flies: number of the first episode, and how many; None for none.
+        result: of it, to be waited for.
+    """
+
+    def __init__(self) -> None:
+        self._task: Any = None
+        self._tries = 0
+        self.part: tuple[int, int] | None = None
+        self.result: Any = None
+        self._begin()
+
+    def _begin(self) -> None:
+        import ray
+
+        actor: Any = ray.remote(**_ray.ACTOR)(_Flyer)
+        self._actor, self._pulse = actor.remote(os.getcwd(), list(sys.path)), _ray.Pulse("workers")
+
+    def fly(self, task: Any, part: tuple[int, int]) -> None:
+        """Begin with a part of a task, see `_fly_part`."""
+        self._task, self.part, self._tries = task, part, 0
+        self.result = self._actor.fly.remote(task, *part)
+
+    def take(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
+        """Return the metrics and trajectories of its part once they are there.
+
+        Raises:
+            ConfigError: too many processes died of it, or one has not started; see also `run_episodes`.
+        """
+        import ray
+
+        try:
+            self._pulse.check(self._actor)
+            if ray.wait([self.result], timeout=0)[0]:
+                found: tuple[dict[str, np.ndarray], dict[str, np.ndarray]] = ray.get(self.result)
+                return found
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause from error
+        except (ray.exceptions.RayActorError, ray.exceptions.ObjectLostError, _ray.Silent):
+            assert self.part is not None
+            self.end()
+            self._tries += 1
+            if self._tries == _ray.TRIES:
+                first, count = self.part
+                raise ConfigError(
+                    f"the worker of episodes {first} to {first + count - 1} died {_ray.TRIES} times in a row; give it "
+                    "more memory, or set workers=0"
+                ) from None
+            self._begin()
+            self.result = self._actor.fly.remote(self._task, *self.part)
+        return None
+
+    def end(self) -> None:
+        """End its process, whatever that does."""
+        import ray
+
+        ray.kill(self._actor)
+
+
+class _Flyer:
+    """A process that evaluates, as an actor of Ray; see `enter_worker` for its arguments."""
+
+    def __init__(self, folder: str, path: list[str]):
+        _ray.enter_worker(folder, path)
+
+    def pulse(self) -> int:
+        """Return the number of this process, by a thread of its own: it runs."""
+        return os.getpid()
+
+    def fly(self, task: bytes, first: int, count: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """See `_fly_part`."""
+        return _fly_part(task, first, count)
+
+
+def _fly_part(task: bytes, first: int, count: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Fly some episodes; return their metrics, and trajectories where these are asked for.
+
+    Args:
+        task: pickled configuration values, maker of the policy, seed, factors and whether trajectories are asked for.
+        first, count: number of the first episode, and how many.
+    """
+    from ray import cloudpickle
+
+    values, make_policy, seed, factors, records = cloudpickle.loads(task)
+    config = build_config(values, {})
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(1)
+    arrays = make_arrays(MultiliftVec(build_config(values, {"env.num_envs": 1})), count) if records else {}
+    record = partial(Recording, arrays) if records else None
+    return run_episodes(config, make_policy, count, seed, first=first, factors=factors, record=record), arrays

@@ -1,0 +1,54 @@
+"""What a success needs, bound by bound, for reports that say why an episode was none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from multilift_marl.mdp.env_data import Errors
+from multilift_marl.mdp.rewards import RestBounds
+from multilift_marl.sim.state import SystemState
+
+CONDITION = float("nan")  # bound of a criterion that is met or not: its excess is 1 or 0
+
+
+class Criterion(NamedTuple):
+    """One bound of the success of a task."""
+
+    name: str
+    """With its unit as suffix: _m, _deg, _s, _m_s, _rad_s, _n, or none for a ratio or a condition."""
+    bound: float
+    """In that unit, or `CONDITION`."""
+    excess: Callable[[], np.ndarray]
+    """Returns how far beyond the bound each environment is now (E,), at most 0 where it keeps to it."""
+    throughout: bool = True
+    """Whether it counts throughout `Task.success_windows`; otherwise at the end of the episode."""
+
+
+def rest_criteria(bounds: Any, errors: Errors, state: SystemState) -> tuple[Criterion, ...]:
+    """Return what `rewards.is_at_rest` asks for, its finite bounds; nothing where `bounds` are no RestBounds."""
+    if not isinstance(bounds, RestBounds):
+        return ()
+    found = (
+        Criterion("distance_m", bounds.distance, lambda: errors.distance - bounds.distance),
+        Criterion("angle_deg", float(np.rad2deg(bounds.angle)), lambda: np.rad2deg(errors.angle - bounds.angle)),
+        Criterion("speed_m_s", bounds.speed, lambda: length(state.payload_velocity) - bounds.speed),
+        Criterion("body_rate_rad_s", bounds.body_rate, lambda: length(state.payload_body_rates) - bounds.body_rate),
+    )
+    return tuple(each for each in found if np.isfinite(each.bound))
+
+
+def length(vectors: np.ndarray) -> np.ndarray:
+    """Return the lengths of vectors (E, 3)."""
+    return np.asarray(np.sqrt((vectors**2).sum(axis=1)))
+
+
+def says_criteria(task: type) -> bool:
+    """Return whether a task's `criteria` are those of its `succeeded`, not of one that it has overridden."""
+    return issubclass(_definer(task, "criteria"), _definer(task, "succeeded"))
+
+
+def _definer(task: type, name: str) -> type:
+    return next(each for each in task.__mro__ if name in vars(each))

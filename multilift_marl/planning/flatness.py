@@ -1,0 +1,165 @@
+"""The state of a whole team that carries a payload along a given motion of its pose.
+
+Pose and its derivatives ask for a force and a moment; cable forces that exert them, the nearest to those of the resting
+formation, point along the cables, so every drone's place follows, and with its acceleration its thrust (differential
+flatness, Sreenath and Kumar, RSS 2013). Derivatives are differences of five poses that are `STEP` apart.
+"""
+
+from __future__ import annotations
+
+from math import asin, atan2, cos, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl.control.cable_forces import WrenchDistribution, distribute_wrench, make_wrench_distribution
+from multilift_marl.control.formation import wrap
+from multilift_marl.kernels.jit import kernel
+from multilift_marl.math3d import (
+    add,
+    cross,
+    heading,
+    matmul,
+    mul,
+    norm,
+    put,
+    rotation_vector,
+    row,
+    scale,
+    sub,
+    tmul,
+    transpose,
+    turn,
+    unit,
+    vec,
+)
+from multilift_marl.physical import GRAVITY
+from multilift_marl.planning.team_model import TeamModel
+from multilift_marl.rig.system import System
+
+STEP = 0.02  # [s]
+SAMPLES = 5  # poses of a state
+MIN_LIFT = 0.1  # of a cable's force at rest, that its vertical component is at least
+
+
+class FlatTeam(NamedTuple):
+    """What `set_flat_state` needs of a team."""
+
+    model: TeamModel
+    force: np.ndarray
+    """(N, 3) of each cable on the resting payload, its heading frame [N]."""
+    distribution: WrenchDistribution
+
+
+def make_flat_team(model: TeamModel, system: System) -> FlatTeam:
+    """Return the numbers of a team."""
+    return FlatTeam(model, system.formation_force.copy(), make_wrench_distribution(system.anchors))
+
+
+class FlatWork(NamedTuple):
+    """Arrays that `set_flat_state` works in."""
+
+    force: np.ndarray
+    """(3, N, 3) of the cables on the payload, `STEP` before, at, and after the state [N]."""
+    place: np.ndarray
+    """(3, N, 3) of the drones [m]."""
+
+    @classmethod
+    def of(cls, num_drones: int) -> FlatWork:
+        """Return arrays for N drones."""
+        return cls(np.zeros((3, num_drones, 3)), np.zeros((3, num_drones, 3)))
+
+
+@kernel
+def set_flat_state(position, rotation, yaw, load, team, w, x):
+    """Write the state (12 + 7 N,) of a team whose payload moves so.
+
+    Args:
+        position: (5, 3) of the payload, `STEP` apart [m].
+        rotation: (5, 3, 3) its attitude there.
+        yaw: which the state's yaw is near to [rad]: it may exceed π.
+        load: (7,) other force, moment and mass of the payload, see `team_model.accelerations`.
+        team: FlatTeam.
+        w: FlatWork.
+        x: written.
+    """
+    count = team.force.shape[0]
+    q = 6 + 2 * count
+    for i in range(3):
+        _place_team(i, position, rotation, load, team, w)
+    middle = _matrix(rotation, 2)
+    put(x[0:3], row(position, 2))
+    roll, pitch, turned = euler_angles(middle)
+    x[3], x[4], x[5] = roll, pitch, yaw + wrap(turned - yaw)
+    put(x[q : q + 3], scale(0.5 / STEP, sub(row(position, 3), row(position, 1))))
+    put(x[q + 3 : q + 6], tmul(middle, scale(0.5 / STEP, _turned(rotation, 1, 3))))
+    for n in range(count):
+        before, here, after = unit(vec(w.force, 0, n)), unit(vec(w.force, 1, n)), unit(vec(w.force, 2, n))
+        f, m = vec(w.force, 1, n), team.model.drone_mass[n]
+        for i in range(2):
+            x[6 + 2 * n + i] = here[i]
+            x[q + 6 + 2 * n + i] = (after[i] - before[i]) * (0.5 / STEP)
+        middle_place = vec(w.place, 1, n)
+        moved = sub(add(vec(w.place, 0, n), vec(w.place, 2, n)), scale(2.0, middle_place))
+        thrust = add(f, scale(m, add(scale(1.0 / STEP**2, moved), (0.0, 0.0, GRAVITY))))
+        put(x[2 * q + 3 * n : 2 * q + 3 * n + 3], thrust)
+
+
+@kernel
+def euler_angles(m):
+    """Return roll, pitch and yaw of Rz(yaw) Ry(pitch) Rx(roll)."""
+    return atan2(m[7], m[8]), -asin(min(max(m[6], -1.0), 1.0)), atan2(m[3], m[0])
+
+
+@kernel
+def _matrix(rotation, i):
+    return (
+        rotation[i, 0, 0], rotation[i, 0, 1], rotation[i, 0, 2],
+        rotation[i, 1, 0], rotation[i, 1, 1], rotation[i, 1, 2],
+        rotation[i, 2, 0], rotation[i, 2, 1], rotation[i, 2, 2],
+    )  # fmt: skip
+
+
+@kernel
+def _turned(rotation, i, j):
+    """Return the rotation vector from attitude i to attitude j, world frame [rad]."""
+    return rotation_vector(matmul(_matrix(rotation, j), transpose(_matrix(rotation, i))))
+
+
+@kernel
+def _place_team(i, position, rotation, load, team, w):
+    """Write cable forces and places of the drones at pose i + 1 of five."""
+    model = team.model
+    here, attitude = row(position, i + 1), _matrix(rotation, i + 1)
+    velocity = scale(0.5 / STEP, sub(row(position, i + 2), row(position, i)))
+    change = sub(add(row(position, i), row(position, i + 2)), scale(2.0, here))
+    rates = scale(0.5 / STEP, _turned(rotation, i, i + 2))
+    spin = scale(1.0 / STEP**2, sub(_turned(rotation, i + 1, i + 2), _turned(rotation, i, i + 1)))
+    force = scale(model.payload_mass + load[6], add(scale(1.0 / STEP**2, change), (0.0, 0.0, GRAVITY)))
+    force = sub(add(force, scale(model.drag * norm(velocity), velocity)), (load[0], load[1], load[2]))
+    body_rates, body_spin = tmul(attitude, rates), tmul(attitude, spin)
+    moment = add(_times(model.inertia, body_spin), cross(body_rates, _times(model.inertia, body_rates)))
+    moment = mul(attitude, sub(moment, (load[3], load[4], load[5])))
+    psi = heading(attitude)
+    c, s = cos(psi), sin(psi)
+    for n in range(team.force.shape[0]):
+        nominal = turn(c, s, row(team.force, n))
+        put(w.force[i, n], nominal)
+        force = sub(force, nominal)
+        moment = sub(moment, cross(mul(attitude, row(model.anchors, n)), nominal))
+    linear, angular = distribute_wrench(force, moment, attitude, team.distribution)
+    for n in range(team.force.shape[0]):
+        arm = mul(attitude, row(model.anchors, n))
+        f = add(vec(w.force, i, n), add(linear, cross(angular, arm)))
+        f = (f[0], f[1], max(f[2], MIN_LIFT * team.force[n, 2]))  # a cable cannot push
+        put(w.force[i, n], f)
+        put(w.place[i, n], add(add(here, arm), scale(model.length[n], unit(f))))
+
+
+@kernel
+def _times(matrix, vector):
+    return (
+        matrix[0, 0] * vector[0] + matrix[0, 1] * vector[1] + matrix[0, 2] * vector[2],
+        matrix[1, 0] * vector[0] + matrix[1, 1] * vector[1] + matrix[1, 2] * vector[2],
+        matrix[2, 0] * vector[0] + matrix[2, 1] * vector[1] + matrix[2, 2] * vector[2],
+    )

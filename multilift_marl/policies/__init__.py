@@ -1,0 +1,1 @@
+"""Baselines and tuned linear policies; beside them, the files of the shipped learned policies."""

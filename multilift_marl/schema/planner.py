@@ -1,0 +1,54 @@
+"""Parameters of the model-predictive planner (`policy=mpc`): its horizon, what it weighs, its limits."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from multilift_marl.schema.values import Between, Float, Int, Section
+
+
+class PlannerConfig(Section):
+    """The planner looks `steps` times `step` ahead; a deviation as large as its tolerance costs 1/2 in each second."""
+
+    steps: Int = Field(20, ge=5, le=200, description="of the horizon")
+    step: Annotated[Float, Between(0.005, 0.5, "s")] = Field(0.05, description="[s] length of each")
+    iterations: Int = Field(1, ge=1, le=100, description="Gauss-Newton iterations in each policy step")
+    position: Annotated[Float, Between(1e-4, 100, "m")] = Field(0.02, description="[m] tolerance of the payload")
+    attitude: Annotated[Float, Between(0.01, 1000, "deg")] = Field(8.6, description="[deg] of the payload")
+    cable: Annotated[Float, Between(0.01, 1000, "deg")] = Field(8.6, description="[deg] of each cable's direction")
+    velocity: Annotated[Float, Between(1e-3, 1000, "m/s")] = Field(0.3, description="[m/s] of the payload")
+    body_rates: Annotated[Float, Between(1e-3, 1000, "rad/s")] = Field(1.0, description="[rad/s] of the payload")
+    cable_rates: Annotated[Float, Between(1e-3, 1000, "rad/s")] = Field(1.0, description="[rad/s] of each cable")
+    thrust: Annotated[Float, Between(1e-4, 100)] = Field(
+        0.25, description="[-] of each thrust vector, over the thrust at rest"
+    )
+    thrust_rate: Annotated[Float, Between(1e-3, 1000, "1/s")] = Field(
+        3.3, description="[1/s] of its change, over the thrust at rest; larger: quicker, less smooth"
+    )
+    end: Annotated[Float, Between(0, 1000, "s")] = Field(
+        0.2, description="[s] that the last state counts for: what comes after the horizon"
+    )
+    least_tension: Annotated[Float, Between(0, 10)] = Field(
+        0.05, description="[-] of each cable, over its tension at rest; less costs as much as `tension` below it says"
+    )
+    tension: Annotated[Float, Between(1e-4, 10)] = Field(0.03, description="[-] tolerance of what is missing, likewise")
+    largest_thrust: Annotated[Float, Between(0.1, 2)] = Field(0.95, description="[-] over what the rotors can give")
+    separation: Annotated[Float, Between(0, 10)] = Field(
+        1.1, description="[-] least distance of drones, over that which counts as a collision"
+    )
+    estimate: bool = Field(
+        True, description="whether mass beside the nominal one, force and moment on the payload are estimated"
+    )
+    estimate_noise: Annotated[Float | None, Between(1e-3, 1000)] = Field(
+        None,
+        description="[-] of forces as measured for that, over the payload's weight; larger: slower; None: 0.2 with "
+        "env.sensing=ideal, else 1",
+    )
+    delay: Annotated[Float, Between(0, 1, "s")] = Field(
+        0.0, description="[s] by which actions and what is measured are late: the plan begins with the state then"
+    )
+    lead: Annotated[Float | None, Between(0, 1, "s")] = Field(
+        None, description="[s] thrusts are commanded ahead of the plan; None: motor lag and half a policy step"
+    )

@@ -1,0 +1,89 @@
+"""The shipped policy of `hover`, trained on one rig, and baselines on rigs that it has not seen, on the same episodes.
+
+  python results/unseen_rigs.py [episodes=20]     all rigs -> results/hover/unseen_rigs.json (fewer episodes: not kept)
+
+The policy was trained with four falcons, cables of equal length and a plate of 1.2 kg. A hidden mass (± 20 %) and force
+(to 0.12 of the payload's weight) are drawn on every rig. `python results/reproduce.py table` writes the table.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from flights import HERE
+
+from multilift_marl._files import write_whole
+from multilift_marl.agents.policy import load_policy
+from multilift_marl.config.load import load_config
+from multilift_marl.evaluation.metrics import bootstrap
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.evaluation.suites import list_shifts
+from multilift_marl.policies.baselines import make_scripted
+
+EPISODES, SEED = 250, 2000
+BASELINES = ("formation", "formation_integral", "formation_feedback", "payload_geometric")
+L_SHAPE = [(0, 0), (0.9, 0), (0.9, 0.3), (0.3, 0.3), (0.3, 0.7), (0, 0.7)]  # [m] counter-clockwise, 0.1 m thick
+
+RIGS: dict[str, dict[str, Any]] = {
+    "as in training": {},
+    **{rig.title: rig.overrides for rig in list_shifts(4, "rigs")},  # those of the benchmark, too
+    "five drones, L-shaped payload of 2 kg, cables of 0.6 to 1 m": {
+        "env.num_drones": 5,
+        "payload.mass": 2.0,
+        "payload.shape": "mesh",
+        "payload.anchors": [[0.02, 0.02, 0.1], [0.5, 0.02, 0.1], [0.88, 0.15, 0.1], [0.28, 0.6, 0.1], [0.02, 0.5, 0.1]],
+        "payload.origin": "file",
+        "cable.length": [0.8, 0.6, 1.0, 0.7, 0.9],
+    },
+    "cables as chains of 20 g": {"cable.model": "chain"},
+}
+
+
+def write_prism(path: Path, outline: list[tuple[float, float]], height: float) -> None:
+    """Write an upright prism over a polygon as an OBJ file [m]."""
+    n = len(outline)
+    lines = [f"v {x} {y} {z}" for z in (0.0, height) for x, y in outline]
+    lines += [f"f {' '.join(str(i) for i in range(n, 0, -1))}", f"f {' '.join(str(n + i) for i in range(1, n + 1))}"]
+    lines += [f"f {i + 1} {(i + 1) % n + 1} {n + (i + 1) % n + 1} {n + i + 1}" for i in range(n)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def evaluate(overrides: dict[str, Any], episodes: int) -> dict[str, Any]:
+    """Return success and error [m] of the policy and of each baseline, and the policy's interval of the error."""
+    mass = overrides.get("payload.mass", 1.2)
+    config = load_config("hover", overrides | {"randomization.payload_force": 0.12 * 9.81 * mass})
+    row: dict[str, Any] = {}
+    makers = {"learned": load_policy("hover").bind} | {name: partial(make_scripted, name) for name in BASELINES}
+    for name, maker in makers.items():
+        flown = run_episodes(config, maker, episodes, SEED)
+        error = flown["payload_position_error_m"]
+        row[name] = {"success": float(flown["success_rate"].mean()), "error": float(error.mean())}
+        row[name]["error_ci95"] = [float(bound) for bound in bootstrap(error)]
+    return row
+
+
+def main(episodes: int = EPISODES) -> None:
+    """Evaluate, print and, with all episodes, write."""
+    with tempfile.TemporaryDirectory() as folder:
+        mesh = Path(folder) / "l_shape.obj"
+        write_prism(mesh, L_SHAPE, 0.1)
+        rows = []
+        for title, overrides in RIGS.items():
+            own = overrides | ({"payload.mesh": str(mesh)} if overrides.get("payload.shape") == "mesh" else {})
+            rows.append({"rig": title} | evaluate(own, episodes))
+            print(json.dumps(rows[-1]), flush=True)
+    if episodes == EPISODES:
+        content = {"episodes": episodes, "seed": SEED, "rows": rows}
+        write_whole(HERE / "hover" / "unseen_rigs.json", f"{json.dumps(content, indent=1)}\n".encode())
+
+
+if __name__ == "__main__":
+    given = dict(word.partition("=")[::2] for word in sys.argv[1:])
+    if set(given) - {"episodes"}:
+        sys.exit(__doc__)
+    main(int(given.get("episodes", EPISODES)))

@@ -1,0 +1,86 @@
+"""Training with several rigs at once: one network for teams of different sizes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_trainer, refusal
+
+from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.trainer import resume_run
+from multilift_marl.config.load import build_config
+from multilift_marl.envs.core import TRAINING_EVALUATION
+from multilift_marl.evaluation.rollout import run_episodes
+
+RIGS = [{"env.num_drones": 3, "cable.length": 0.7}, {"env.num_drones": 5}]
+TWO = {"train.rigs": RIGS, "train.algorithm": "ippo", "env.units": "cable"}
+
+
+def weights(trainer) -> torch.Tensor:
+    """Return all weights of policy and critic."""
+    networks = (trainer.learner.actor, trainer.learner.critic)
+    return torch.cat([tensor.flatten().double() for net in networks for tensor in net.state_dict().values()])
+
+
+def test_one_rig_that_differs_in_nothing_is_none(tmp_path):
+    learned = []
+    for rigs in ([], [{}]):
+        trainer = make_trainer(tmp_path, **{"train.rigs": rigs})
+        for _ in range(2):
+            trainer.step()
+        learned.append(weights(trainer))
+    assert torch.equal(*learned)
+
+
+def test_teams_of_different_sizes_learn_together(tmp_path):
+    trainer = make_trainer(tmp_path, **TWO)
+    before = weights(trainer)
+    values = trainer.step()
+    batches = trainer.rollouts.collect(1)
+    assert [batch["agents", "observation"].shape[2] for batch in batches] == [3, 5]
+    assert [len(batch) for batch in batches] == [trainer.config.env.num_envs // 2] * 2
+    assert not torch.equal(weights(trainer), before)
+    assert np.isfinite(list(values.values())).all()
+
+
+@pytest.mark.slow
+def test_rigs_resume_bit_for_bit(tmp_path):
+    whole = make_trainer(tmp_path, **TWO)
+    for _ in range(4):
+        whole.step()
+    halted = make_trainer(tmp_path, **TWO)
+    for _ in range(2):
+        halted.step()
+    halted.save("last")
+    resumed = resume_run(halted.folder, {})
+    for _ in range(2):
+        resumed.step()
+    assert torch.equal(weights(resumed), weights(whole))
+
+
+def test_evaluations_fly_every_rig(tmp_path):
+    trainer = make_trainer(tmp_path, **TWO, **{"eval.episodes": 4})
+    values = trainer.evaluate()
+    policy = LearnedPolicy(trainer._content(), "the run")
+    config = trainer.config
+    returns = [
+        run_episodes(build_config(config.model_dump(), rig), policy.bind, 2, config.seed, TRAINING_EVALUATION)["return"]
+        for rig in RIGS
+    ]
+    assert values["eval/return"] == pytest.approx(np.concatenate(returns).mean(), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "overrides, said",
+    [
+        ({**TWO, "train.algorithm": "mappo"}, "need train.algorithm=ippo"),
+        ({**TWO, "train.workers": 2}, "train.rigs and train.workers do not go together"),
+        ({**TWO, "env.num_envs": 3}, "cannot be shared by the 2 of train.rigs"),
+        ({**TWO, "train.rigs": [{"task": "gate"}]}, "train.rigs cannot hold 'task'"),
+        ({**TWO, "train.rigs": [{}, {"control.action": "velocity"}]}, "differ in what drones observe or act by"),
+        ({**TWO, "train.rigs": [{"env.drones": 3}]}, "env.drones"),
+    ],
+)
+def test_rigs_that_cannot_be_trained_together_are_refused(tmp_path, overrides, said):
+    assert said in refusal(make_trainer, tmp_path, **overrides)

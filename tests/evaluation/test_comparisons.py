@@ -1,0 +1,119 @@
+"""Comparisons of policies: rates, intervals, gains and tables, by numbers that were worked out apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from multilift_marl.evaluation.metrics import (
+    _ROWS,
+    bootstrap,
+    compare,
+    format_table,
+    is_better,
+    is_gain,
+    summarize,
+    wilson,
+)
+from multilift_marl.mdp.failures import CAUSES
+
+
+def episodes(count: int = 40, seed: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    values = {key.removesuffix("_held"): rng.normal(5, 1, count) for key, *_ in _ROWS}
+    values |= {"success_rate": rng.random(count) < 0.6, "precise_rate": rng.random(count) < 0.3}
+    values["failure_cause"] = np.where(values["success_rate"], 0, rng.integers(0, 3, count))
+    return values
+
+
+@pytest.mark.parametrize("successes, trials", [(0, 7), (3, 7), (7, 7), (50, 200)])
+def test_a_rates_interval_is_where_the_score_test_rejects(successes, trials):
+    low, high = wilson(successes, trials)
+    for bound in (low, high):
+        if 0 < bound < 1:
+            score = (successes / trials - bound) / np.sqrt(bound * (1 - bound) / trials)
+            assert abs(score) == pytest.approx(1.959964, rel=1e-9)
+    assert (low == 0) == (successes == 0) and (high == 1) == (successes == trials)
+    assert low <= successes / trials <= high
+
+
+def test_a_means_interval_is_that_of_resampled_means():
+    values = np.random.default_rng(3).exponential(2.0, 400)
+    low, high = bootstrap(values)
+    half = 1.959964 * values.std() / np.sqrt(400)
+    assert low == pytest.approx(values.mean() - half, abs=0.15 * half)
+    assert high == pytest.approx(values.mean() + half, abs=0.15 * half)
+    assert bootstrap(values) == (low, high) != bootstrap(values, seed=1)
+
+
+def test_a_summary_has_each_metric_over_all_over_those_that_held_and_over_successes():
+    flown = episodes()
+    summary = summarize(flown)
+    success, cause = flown["success_rate"], flown["failure_cause"]
+    assert summary["success_rate"]["mean"] == success.mean()
+    assert summary["precise_rate"]["ci95"] == list(wilson(int(flown["precise_rate"].sum()), 40))
+    for name in ("payload_position_error_m", "settling_time_s", "payload_rmse_m"):
+        assert summary[name]["mean"] == pytest.approx(flown[name].mean())
+        assert summary[f"{name}_held"]["mean"] == pytest.approx(flown[name][cause == 0].mean())
+        assert summary[f"{name}_successful"]["mean"] == pytest.approx(flown[name][success].mean())
+    assert "energy_j_held" not in summary and "failure_cause" not in summary and "failure_none_rate" not in summary
+    for index, name in enumerate(CAUSES[1:], 1):
+        assert summary[f"failure_{name}_rate"]["mean"] == (cause == index).mean()
+
+
+def test_differences_are_policy_minus_baseline_pair_by_pair():
+    first, second = episodes(), episodes(seed=1)
+    paired = compare(first, second)
+    assert "failure_cause" not in paired
+    for name, each in paired.items():
+        difference = first[name].astype(float) - second[name].astype(float)
+        assert each["mean"] == pytest.approx(difference.mean())
+        assert each["ci95"] == list(bootstrap(difference))
+
+
+CASES = {  # differences of success and error: whether that is a gain, also by the means alone
+    "more success": ([1] * 12 + [0] * 28, [0.0] * 40, True, True),
+    "less success": ([-1] * 12 + [0] * 28, [-1.0] * 40, False, False),
+    "as much success, less error": ([0] * 40, [-0.1, -0.2] * 20, True, True),
+    "as much success, more error": ([0] * 40, [0.1, 0.2] * 20, False, False),
+    "error within the noise": ([0] * 40, [-1.0] * 21 + [1.0] * 19, False, True),
+    "a little less success, less error": ([-1, 1, -1] + [0] * 37, [-0.1, -0.2] * 20, False, False),
+    "error of those that end otherwise alone": ([1, -1] + [0] * 38, [-9.0, -9.0] + [0.1] * 38, False, False),
+    "nothing alike": ([1, -1] * 20, [-9.0] * 40, False, False),
+}
+
+
+@pytest.mark.parametrize("success, error, gain, by_means", CASES.values(), ids=CASES)
+def test_a_gain_is_in_success_first_and_then_in_the_error_of_episodes_that_end_alike(success, error, gain, by_means):
+    success, error = np.array(success, float), np.array(error)
+    assert is_gain(success, error) == gain
+    other = {"success_rate": success < 0, "payload_position_error_m": np.full(40, 5.0)}
+    policy = {"success_rate": success > 0, "payload_position_error_m": 5.0 + error}
+    assert is_better(policy, other) == gain and is_better(policy, other, beyond_noise=False) == by_means
+
+
+def test_a_table_has_means_and_intervals_in_its_units():
+    flown, other = episodes(), episodes(seed=1)
+    summaries = {"policy": summarize(flown), "baselines": {"script": summarize(other)}}
+    lines = format_table(summaries, "mine").splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert (
+        cells[0] == ["", "mine", "script"] and set(lines[1]) == {"|", "-"} and len({len(line) for line in lines}) == 1
+    )
+    rows = {row[0]: row[1:] for row in cells[2:]}
+    for key, heading, factor, digits in _ROWS:
+        for cell, summary in zip(rows[heading], (summarize(flown), summarize(other)), strict=True):
+            value = summary[key]
+            numbers = [factor * value["mean"], *(factor * bound for bound in value["ci95"])]
+            assert cell == "{0:.{3}f} ({1:.{3}f} - {2:.{3}f})".format(*numbers, digits)
+    percent = {
+        "success [%]",
+        "within 1 cm and 1 deg [%]",
+        "position error [cm]",
+        "... without failure [cm]",
+        "RMSE [cm]",
+    }
+    assert {heading for _, heading, factor, _ in _ROWS if factor == 100} == percent
+    found = (flown["failure_cause"] == 1).mean()
+    assert rows["ground [%]"][0].startswith(f"{100 * found:.1f} (")
+    assert "tilt [%]" not in rows  # nobody has failed so

@@ -1,0 +1,124 @@
+"""The policy mpc: it flies paths, poses and hidden loads; what it sees ahead is what comes; what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import refusal
+
+import multilift_marl as ml
+from multilift_marl.config.load import load_config
+from multilift_marl.envs.measured import MeasuredTeam
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.policies.baselines import make_scripted
+
+BY_RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
+FAST = {"task_options.speed": 2.0, "task_options.acceleration": 4.0, "task_options.rmse_from": 3.0}
+
+
+def fly(config, overrides, episodes=2, seconds=6.0):
+    loaded = load_config(config, BY_RATES | overrides | {"env.episode_seconds": seconds, "env.num_threads": 1})
+    return run_episodes(loaded, lambda vec: make_scripted("mpc", vec), episodes, 77)
+
+
+@pytest.mark.parametrize("overrides", [{}, {"env.num_drones": 3}, {"env.num_drones": 6}])
+def test_it_keeps_to_a_figure_eight_within_millimetres(overrides):
+    result = fly("track", FAST | overrides)
+    assert (result["payload_rmse_m"] < 0.0025).all()
+
+
+@pytest.mark.slow
+def test_chains_and_a_hidden_mass_cost_little():
+    assert (fly("track", FAST | {"cable.model": "chain"}, 1)["payload_rmse_m"] < 0.004).all()
+    assert (fly("track", FAST | {"randomization.payload_mass": 0.2})["payload_rmse_m"] < 0.004).all()
+    late = {"randomization.action_delay": 1, "planner.delay": 0.02}
+    assert (fly("track", FAST | late)["payload_rmse_m"] < 0.006).all()
+
+
+def test_it_holds_what_it_does_not_know():
+    """Hidden mass ± 20 % and a force up to 1.5 N, from starts up to half a metre away."""
+    result = fly("hover", {}, episodes=4, seconds=8.0)
+    assert result["success_rate"].all() and (result["payload_position_error_m"] < 0.001).all()
+    without = fly("hover", {"planner.estimate": False}, episodes=4, seconds=8.0)
+    assert (without["payload_position_error_m"] > 0.01).all()
+
+
+@pytest.mark.slow
+def test_late_cameras_cost_a_centimetre():
+    assert (fly("track", FAST | {"env.sensing": "mocap"})["payload_rmse_m"] < 0.02).all()
+
+
+@pytest.mark.slow
+def test_it_flies_tilted_poses():
+    result = fly("pose", {}, episodes=2, seconds=8.0)
+    assert result["success_rate"].all() and (result["payload_position_error_m"] < 0.01).all()
+
+
+def test_a_target_that_leaps_is_approached():
+    vec = ml.make_vec("hover", num_envs=2, num_threads=1, **BY_RATES)
+    observation, _ = vec.reset(seed=3)
+    policy = make_scripted("mpc", vec)
+    for k in range(250):
+        if k == 100:
+            for e in range(2):
+                vec.task.place_goal(e, vec.task.goal.position[e] + [0.8, -0.6, 0.3])
+            assert (np.linalg.norm(vec.world.state.payload_position - vec.task.goal.position, axis=1) > 1).all()
+        observation, _, ended, *_ = vec.step(policy.act(observation))
+        assert not ended.any()
+    assert (np.linalg.norm(vec.world.state.payload_position - vec.task.goal.position, axis=1) < 2e-3).all()
+
+
+@pytest.mark.parametrize("config", ["track", "pose"])
+def test_what_it_sees_ahead_is_what_comes(config):
+    vec = ml.make_vec(config, num_envs=2, num_threads=1)
+    vec.reset(seed=5)
+    times = vec.task.time[:, None] + np.arange(1, 60) * vec.task.dt
+    position, rotation = vec.task.preview_targets(times)
+    for k in range(59):
+        vec.step(np.zeros((2, vec.num_drones, vec.action_size)), restart=True)
+        assert vec.task.planned.position == pytest.approx(position[:, k], abs=1e-9)
+        assert vec.task.planned.rotation == pytest.approx(rotation[:, k], abs=1e-9)
+
+
+def test_its_flight_is_the_same_alone_and_again():
+    def actions(num_envs, first):
+        vec = ml.make_vec("track", num_envs=num_envs, first_env=first, num_threads=1, **BY_RATES)
+        observation, _ = vec.reset(seed=3)
+        policy, taken = make_scripted("mpc", vec), []
+        for _ in range(5):
+            taken.append(policy.act(observation))
+            observation, *_ = vec.step(taken[-1])
+        return np.array(taken)
+
+    together = actions(3, 0)
+    assert np.array_equal(actions(3, 0), together)
+    assert np.array_equal(actions(1, 2)[:, 0], together[:, 2])
+
+
+@pytest.mark.parametrize(
+    ("config", "overrides", "said"),
+    [
+        ("takeoff", {}, "policy=mpc cannot fly task takeoff"),
+        ("gate", {}, "policy=mpc cannot fly task gate"),
+        ("loss", {}, "policy=mpc cannot fly task loss"),
+        ("recover", {}, "policy=mpc cannot fly task recover"),
+        ("hover", {"env.num_drones": 1}, "two cables or more"),
+        ("hover", {"payload.shape": "point"}, "two cables or more"),
+        ("hover", {"control.action": "reference"}, "acts by control.action=acc_rates"),
+    ],
+)
+def test_what_it_cannot_fly_is_refused(config, overrides, said):
+    vec = ml.make_vec(config, num_envs=1, num_threads=1, **(BY_RATES | overrides))
+    assert said in refusal(make_scripted, "mpc", vec)
+
+
+def test_a_team_whose_rotors_are_not_measured_is_refused():
+    vec = MeasuredTeam(load_config("hover", BY_RATES))
+    assert "rotor speeds" in refusal(make_scripted, "mpc", vec)
+
+
+def test_observations_of_other_environments_are_refused():
+    vec = ml.make_vec("hover", num_envs=2, num_threads=1, **BY_RATES)
+    observation, _ = vec.reset(seed=0)
+    with pytest.raises(ValueError, match="give the observations of all of them"):
+        make_scripted("mpc", vec).act(observation[:1])

@@ -1,0 +1,86 @@
+"""Task recover: harsh starts, grace, and what counts as recovered."""
+
+import numpy as np
+import pytest
+from conftest import make, zeros
+
+from multilift_marl.mdp.failures import CABLE, TILT, ignore
+
+
+def starts(config: str, count: int = 200):
+    """Return environments of `config` at their starts."""
+    vec = make(config, num_envs=count, **({"num_drones": 2} if "crazymarl" in config else {}))
+    vec.reset(seed=0)
+    return vec
+
+
+def test_default_starts_are_as_documented():
+    vec = starts("recover")
+    state, goal, system = vec.world.state, vec.task.goal, vec.world.system
+    assert (np.abs(goal.position[:, :2]) <= 1).all() and goal.position[:, 2].min() >= 1.5 > goal.position[
+        :, 2
+    ].max() - 1
+    assert vec.task.errors.distance.max() <= 0.5
+    tilt = np.rad2deg(np.arccos(np.clip(state.drone_rotation[..., 2, 2], -1, 1)))
+    assert tilt.max() <= 90 + 1e-9 and tilt.max() > 80
+    assert np.rad2deg(vec.task.errors.angle).max() <= 90
+    for speed in (np.linalg.norm(state.drone_velocity, axis=-1), np.linalg.norm(state.payload_velocity, axis=-1)):
+        assert 0.9 < speed.max() <= 1
+    anchors = state.payload_position[:, None] + np.einsum("eij,nj->eni", state.payload_rotation, system.anchors)
+    span = np.linalg.norm(state.drone_position - anchors, axis=-1)
+    assert span.min() >= 0.6 - 1e-9 and span.max() <= 1.0
+    assert (state.cable_tension == 0).all()
+
+
+def test_crazymarl_starts_are_its_samplers():
+    vec = starts("recover_crazymarl", 1000)
+    state = vec.world.state
+    load, drones = state.payload_position, state.drone_position
+    assert np.abs(load[:, :2]).max() <= 1.5 and load[:, 2].max() <= 3 and load[:, 2].min() == 0.0055
+    assert (load[:, 2] == 0.0055).mean() == pytest.approx(0.25, abs=0.05)
+    apart = np.linalg.norm(drones[:, 0] - drones[:, 1], axis=-1)
+    assert apart.min() >= 0.19
+    distance = np.linalg.norm(drones - load[:, None], axis=-1)
+    assert distance.max() <= 0.3 + 1e-9
+    expected = np.random.default_rng(0).normal(0.3, 0.1, 100_000).clip(0.05, 0.3)
+    high = load[:, 2] > 0.5  # else the ground lifts drones
+    assert distance[high & (load[:, 2] < 2.7)].min() == pytest.approx(0.05, abs=1e-9)  # nor the ceiling
+    for quantile in (0.1, 0.25, 0.4):
+        assert np.quantile(distance[high], quantile) == pytest.approx(np.quantile(expected, quantile), abs=0.01)
+    assert state.drone_velocity.std() == pytest.approx(0.2, rel=0.05)
+    assert state.drone_body_rates.std() == pytest.approx(np.deg2rad(20), rel=0.05)
+    assert (vec.task.goal.position == [0, 0, 1.5]).all()
+
+
+def test_tilt_and_cable_angle_count_after_the_grace_alone():
+    vec = make("recover", num_envs=2)
+    vec.reset(seed=0)
+    assert (vec.task.mask.ignored == ignore(TILT, CABLE)).all()
+    for step in range(101):
+        assert (vec.task.mask.ignored != 0).all() == (step <= 100 and vec.task.time[0] <= 2.0)
+        vec.step(zeros(vec))
+    assert (vec.task.mask.ignored == 0).all()
+
+
+def test_success_is_within_a_centimetre_at_the_end():
+    vec = make("recover", num_envs=2, **{"env.episode_seconds": 1.0})
+    vec.reset(seed=0)
+    for _ in range(vec.max_steps):
+        info = vec.step(zeros(vec))[4]
+    assert not info["success"].any()
+    vec.task.good_time[:] = [0.5, 0.48]
+    assert vec.task.succeeded().tolist() == [True, False]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("config", ["recover", "recover_crazymarl"])
+def test_the_formation_recovers_from_most_starts(config):
+    vec = starts(config, 32)
+    success, over = np.zeros((2, 32), bool)
+    for _ in range(vec.max_steps):
+        _, _, terminated, truncated, info = vec.step(zeros(vec))
+        new = (terminated | truncated) & ~over
+        success[new], over = info["success"][new], over | terminated | truncated
+        if (terminated | truncated).any() and not over.all():
+            vec.reset(mask=terminated | truncated)
+    assert success.mean() > 0.8

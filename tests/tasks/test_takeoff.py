@@ -1,0 +1,207 @@
+"""Take-off: its starts on the ground, its plan, what is forgiven there, its success."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import make, refusal, zeros
+from test_scripted_flights import fly_once
+
+import multilift_marl as ml
+from multilift_marl.math3d import axis_angle
+from multilift_marl.mdp.ground import resting_distance
+from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.tasks.takeoff import ARRIVED, FLYING, LIFT, LIFTED, PULL, RESTING, TIGHTEN
+
+CALM = {"randomization.payload_mass": 0.0}
+
+
+def after(seconds: float, num_envs: int = 1, **overrides):
+    """Return take-offs that the formation has flown for so long."""
+    vec = make("takeoff", num_envs=num_envs, **overrides)
+    vec.reset(seed=0)
+    for _ in range(round(seconds / vec.task.dt)):
+        vec.step(zeros(vec))
+    return vec
+
+
+# Starts
+
+
+def test_takeoff_starts_are_as_documented():
+    vec = make("takeoff", num_envs=4000)
+    vec.reset(seed=0)
+    goal, state, system = vec.task.goal, vec.world.state, vec.world.system
+    assert np.abs(goal.position[:, :2]).max() <= 1 and np.ptp(goal.position[:, :2], axis=0).min() > 1.99
+    assert np.degrees(np.abs(goal.yaw).max()) <= 45 and np.degrees(np.ptp(goal.yaw)) > 89
+    np.testing.assert_allclose(state.payload_position[:, 2], system.payload_size[2] / 2)
+    np.testing.assert_array_equal(state.payload_position, goal.position)
+    assert vec.task.errors.angle.max() < 1e-7
+    np.testing.assert_allclose(state.drone_position[..., 2], 0.3 * system.vehicle.arm)
+    assert (state.cable_tension == 0).all() and (state.drone_velocity == 0).all()
+    np.testing.assert_allclose(goal.slots, state.drone_position, atol=1e-12)
+    away = np.linalg.norm((state.drone_position - state.payload_position[:, None])[..., :2], axis=-1)
+    middle = np.hypot(*system.slots[0, :2])
+    assert middle - 0.1 <= away.min() < middle - 0.09 and middle + 0.09 < away.max() <= middle + 0.1
+
+
+@pytest.mark.parametrize("model", ["massless", "chain"])
+def test_a_team_that_stands_does_not_drift(model, num_drones):
+    vec = make("takeoff", num_envs=2, num_drones=num_drones, **{"cable.model": model})
+    vec.reset(seed=0)
+    world, state = vec.world, vec.world.state
+    before = [array.copy() for array in (state.payload_position, state.drone_position)]
+    world.step(np.zeros((2, num_drones, 4)), nstep=500)
+    for now, was in zip((state.payload_position, state.drone_position), before, strict=True):
+        np.testing.assert_allclose(now, was, atol=1e-3)
+    assert not world.diverged.any()
+
+
+def test_drones_beside_a_payload_too_wide_for_their_cables_are_refused():
+    wide = {"payload.size": [3.0, 3.0, 0.1], "payload.anchors": [[0.3, 0, 0.05], [-0.3, 0.3, 0.05], [-0.3, -0.3, 0.05]]}
+    message = refusal(ml.make_vec, "takeoff", num_envs=1, num_drones=3, **wide)
+    assert "cable 0 is too short" in message and "cable.length" in message and "start_spread" in message
+
+
+# The plan
+
+
+def test_the_velocities_of_the_plan_are_those_of_target_and_slots():
+    vec = make("takeoff", num_envs=1, **{"env.policy_hz": 250})
+    vec.reset(seed=0)
+    goal, rows = vec.task.goal, []
+    for _ in range(round(ARRIVED * 250)):
+        vec.step(zeros(vec))
+        rows.append([x[0].copy() for x in (goal.position, goal.velocity, goal.slots, goal.slot_velocity)])
+    target, target_velocity, slots, slot_velocity = (np.array(x) for x in zip(*rows, strict=True))
+    np.testing.assert_allclose(np.gradient(target, 0.004, axis=0)[1:-1], target_velocity[1:-1], atol=1e-3)
+    own = np.gradient(slots - target[:, None], 0.004, axis=0)
+    np.testing.assert_allclose(own[1:-1], slot_velocity[1:-1], atol=0.02)  # the closing of the cables is not told
+    assert np.abs(slot_velocity).max() > 0.5
+    assert target[-1, 2] == pytest.approx(vec.task.options.target_height, abs=1e-6)
+
+
+def test_cables_are_slack_until_the_drones_close_them_and_taut_when_they_pull():
+    assert (after(TIGHTEN[0], 8).world.stats.tension_max == 0).all()
+    vec = after(PULL[0] + 0.6 * PULL[1], 8)
+    assert (vec.world.state.cable_tension > 0.2 * vec.world.system.resting_tension).all()
+    assert (vec.task.own.stage == FLYING).all()
+
+
+def test_the_team_of_a_known_payload_lifts_it_with_no_jerk_at_its_cables():
+    vec = after(ARRIVED + 1.0, 4, **CALM)
+    assert (vec.task.own.stage == LIFTED).all()
+    assert vec.task.errors.distance.max() < 0.01
+    assert (vec.world.stats.tension_max < 1.3 * vec.world.system.resting_tension.max()).all()
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.2])
+def test_the_pull_suits_lighter_and_heavier_payloads(factor):
+    vec = make("takeoff", num_envs=4, **CALM, **{"task_options.success_distance": 0.1})
+    vec.reset(seed=0)
+    vec.world.set_parameters(np.ones(4, bool), payload_mass=np.full(4, factor * vec.world.system.payload_mass))
+    for _ in range(vec.max_steps):
+        *_, info = vec.step(zeros(vec))
+    assert info["success"].all()
+    assert (vec.world.stats.tension_max < 1.5 * factor * vec.world.system.resting_tension.max()).all()
+
+
+# What is forgiven
+
+
+def cause(vec) -> str:
+    vec.task.cause[:] = 0
+    vec.task.stages["measure"](0, 1)
+    return vec.failure_causes[vec.task.cause[0]]
+
+
+def test_drones_may_touch_the_ground_until_they_fly():
+    vec = after(0.2)
+    assert vec.task.own.stage[0] == RESTING and cause(vec) == "none"
+    vec = after(TIGHTEN[0])
+    assert vec.task.own.stage[0] == FLYING and cause(vec) == "none"
+    vec.world.state.drone_position[0, 1, 2] = 0.03
+    assert cause(vec) == "ground"
+
+
+def test_the_payload_may_touch_the_ground_until_it_is_lifted():
+    vec = after(PULL[0])
+    assert cause(vec) == "none"
+    vec = after(LIFT[0] + 0.8 * LIFT[1])
+    assert vec.task.own.stage[0] == LIFTED and cause(vec) == "none"
+    sunk = vec.world.state.payload_position[0, 2] - 0.078
+    vec.world.state.payload_position[0, 2] -= sunk
+    vec.world.state.drone_position[0, :, 2] -= sunk
+    assert cause(vec) == "ground"
+
+
+@pytest.mark.parametrize("seconds", [0.2, TIGHTEN[0], ARRIVED])
+def test_collisions_and_tumbling_are_never_forgiven(seconds):
+    vec = after(seconds)
+    state = vec.world.state
+    kept = state.drone_position[0, 1].copy()
+    state.drone_position[0, 1] = state.drone_position[0, 0] + [0.0, -0.3, 0.05]
+    assert cause(vec) == "drone_collision"
+    state.drone_position[0, 1] = kept
+    state.drone_rotation[0, 0] = np.reshape(axis_angle((1.0, 0.0, 0.0), 1.45), (3, 3))
+    assert cause(vec) == "tilt"
+
+
+# Success and reward
+
+
+def test_success_is_at_the_final_target_with_never_more_than_twice_the_resting_tension():
+    vec = after(9.9, 8, **{"task_options.success_distance": 0.1})
+    assert vec.task.succeeded().all()
+    static = (
+        vec.world.system.resting_tension.max() * vec.world.hidden_loads.payload_mass / vec.world.system.payload_mass
+    )
+    vec.world.stats.tension_max[:4] = 2.01 * static[:4]
+    assert vec.task.succeeded().tolist() == [False] * 4 + [True] * 4
+    vec.task.good_time[:] = 1.9
+    assert not vec.task.succeeded().any()
+
+
+def test_errors_on_the_way_do_not_count_as_success():
+    vec = after(ARRIVED - 0.1, 4, **CALM)
+    assert (vec.task.good_time == 0).all() and vec.task.errors.distance.max() < 0.05
+
+
+@pytest.mark.slow
+def test_the_integral_formation_takes_off():
+    vec = make("takeoff", num_envs=64)
+    _, success, failure = fly_once(vec, make_scripted("formation_integral", vec).act)
+    assert not failure.any() and success.mean() >= 0.9
+
+
+@pytest.mark.slow
+def test_in_return_motors_off_lose_to_standing_by_to_the_formation_to_its_integral():
+    def score(script=None, raised=0.0, **gains):
+        vec = make("takeoff", num_envs=32, **{"control.max_offset": 0.5})
+        vec.controller.gains = vec.controller.gains._replace(**gains)
+        vec._bind()
+        vec.reset(seed=0)
+        action = zeros(vec)
+        action[..., 2] = raised
+        total, *_ = fly_once(vec, make_scripted(script, vec).act if script else lambda observation: action)
+        return total.mean()
+
+    off, low = score(thrust_min=np.zeros(4), thrust_max=np.zeros(4)), score(raised=-0.5)
+    formation, integral = score("formation"), score("formation_integral")
+    assert off < 0.35 * formation
+    assert off < low < 0.8 * formation
+    assert formation < 0.97 * integral
+
+
+def test_drones_rest_at_their_slots_distance_or_clear_of_the_payload():
+    narrow = make("takeoff").world.system
+    np.testing.assert_allclose(resting_distance(narrow, 0.0), np.hypot(narrow.slots[:, 0], narrow.slots[:, 1]))
+    wide = make("takeoff", **{"payload.size": [1.6, 1.2, 0.1], "cable.length": 3.0, "cable.angle": 0.0}).world.system
+    clear = 1.0 + 1.5 * wide.vehicle.arm + 0.2  # half the diagonal, the drone's reach, the spread
+    np.testing.assert_allclose(resting_distance(wide, 0.2), clear)
+    level = clear - np.hypot(*wide.anchors[0, :2]) + 0.2
+    said = refusal(make, "takeoff", **{"payload.size": [1.6, 1.2, 0.1], "cable.length": 0.6, "cable.angle": 0.0,
+                                      "task_options.start_spread": 0.2 / 0.6})  # fmt: skip
+    height = 0.05 + 0.05 - drone_half_size(wide.vehicle)[2]
+    assert f"takes {np.hypot(level, height) / 0.6:.2f} of its length" in said
