@@ -89,12 +89,12 @@ def summarize(episodes: dict[str, np.ndarray], causes: Sequence[str] = CAUSES) -
 def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     """Return the mean paired difference, policy minus baseline, of every metric of `run_episodes`.
 
-    Both on the same episodes, (n,) each; the form is that of `summarize`.
+    Both on the same episodes, (n,) each; the form is that of `summarize`. Metrics that one of them lacks are left out.
     """
     return {
         name: _mean(values.astype(float) - baseline[name].astype(float))
         for name, values in policy.items()
-        if name != "failure_cause" and not is_shortfall(name)
+        if name in baseline and name != "failure_cause" and not is_shortfall(name)
     }
 
 

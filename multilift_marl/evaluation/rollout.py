@@ -122,6 +122,8 @@ def measure_episodes(
     result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
     previous = np.zeros((e, vec.num_drones, vec.action_size))
     meter = ShortfallMeter(vec)
+    own: Callable[[], dict[str, np.ndarray]] = getattr(policy, "metrics", dict)
+    result |= {name: np.zeros(e) for name in own()}
     for step in range(vec.max_steps):
         action = policy.act(observation)
         observation, reward, terminated, truncated, info = vec.step(action)
@@ -147,7 +149,7 @@ def measure_episodes(
         if ended.any():
             result["success_rate"][ended] = info["success"][ended]
             result["failure_cause"][ended] = info["failure_cause"][ended]
-            for name, source in _at_end(vec).items():
+            for name, source in (_at_end(vec) | own()).items():
                 result[name][ended] = source[ended]
             running &= ~ended
         if not running.any():

@@ -1,11 +1,13 @@
 """Model-predictive control of a whole team, `policy=mpc`: central, it knows all drones' states and the path ahead.
 
 At each policy step a plan of the team's motion (`planning/team_planner.py`) gives every drone its thrust vector and how
-that changes; the drone's controller gets them as an acceleration and the rates of its tilt (`acc_rates`).
+that changes; the drone's controller gets them as an acceleration and the rates of its tilt (`acc_rates`). A team whose
+plan is late or not finite flies on by its last one, and after `planner.patience` by the interface's linear baseline.
 """
 
 from __future__ import annotations
 
+from time import perf_counter
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -17,6 +19,8 @@ from multilift_marl.planning.approach import Approach, begin_approaches, write_a
 from multilift_marl.planning.load_estimator import LoadEstimator
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
+from multilift_marl.policies.hold import HoldAccRates
+from multilift_marl.policies.last_plan import LastPlan
 from multilift_marl.sensing.load_sensing import CAMERA_DELAY
 
 if TYPE_CHECKING:
@@ -73,6 +77,8 @@ class TeamMpc:
         under_way = round(settings.delay / self._dt)
         self._sent = np.zeros((under_way + 1, vec.num_envs, 3 * n))
         self._fresh = np.ones(vec.num_envs, bool)
+        self._last = LastPlan(self.planner.plans, settings.step, self._dt)
+        self._without_plan = HoldAccRates(vec)
         self._approach = Approach.zeros(vec.num_envs)
         self._offsets = np.zeros((vec.num_envs, settings.steps + 1, 12))
         if config.acting.max_acceleration < ENOUGH[0] or config.acting.max_tilt_rate < ENOUGH[1]:
@@ -81,11 +87,19 @@ class TeamMpc:
                 "actions of these full scales limit what policy=mpc can command; set control.max_acceleration=25 and "
                 "control.max_tilt_rate=15",
             )
+        self._deadline = np.inf if settings.deadline is None else settings.deadline
+        self._patience = settings.patience
         self._limits = config.acting.max_acceleration, config.acting.max_tilt_rate
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget the plans of the environments in the mask (E,) (None: all)."""
-        self._fresh[... if mask is None else mask] = True
+        chosen = np.ones(self._vec.num_envs, bool) if mask is None else mask
+        self._fresh[chosen] = True
+        self._last.reset(chosen)
+
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Return the shares of the episodes' steps (E,) with a plan that came late, or failed: was not finite."""
+        return self._last.metrics()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (E, N, 5) in [-1, 1] for the present state of the environments, whose observations these are.
@@ -99,8 +113,12 @@ class TeamMpc:
                 f"mpc reads the state of its {shape[0]} environments of {shape[1]} drones, but the observation has "
                 f"shape {np.shape(observation)}; give the observations of all of them"
             )
-        ahead = (len(self._sent) - 1) * self._dt
+        ahead, begin = (len(self._sent) - 1) * self._dt, perf_counter()
         states, payload_rotation, drag = self._measure()
+        unknown = ~np.isfinite(states).all(axis=1)
+        if unknown.any():
+            states[unknown] = self._last.states(self._dt)[unknown]
+            payload_rotation[unknown], drag[unknown] = np.eye(3), 0.0
         if self._observer is not None:
             self._observer.fresh[self._fresh] = True
             known = np.zeros((len(states), 7)) if self._estimator is None else self._estimator.estimate.loads
@@ -119,18 +137,24 @@ class TeamMpc:
         write_approaches(at, np.ascontiguousarray(rotations[:, :, middle]), self._approach, self._offsets)
         planner.plans.fresh[self._fresh] = True
         self._sent[:, self._fresh] = states[self._fresh, -3 * shape[1] :]
-        self._fresh[:] = False
+        self._fresh &= unknown
         loads = None
         if self._estimator is not None:
             self._estimator.estimate.fresh[planner.plans.fresh] = True
             loads = self._estimator.update(states, self._dt)
         planner.predict(states, self._sent, self._dt, loads)
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
-        rate = plans.inputs[:, 0].reshape(*shape, 3)
-        thrust = plans.states[:, 0, -3 * shape[1] :].reshape(*shape, 3) + self._lead * rate
+        late = (perf_counter() - begin) / shape[0] > self._deadline
+        self._last.keep(plans, late, plans.failed | unknown)
+        rate = self._last.inputs().reshape(*shape, 3)
+        thrust = self._last.states()[:, -3 * shape[1] :].reshape(*shape, 3) + self._lead * rate
         self._sent[:-1] = self._sent[1:]
         self._sent[-1] = thrust.reshape(shape[0], -1)
-        return self._command(thrust, rate, drag)
+        action = self._command(thrust, rate, drag)
+        lost = self._last.without > self._patience
+        if lost.any():
+            action[lost] = self._without_plan.act(observation)[lost]
+        return action
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the states (E, 12 + 7 N) of the reduced model, the payload's attitudes, and drag (E, N, 3) [N]."""

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 
 class Policy(Protocol):
-    """What can fly a team: learned, a baseline or one's own."""
+    """What can fly a team: learned, a baseline or one's own.
+
+    A policy may also have `metrics()`, numbers (E,) of the episodes so far by name, which evaluation reports.
+    """
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (..., N, A) in [-1, 1] for observations (..., N, D)."""

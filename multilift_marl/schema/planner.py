@@ -52,3 +52,11 @@ class PlannerConfig(Section):
     lead: Annotated[Float | None, Between(0, 1, "s")] = Field(
         None, description="[s] thrusts are commanded ahead of the plan; None: motor lag and half a policy step"
     )
+    deadline: Annotated[Float | None, Between(1e-4, 10, "s")] = Field(
+        None,
+        description="[s] a plan may take, in the mean of the teams that are planned together; a later one is not flown "
+        "(planner_late); None: simulated time waits",
+    )
+    patience: Annotated[Float, Between(0, 10, "s")] = Field(
+        0.5, description="[s] without a plan in time, after which a linear baseline flies"
+    )

@@ -1,0 +1,64 @@
+"""What a team flies by while no new plan can be had: the last sound one, as far as it goes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from multilift_marl.planning.team_planner import Plans
+
+
+class LastPlan:
+    """The last sound plans of E teams, and how old they are.
+
+    Args:
+        plans: of `TeamPlanner`, for their shapes.
+        step: length of a plan's steps [s].
+        dt: policy step [s].
+
+    Attributes:
+        age: (E,) time since the plan was made [s].
+        without: (E,) how long no sound plan has been made [s]; infinite where there never was one.
+        steps, late, failed: (E,) policy steps of the episode, those with a late plan, those with one that failed.
+    """
+
+    def __init__(self, plans: Plans, step: float, dt: float):
+        self._states, self._inputs = np.zeros_like(plans.states), np.zeros_like(plans.inputs)
+        self._step, self._dt = step, dt
+        num_envs = len(self._states)
+        self.age, self.without = np.zeros(num_envs), np.full(num_envs, np.inf)
+        self.steps, self.late, self.failed = np.zeros((3, num_envs))
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Forget the plans and counts of the teams in the mask (E,)."""
+        self.without[mask] = np.inf
+        for count in (self.age, self.steps, self.late, self.failed):
+            count[mask] = 0.0
+
+    def keep(self, plans: Plans, late: bool, failed: np.ndarray) -> None:
+        """Take over the plans that came in time and did not fail (E,); all others grow older by a policy step."""
+        sound = ~failed & (not late)
+        self._states[sound], self._inputs[sound] = plans.states[sound], plans.inputs[sound]
+        self.age = np.where(sound, 0.0, self.age + self._dt)
+        self.without = np.where(sound, 0.0, self.without + self._dt)
+        self.steps += 1.0
+        self.late += late
+        self.failed += failed
+
+    def states(self, later: float = 0.0) -> np.ndarray:
+        """Return the planned states (E, 12 + 7 N) `later` [s] from now, the last ones where a plan ends before."""
+        every = np.arange(len(self.age))
+        at = np.minimum((self.age + later) / self._step, self._inputs.shape[1])
+        before = np.minimum(at.astype(int), self._inputs.shape[1] - 1)
+        share = (at - before)[:, None]
+        return (1.0 - share) * self._states[every, before] + share * self._states[every, before + 1]
+
+    def inputs(self) -> np.ndarray:
+        """Return the planned change of the thrust vectors (E, 3 N) now [N/s], zero where a plan has ended."""
+        every, at = np.arange(len(self.age)), (self.age / self._step).astype(int)
+        last = self._inputs.shape[1] - 1
+        return np.where((at <= last)[:, None], self._inputs[every, np.minimum(at, last)], 0.0)
+
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Return the shares of policy steps (E,) by metric."""
+        steps = np.maximum(self.steps, 1.0)
+        return {"planner_late": self.late / steps, "planner_failed": self.failed / steps}
