@@ -30,15 +30,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from flights import EPISODES, FLIGHTS, HERE, ROOT, SCRIPTED, SEED, error_metric
+from flights import EPISODES, FLIGHTS, HERE, MPC, ROOT, SCRIPTED, SEED, error_metric
 from searched import SEARCHED, settings_of
 from tables import write_tables
 
 from multilift_marl._files import write_whole
 from multilift_marl._platform import cpu_count
 from multilift_marl._ray import connect, disconnect
+from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import fitting_scripts, make_scripted
@@ -180,8 +182,18 @@ def list_jobs(flight: str, only: str = "") -> list[Job]:
     weights = sorted((HERE / FLIGHTS[flight].recipe).glob("seed*/policy.pt"))
     scripts += ["searched"] if flight in SEARCHED else []
     scripts = [name for name in scripts if name in (FLIGHTS[flight].scripts or scripts)]
+    scripts += ["mpc"] if can_plan(config) else []
     jobs = [*(Job(flight, name, "") for name in scripts), *(Job(flight, w.parent.name, str(w)) for w in weights)]
     return [job for job in jobs if only in ("", job.team)]
+
+
+def can_plan(config: Config) -> bool:
+    """Return whether the central planner can fly an environment."""
+    try:
+        make_scripted("mpc", MultiliftVec(build_config(config.model_dump(), MPC | {"env.num_envs": 1})))
+    except ConfigError:
+        return False
+    return True
 
 
 def fly(job: Job) -> str:
@@ -203,7 +215,8 @@ def fly(job: Job) -> str:
         maker = policy.bind
         overrides = overrides | scales
     else:
-        overrides = overrides | (settings_of(job.flight) if job.team == "searched" else SCRIPTED)
+        settings = {"searched": settings_of, "mpc": lambda _: MPC}.get(job.team, lambda _: SCRIPTED)
+        overrides = overrides | settings(job.flight)
     results = run_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
     metrics = summarize(results)
     error = results[error_metric(flight)]

@@ -45,6 +45,7 @@ def rows(names: str) -> str:
     task = "" if names.split()[0] in FLIGHTS and " " in names else names
     chosen = flights_of(task) if task else names.split()
     published = any(FLIGHTS[name].published for name in chosen)
+    planned = any((HERE / name / "mpc.json").is_file() for name in chosen)
     lines = []
     for name in chosen:
         flight, baseline = FLIGHTS[name], best_baseline(name)
@@ -62,8 +63,10 @@ def rows(names: str) -> str:
                 str(len(learned) or "-"),
             ]
         )
+        lines[-1] += [_cell([HERE / name / "mpc.json"], error_metric(flight))] * planned
         lines[-1] += [flight.published] * published
     columns = ["conditions", "learned", "best baseline", "gain (95 % interval)", "verdict", "seeds"]
+    columns += ["`mpc`: central, knows the path"] * planned
     return _markdown(columns + ["published"] * published, lines)
 
 
@@ -218,7 +221,7 @@ def policies_csv() -> str:
     head += [f"{column}{part}" for _, column, _ in METRICS for part in ("", "_low", "_high")]
     lines = []
     for flight, entry in FLIGHTS.items():
-        for policy in (*BASELINES, *learned_policies(flight)):
+        for policy in (*BASELINES, "mpc", *learned_policies(flight)):
             path = HERE / flight / f"{policy}.json"
             if not path.is_file():
                 continue
