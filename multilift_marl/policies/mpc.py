@@ -16,7 +16,7 @@ from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.approach import Approach, begin_approaches, write_approaches
-from multilift_marl.planning.load_estimator import LoadEstimator
+from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.policies.hold import HoldAccRates
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 
-SHARE = 0.4  # of what sensors say beside the prediction, by which states are corrected
+SHARE = 0.6  # of what sensors say beside the prediction, by which states are corrected
 ENOUGH = 10.0, 8.0  # [m/s²], [rad/s] full scales of actions that limit no usual flight
 
 
@@ -65,7 +65,7 @@ class TeamMpc:
         self.planner = TeamPlanner(system, settings, vec.num_envs)
         self._dt = vec.task.dt
         noise = settings.estimate_noise or (0.2 if config.env.sensing == "ideal" else 1.0)
-        self._estimator = LoadEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None
+        self._estimator = ForceEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None
         self._observer = None
         if config.env.sensing != "ideal":
             late = CAMERA_DELAY if config.env.sensing == "mocap" else 0.0
@@ -119,10 +119,11 @@ class TeamMpc:
         if unknown.any():
             states[unknown] = self._last.states(self._dt)[unknown]
             payload_rotation[unknown], drag[unknown] = np.eye(3), 0.0
+        loads, forces = self._unknown(self._fresh)
+        states[:, -3 * shape[1] :] += forces
         if self._observer is not None:
             self._observer.fresh[self._fresh] = True
-            known = np.zeros((len(states), 7)) if self._estimator is None else self._estimator.estimate.loads
-            states = self._observer.update(states, self._dt, known).copy()
+            states = self._observer.update(states, self._dt, loads).copy()
         now = vec.task.time[:, None]
         last = np.maximum(now - self._dt, 0.0)
         preview = vec.task.preview_targets
@@ -138,10 +139,8 @@ class TeamMpc:
         planner.plans.fresh[self._fresh] = True
         self._sent[:, self._fresh] = states[self._fresh, -3 * shape[1] :]
         self._fresh &= unknown
-        loads = None
         if self._estimator is not None:
-            self._estimator.estimate.fresh[planner.plans.fresh] = True
-            loads = self._estimator.update(states, self._dt)
+            self._estimator.update(states, self._dt)
         planner.predict(states, self._sent, self._dt, loads)
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
         late = (perf_counter() - begin) / shape[0] > self._deadline
@@ -150,11 +149,19 @@ class TeamMpc:
         thrust = self._last.states()[:, -3 * shape[1] :].reshape(*shape, 3) + self._lead * rate
         self._sent[:-1] = self._sent[1:]
         self._sent[-1] = thrust.reshape(shape[0], -1)
-        action = self._command(thrust, rate, drag)
+        action = self._command(thrust - forces.reshape(thrust.shape), rate, drag)
         lost = self._last.without > self._patience
         if lost.any():
             action[lost] = self._without_plan.act(observation)[lost]
         return action
+
+    def _unknown(self, fresh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the estimates of loads (E, 7) and of forces on drones (E, 3 N), live; zero for fresh teams (E,)."""
+        if self._estimator is None:
+            return np.zeros((len(fresh), 7)), np.zeros((len(fresh), 3 * self._vec.num_drones))
+        self._estimator.estimate.fresh[fresh] = True
+        self._estimator.estimate.unknowns[fresh] = 0.0
+        return self._estimator.loads, self._estimator.forces
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the states (E, 12 + 7 N) of the reduced model, the payload's attitudes, and drag (E, N, 3) [N]."""

@@ -39,11 +39,11 @@ class PlannerConfig(Section):
         1.1, description="[-] least distance of drones, over that which counts as a collision"
     )
     estimate: bool = Field(
-        True, description="whether mass beside the nominal one, force and moment on the payload are estimated"
+        True, description="whether forces on payload and drones, a moment and mass of the payload are estimated"
     )
     estimate_noise: Annotated[Float | None, Between(1e-3, 1000)] = Field(
         None,
-        description="[-] of forces as measured for that, over the payload's weight; larger: slower; None: 0.2 with "
+        description="[-] of accelerations as measured for that, over gravity; larger: slower; None: 0.2 with "
         "env.sensing=ideal, else 1",
     )
     delay: Annotated[Float, Between(0, 1, "s")] = Field(

@@ -1,4 +1,4 @@
-"""Every key of `randomization`, alone in every configuration and in pairs: episodes start and fly."""
+"""Every key of `randomization`, alone, in pairs, and among some in every configuration: episodes start and fly."""
 
 from __future__ import annotations
 
@@ -50,9 +50,19 @@ def fly(config: str, varied: tuple[str, ...], **overrides) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("config", list_configs())
-def test_every_key_alone_in_every_configuration(config):
+def test_every_key_among_some_in_every_configuration(config):
+    """Each set is compiled anew, in seconds: so keys go in four sets, others in each configuration."""
+    order = np.random.default_rng(list_configs().index(config)).permutation(keys(config))
+    for some in np.array_split(order, 4):
+        fly(config, tuple(map(str, some)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_key_alone(kind):
+    config, overrides = KINDS[kind]
     for key in keys(config):
-        fly(config, (key,))
+        fly(config, (key,), **overrides)
 
 
 @pytest.mark.slow
