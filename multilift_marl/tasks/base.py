@@ -29,6 +29,7 @@ from multilift_marl.schema.values import Section
 from multilift_marl.sensing.measurement import Sensing
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
+from multilift_marl.tasks.scenery import Box as Box
 
 _HANDED_ON = (
     "action", "cause", "errors", "goal", "good_time", "limits", "mask", "min_separation", "own", "planned", "previous",
@@ -37,17 +38,6 @@ _HANDED_ON = (
 """Attributes of a task that its kernels read and write as fields of the view."""
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
 Call = Callable[[int, int], None]  # of environments lo to hi
-
-
-class Box(NamedTuple):
-    """A box to draw."""
-
-    size: tuple[float, float, float]
-    """Half its edges [m]."""
-    position: tuple[float, float, float]
-    """Of its middle [m]."""
-    rgba: tuple[float, float, float, float]
-    """Colour and opacity, 0 to 1."""
 
 
 @inlined
