@@ -150,6 +150,13 @@ SCRIPTED = {"control.action": "reference"}
 """Actions of the baselines, whatever those of the learned policies that they are compared with."""
 MPC = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
 """Actions of the central planner, which knows all states and the path ahead."""
+PLANNED_EPISODES = 250
+"""Of the central planner, which takes a millisecond a step of each."""
+
+
+def episodes_of(team: str) -> int:
+    """Return how many episodes a policy is evaluated on."""
+    return PLANNED_EPISODES if team == "mpc" else EPISODES
 
 
 def error_metric(flight: Flight) -> str:

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from flights import EPISODES, FLIGHTS, HERE, MPC, ROOT, SCRIPTED, SEED, error_metric
+from flights import FLIGHTS, HERE, MPC, ROOT, SCRIPTED, SEED, episodes_of, error_metric
 from searched import SEARCHED, settings_of
 from tables import write_tables
 
@@ -112,7 +112,9 @@ class Job(NamedTuple):
     def done(self) -> bool:
         """Whether both files are there, for as many episodes."""
         metrics, episodes = self.files
-        return episodes.is_file() and metrics.is_file() and json.loads(metrics.read_text())["episodes"] == EPISODES
+        if not (episodes.is_file() and metrics.is_file()):
+            return False
+        return bool(json.loads(metrics.read_text())["episodes"] == episodes_of(self.team))
 
 
 def evaluate(flights: list[str], workers: int, address: str = "") -> None:
@@ -217,10 +219,10 @@ def fly(job: Job) -> str:
     else:
         settings = {"searched": settings_of, "mpc": lambda _: MPC}.get(job.team, lambda _: SCRIPTED)
         overrides = overrides | settings(job.flight)
-    results = run_episodes(load_config(flight.config, overrides), maker, EPISODES, SEED)
+    results = run_episodes(load_config(flight.config, overrides), maker, episodes_of(job.team), SEED)
     metrics = summarize(results)
     error = results[error_metric(flight)]
-    content = {"episodes": EPISODES, "seed": SEED, "config": flight.config, "overrides": flight.overrides}
+    content = {"episodes": episodes_of(job.team), "seed": SEED, "config": flight.config, "overrides": flight.overrides}
     report, episodes = job.files
     report.parent.mkdir(parents=True, exist_ok=True)
     arrays = io.BytesIO()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flights import FLIGHTS, HERE, ROOT, error_metric
+from flights import FLIGHTS, HERE, PLANNED_EPISODES, ROOT, error_metric
 
 from multilift_marl.config.load import load_config
 from multilift_marl.evaluation.metrics import bootstrap
@@ -66,7 +66,7 @@ def rows(names: str) -> str:
         lines[-1] += [_cell([HERE / name / "mpc.json"], error_metric(flight))] * planned
         lines[-1] += [flight.published] * published
     columns = ["conditions", "learned", "best baseline", "gain (95 % interval)", "verdict", "seeds"]
-    columns += ["`mpc`: central, knows the path"] * planned
+    columns += [f"`mpc`: central, knows the path, {PLANNED_EPISODES} episodes"] * planned
     return _markdown(columns + ["published"] * published, lines)
 
 
