@@ -51,6 +51,7 @@ class _Mean(nn.Module):
     def forward(
         self, observation: torch.Tensor, memory: torch.Tensor | None = None
     ) -> torch.Tensor | tuple[torch.Tensor, torch.Tensor]:
+        # Clipping is part of the network, so that other programs need not know of it.
         if memory is None:
             return self.actor(observation)[0].clamp(-1, 1)
         memory = self.actor.remember(observation, memory)
@@ -115,6 +116,7 @@ def _convert(policy: LearnedPolicy, opset: int | None) -> onnx.ModelProto:
         )  # fmt: skip
     assert program is not None
     model = program.model_proto
+    # Where a network cannot be expressed in that opset, the exporter keeps its own without an error.
     if opset is not None and (made := model.opset_import[0].version) != opset:
         raise ConfigError(
             f"the network cannot be expressed by opset={opset} of ONNX, only by {made}; give that or more"
@@ -150,6 +152,7 @@ def _compare(policy: LearnedPolicy, path: Path) -> float:
     for drones in (1, 2, policy.config.env.num_drones, 7):
         learned.reset()
         memory = {"memory": np.zeros((5, drones, gru), np.float32)} if gru else {}
+        # Some steps with a memory: a wrong `next_memory` shows in the next action only.
         for _ in range(3 if gru else 1):
             # Observations as training had them, or the comparison would be of clipped ones.
             spread = rng.standard_normal((5, drones, len(policy.observation_names)), np.float32)
@@ -173,6 +176,7 @@ def make_contract(policy: LearnedPolicy) -> dict[str, Any]:
         ConfigError: the task is not known, or its system is impossible.
     """
     config, kind = policy.config, policy.config.train.actor
+    # First: what follows describes the numbers of this version, not those that the policy was trained with.
     _check_names(policy)
     return {
         "format": CONTRACT_FORMAT,
@@ -227,6 +231,7 @@ def _describe_observation(policy: LearnedPolicy) -> dict[str, Any]:
 
 def _describe_action(policy: LearnedPolicy) -> dict[str, Any]:
     control = policy.config.control
+    # For each thrust among the numbers, in their order: lowest, at zero and largest of each drone.
     thrusts = iter(np.moveaxis(_measure_thrusts(policy.config), -1, 0).tolist())
     numbers = []
     for name, frame, unit, limit, meaning in ACTIONS[control.action].numbers:
@@ -248,6 +253,7 @@ def _measure_thrusts(config: Config) -> np.ndarray:
     system = config.system
     interface = ACTIONS[config.control.action](config.acting, 1.0 / config.sim.control_hz)
     e, n = 3, system.num_drones
+    # One environment for each of -1, 0 and 1, in all numbers of all drones.
     action = np.broadcast_to(np.array([-1.0, 0.0, 1.0])[:, None, None], (e, n, len(interface.numbers))).copy()
     team = ControlContext(
         SystemState.zeros(e, n), Goal.zeros(e, n), Reference.zeros(e, n), Setpoint.zeros(e, n),

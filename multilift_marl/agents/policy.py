@@ -62,6 +62,7 @@ class TrainedPolicy:
                 drones than it remembers.
         """
         observation = self._checked(observation)
+        # The memory is of B teams: whatever axes come before the drones are one to the network.
         teams = observation.reshape(-1, *observation.shape[-2:])
         if self.config.train.gru == 0:
             action, _ = self._act(teams, None)
@@ -101,6 +102,7 @@ class TrainedPolicy:
 
     def copy(self) -> Self:
         """Return this policy with a memory of its own, empty."""
+        # Shallow: both have the same network; the memory is dropped, not copied.
         other = copy.copy(self)
         other.reset()
         return other
@@ -141,6 +143,7 @@ class TrainedPolicy:
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget what was observed in the environments of the mask (E,) bool (None: all)."""
         if mask is None:
+            # None rather than zeros: the next environments may be another number of teams.
             self._memory = None
         elif self._memory is not None:
             self._memory[np.asarray(mask, bool)] = 0.0
@@ -172,6 +175,7 @@ class LearnedPolicy(TrainedPolicy):
         from multilift_marl.agents.networks import Actor
 
         check_policy(content, source)
+        # Before the configuration is built, which imports the modules that it names.
         review(content["config"], source)
         config = build_config(content["config"])
         super().__init__(config, content["observation_names"], content["action_names"], source)
@@ -268,6 +272,7 @@ def find_policy(name: str | Path, what: str = "policy", others: Iterable[str] = 
     text = str(name)
     if text in SCRIPTED:
         return Script(text)
+    # Who names module:Class wants it to run; what only a file names has to be trusted, see `trust.review`.
     if ":" in text:
         named.add(identify(text.rpartition(":")[0]))
         return Script(text)
@@ -320,6 +325,7 @@ def find_checkpoint(name: str | Path, checkpoint: str = "best") -> tuple[Path, P
     except ModuleNotFoundError as error:
         message = f"ml.load_policy needs {error.name}: {pip_install('train')}"
         raise ModuleNotFoundError(message, name=error.name) from error
+    # What is in the current folder goes before a shipped policy of that name.
     if text in shipped_policies() and not os.path.exists(text):
         if checkpoint != "best":
             raise ConfigError(f"checkpoint={checkpoint} means nothing to the shipped policy '{text}'; leave it out")
@@ -345,6 +351,7 @@ def check_policy(content: dict[str, Any], source: str) -> None:
     for key, kind in _NEEDED.items():
         if key not in content:
             raise CheckpointError(f"{source} holds no policy ('{key}' is missing); {cure}")
+        # bool by itself, since True is an int to Python.
         if not isinstance(content[key], kind) or isinstance(content[key], bool):
             found = type(content[key]).__name__
             raise CheckpointError(f"{source} holds no policy ('{key}' is {found}, expected {kind.__name__}); {cure}")

@@ -62,7 +62,9 @@ class Trainer:
     """
 
     def __init__(self, config: Config, folder: Path, checkpoint: dict[str, Any] | None = None):
+        # One thread in rollouts, where those of the environments have the cores; `step` gives learning its own number.
         torch.set_num_threads(1)
+        # Before networks are made: their first weights are drawn from it.
         torch.manual_seed(config.seed)
         config, initial = find_initial(config) if checkpoint is None else (config, None)
         self.config, self.folder = config, folder
@@ -81,6 +83,7 @@ class Trainer:
         self.learner = make_learner(config.train, self.env)
         self.taken_over = "" if initial is None else initial.take_over(self.learner, config)
         self._simulate(envs)
+        # Rounded up: the last batch is a whole one, too.
         self.iterations = -(-config.train.frames // self.frames_per_batch)
         self.iteration, self.seconds = 0, 0.0
         self.evaluator = Evaluator(config)
@@ -89,6 +92,7 @@ class Trainer:
         self._stopper = Stopper(self._rescue, say)
         self._begun: dict[str, Any] | None = None  # what a checkpoint holds at the beginning of the iteration
         self._saved_iteration = -1
+        # Last, since all that is made above has drawn random numbers: the run goes on as if it had never stopped.
         if checkpoint is not None:
             self._restore(checkpoint)
             torch.set_rng_state(checkpoint["rng"])
@@ -170,6 +174,8 @@ class Trainer:
                 values |= self.gain.values()
             values |= self.curriculum.values()
             self._attempt(partial(log.write, {"iteration": self.iteration, "frames": self.frames}, values))
+            # After the log, whose numbers are of the stage that is over, and before saving: a run resumes in the new
+            # stage.
             self._advance(values.get("eval/stage_success_rate"))
             self.seconds += time.perf_counter() - start
             if not self._best_saved:
@@ -222,12 +228,15 @@ class Trainer:
     def step(self) -> dict[str, float]:
         """Collect one batch, learn from it, and return the iteration's numbers."""
         start, train, optimizer = time.perf_counter(), self.config.train, self.learner.optimizer
+        # Linear, from 1 at first to the final share after all iterations.
         left = 1 - (1 - train.final_learning_rate) * self.iteration / self.iterations
         actor, critic = optimizer.param_groups
         if not train.desired_kl:
             actor["lr"] = train.learning_rate * left
+        # Before the warm-up takes the actor's rate, which the critic may share.
         critic["lr"] = train.critic_learning_rate * left if train.critic_learning_rate else actor["lr"]
         rate = actor["lr"]
+        # The critic learns alone at first: by its untrained values a good actor would only get worse.
         if self.iteration < train.warmup:
             actor["lr"] = 0.0
         batches = self.rollouts.collect(self.iteration)
@@ -236,6 +245,7 @@ class Trainer:
         values = update(self.learner, batches)
         torch.set_num_threads(1)
         actor["lr"] = rate
+        # In the warm-up the policy does not move: a KL of 0 would only raise the rate.
         if train.desired_kl and self.iteration >= train.warmup:
             actor["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
         learning = values.pop("learning_seconds")
@@ -375,6 +385,7 @@ def resume_run(folder: Path, overrides: dict[str, Any]) -> Trainer:
             `trust.review`.
     """
     import_modules(overrides.get("import"))
+    # Before anything is read, for whoever trains this run may be about to write it.
     lock_run(folder)
     path = folder / "checkpoints" / "last.pt"
     content = load_checkpoint(path)

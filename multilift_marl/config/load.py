@@ -53,6 +53,7 @@ def register_config(name: str, source: str | Path | Mapping[str, Any]) -> None:
         raise ConfigError(f"a configuration of one's own cannot have the name '{name}': choose one that is not taken")
     if not isinstance(source, Mapping):
         source = Path(source).absolute()
+        # For a mistake in it to show here, and not where it is first used.
         _read(source)
     CONFIGS[name] = source
 
@@ -106,6 +107,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
         _note_named(dotted, value)
         *sections, key = dotted.split(".", _MOST_SECTIONS)
         change, node = {key: value}, merged
+        # Down to the section that holds the key: no value may be in the way of it.
         for part in sections:
             node = node.get(part, {})
             if not isinstance(node, Mapping):
@@ -257,6 +259,7 @@ def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
             if not path.is_file():
                 return _read_own(str(name), above)
         values = read_yaml(path)
+    # A ConfigError is a ValueError, too, but not one of those that are caught below.
     except ConfigError:
         raise
     except FileNotFoundError:
@@ -270,6 +273,7 @@ def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
     except (OSError, ValueError) as error:  # ValueError: what is no YAML, and names with a NUL
         raise ConfigError(f"cannot read {shorten(path, 300)} as YAML: {reason(error)}") from None
     folder = path.absolute().parent
+    # Before bases are added: a path counts from the folder of the file that states it.
     located = _locate(stored_names(as_mapping(values, path, "sections such as 'env:'")), folder)
     review(located, path)
     return _add_bases(located, folder, (*above, str(path)))
@@ -299,6 +303,7 @@ def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> 
     merged: dict[str, Any] = {}
     for name in names:
         source = str(folder / name) if is_yaml(name) else str(config_dir() / f"{name}.yaml")
+        # By path and by name, for configurations that are registered have no path.
         if source in above or name in above:
             raise ConfigError(f"{above[-1]} is based on {name}, which is based on it; take one of the two bases out")
         part = _read(folder / name if is_yaml(name) else name, above)

@@ -89,6 +89,7 @@ class MultiliftVec:
         observation = self.task.observation
         self._stacked = observation if config.env.history == 1 else np.tile(observation, config.env.history)
         self._starts = Episodes(config, self.world, self.task, self._sensing)
+        # Episode -1 is none, and all are over: a first reset begins episode 0, a step before it is refused.
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
         self.outcome = outcome = Outcome.of(self._stacked, self.task.terms)
@@ -162,14 +163,17 @@ class MultiliftVec:
 
     def step_live(self, action: np.ndarray, restart: bool = False) -> Outcome:
         """Do as `step`, and return the live arrays of `outcome`, which the next step overwrites."""
+        # Those that were never reset are left out, so that they are refused below.
         begin = self._ended & (self.episodes >= 0) if restart and self._ended.any() else None
         self._set_action(action, self._ended if begin is None else self._ended & ~begin)
         for run in self._parts:  # one, unless the task has NumPy functions
             run()
+        # Before the step is counted: one in which the simulation diverged has no reward.
         self.world.check_warnings()
         out_of_time, bad = self._end_step()
         if bad >= 0:
             self._refuse_step(bad)
+        # The task is asked at a time limit only: who fails has terminated before, and is no success.
         if out_of_time:
             truncated = self.outcome.flags[1]
             np.logical_and(truncated, self.task.succeeded(), out=self.outcome.flags[2])
@@ -196,6 +200,7 @@ class MultiliftVec:
             total: environments among which these are those from `first_env` on; None: these are all.
         """
         first, total = (0, self.num_envs) if total is None else (self.first_env, total)
+        # Environment k of `total` goes on as if the share k/total of its episode were over.
         self.steps[:] = (first + np.arange(self.num_envs)) * self.max_steps // total
 
     @property
@@ -213,6 +218,7 @@ class MultiliftVec:
         Args:
             steps: policy steps that a copy of the first shard's environments makes, with the last actions.
         """
+        # `copy` goes through `__reduce__`: the twin has a world of its own.
         twin = copy(self)
         shard = twin.world.shards[0]
         pipeline = twin._pipelines[shard.lo]
@@ -245,6 +251,7 @@ class MultiliftVec:
         counts |= {"episodes": (-1, most), "task.time": (0, most), "task.cause": (0, len(self.failure_causes) - 1)}
         counts |= {f"task.own.{name}": limits for name, limits in self.task.count_limits().items()}
         counts |= {f"sensing.{name}": (0, getattr(delays, name)[1]) for name in ("action_delay", "observation_delay")}
+        # Kernels index by these and check no bounds: a number out of range would reach into other memory.
         check_counts(saved, counts)
         groups: dict[str, Rows] = {"world": {}, "task": {}, "sensing": {}}
         for key, array in saved.items():
@@ -272,6 +279,7 @@ class MultiliftVec:
         """Start the episodes in `mask`, with a row of what is fixed of draw and state for each."""
         chosen = np.flatnonzero(mask).tolist()
         for i, e in enumerate(chosen):
+            # All that an episode depends on beside the seed: it is the same in any batch, on any thread.
             key = (self.purpose, self.first_env + e, int(self.episodes[e]))
             self._starts.draw(e, int(self.seeds[e]), key, fixed, i)
         self._starts.load(mask)
@@ -316,6 +324,7 @@ class MultiliftVec:
         """Write the first observation and global state of an episode."""
         if self._first_sense is not None:
             self._first_sense(e, e + 1)
+        # The global state first: its kernel computes the task's `preview`, which observations read, too.
         self.task.stages["observe state"](e, e + 1)
         self.task.stages["observe"](e, e + 1)
         self.task.numpy.observe(e, e + 1)

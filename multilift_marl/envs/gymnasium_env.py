@@ -64,6 +64,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self, task: str | Config = "hover", render_mode: str | None = None, *,
         num_drones: int | None = None, seed: int | None = None, **overrides: Any,
     ):  # fmt: skip
+        # Over what the user says: a configuration may be of a batch, but this API is of one environment.
         single = {"env.num_envs": 1, "env.num_threads": 1}
         self.vec = make_vec(task, num_drones=num_drones, seed=seed, **overrides | single)
         modes = possible_modes(render_mode)
@@ -87,6 +88,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: a negative seed, an unknown option or one that cannot be.
         """
+        # Before the first reset only; a `seed` that is given goes over it.
         seed_afresh(self.vec)
         observation, _ = self.vec.reset(seed, options=options)
         self._pictures.show()
@@ -113,6 +115,7 @@ class MultiliftGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._pictures.show()
         mean = float(mean_reward(outcome.reward)[0])
         terminated, truncated = outcome.flags[:2, 0].tolist()
+        # `flatten` copies, unlike `reshape`: the live array is overwritten by the next step.
         return outcome.observation.flatten(), mean, terminated, truncated, solo_info(self.vec)
 
     def render(self) -> np.ndarray | None:
@@ -237,10 +240,13 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         check_open(self.closed)
         joint, mode = _split(self.vec, actions, self.action_space), self.autoreset_mode
+        # The core then starts those anew that ended in the step before, in place of stepping them.
         restart = mode is AutoresetMode.NEXT_STEP
         observation, reward, terminated, truncated, info = self.vec.step(joint, restart)
         over, infos = terminated | truncated, {}
         if mode is AutoresetMode.SAME_STEP and over.any():
+            # Before the reset, or the last observations, from which a value is bootstrapped, would be lost. The form is
+            # Gymnasium's: an array of objects, None where no episode ended.
             final = np.full(self.num_envs, None, dtype=object)
             for e in np.flatnonzero(over):
                 final[e] = observation[e].reshape(-1)
@@ -292,6 +298,7 @@ class MultiliftVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 def _with_limit(spec: EnvSpec | None, vec: MultiliftVec) -> EnvSpec | None:
     """Return a spec that states the time limit of the environments, whatever configured it."""
     if spec is not None:
+        # The one given is left alone: it belongs to whoever made it.
         spec = copy(spec)
         spec.max_episode_steps = vec.max_steps
     return spec

@@ -61,6 +61,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         self.action_spaces = {name: Box(-1.0, 1.0, (vec.action_size,), np.float32) for name in names}
         self.state_space = Box(*unbounded, (vec.state_size,), np.float32)
         self._joint = np.zeros((1, vec.num_drones, vec.action_size))
+        # In the order in which `_infos` reads flags, cause and terms.
         flags = ("success", "failure", "diverged", "failure_cause")
         self._info_names = (*flags, *(f"reward_terms.{name}" for name in vec.reward_terms))
         self._drawn: dict[str, np.ndarray] | None = None  # of the episode of which `_draw` is the draw
@@ -107,6 +108,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
         agents = self.agents
         if not agents:
             raise RuntimeError("the episode has ended or none was started: call reset() before step()")
+        # As many as there are agents: where none is missing, as is seen below, none is unknown either.
         if len(actions) != len(agents):
             raise self._mismatch(actions)
         joint = self._joint[0]
@@ -123,9 +125,11 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
             joint[n] = action
         outcome = self.vec.step_live(self._joint)
         over, out_of_time = outcome.flags[:2, 0].tolist()
+        # As PettingZoo asks, agents leave when they are done; the dicts below are of all who acted.
         if over or out_of_time:
             self.agents = []
         self._pictures.show()
+        # Copies, for the arrays of `outcome` are live: the next step overwrites them.
         return (
             dict(zip(agents, outcome.observation[0].copy(), strict=True)),
             dict(zip(agents, outcome.reward[0].tolist(), strict=True)),
@@ -162,6 +166,7 @@ class MultiliftParallelEnv(ParallelEnv[str, np.ndarray, np.ndarray]):
     def _infos(self) -> dict[str, dict[str, Any]]:
         """Return a dict for each agent; nothing in it is shared, so that wrappers may write into theirs."""
         vec = self.vec
+        # `drawn` is another dict whenever an episode has started: names are made once for each.
         if self._drawn is not vec.drawn:
             self._drawn, self._draw = vec.drawn, self._name_draw(vec.drawn)
         draw, arrays = self._draw

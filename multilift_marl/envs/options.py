@@ -42,6 +42,7 @@ def check_mask(mask: Any, num_envs: int) -> np.ndarray:
 
 def check_seed(seed: Any) -> None:
     """Refuse what is no seed, None excepted, by a ValueError."""
+    # True is an int to Python.
     whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
     if seed is not None and not (whole and 0 <= seed < 2**63):
         raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, but is {seed!r}")
@@ -91,6 +92,8 @@ def _rows(what: str, value: Any, like: np.ndarray, mask: np.ndarray, scalars: bo
     """Return a row of `value` for each environment in `mask`; it has E rows, as many as these, or one for all."""
     count, shape = int(mask.sum()), like.shape[1:]
     try:
+        # Checked in float64, so that nothing is compared that float32 has rounded; `exact` shows what whole numbers or
+        # truth values lose by the conversion.
         array = np.array(value, like.dtype if like.dtype != np.float32 else float)
         exact = np.array(value)
     except (TypeError, ValueError):
@@ -100,6 +103,8 @@ def _rows(what: str, value: Any, like: np.ndarray, mask: np.ndarray, scalars: bo
         raise ValueError(f"{what} must hold {kind}, but is {value!r}")
     if not np.isfinite(array).all():
         raise ValueError(f"{what} holds NaN or infinite values; give finite numbers")
+    # One for all, then one for each of all E environments, then one for each in the mask. Where the mask has all,
+    # the last two are the same rows.
     if array.shape == shape or (scalars and not array.shape):
         return np.broadcast_to(array, (count, *shape))
     if array.shape == like.shape:
@@ -112,6 +117,7 @@ def _rows(what: str, value: Any, like: np.ndarray, mask: np.ndarray, scalars: bo
 def _check_field(name: str, rows: np.ndarray) -> None:
     """Refuse rotations and rotor speeds that are none."""
     if name.endswith("rotation"):
+        # R Rᵀ = 1 holds of reflections, too, whose determinant is -1.
         off = np.abs(rows @ np.swapaxes(rows, -1, -2) - np.eye(3)).max()
         if off > 1e-6 or (np.linalg.det(rows) < 0).any():
             raise ValueError(f"state '{name}' must hold rotation matrices (3, 3), with orthonormal columns, det 1")
@@ -131,6 +137,7 @@ def check_state(given: Rows, system: System) -> None:
     if "rotor_speed" in given:
         fastest = np.array([vehicle.rotor_speed_max for vehicle in system.vehicles])[:, None]
         if (beyond := given["rotor_speed"] > fastest * (1 + 1e-9)).any():
+            # (rows, N, 4): the last index but one is the drone.
             n = int(np.argwhere(beyond)[0][-2])
             raise ValueError(
                 f"state 'rotor_speed' of drone_{n} is {given['rotor_speed'][beyond].max():.4g} rad/s, more than its "
@@ -151,6 +158,7 @@ def check_draw(fixed: Rows, nominal: Rows, system: System) -> None:
         if name == "payload_center_of_mass":
             _refuse_beyond(name, rows, float(np.linalg.norm(system.payload_size)), "m")
         elif name in nominal:
+            # A body may have no drag, but not no mass, length or stiffness.
             least = 0.0 if name.endswith("drag") else low
             factor = rows / nominal[name]
             if not ((factor >= least) & (factor <= high)).all():
@@ -165,6 +173,7 @@ def check_draw(fixed: Rows, nominal: Rows, system: System) -> None:
             _refuse_beyond(name, rows, MAX_LOAD * GRAVITY * system.payload_mass, "N")
         elif name == "observation_bias":
             _refuse_beyond(name, rows, 100.0, "in its units")
+    # The ratio counts: each that is fixed is checked with the other, which is nominal where it is not.
     coefficient, mass = fixed.get("vehicle_thrust_coefficient", 1.0), fixed.get("vehicle_mass", system.drone_mass)
     thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles]) * coefficient
     names = [name for name in ("vehicle_mass", "vehicle_thrust_coefficient") if name in fixed]
@@ -199,6 +208,7 @@ def check_stretch(world: World, e: int, length: np.ndarray, stiffness: np.ndarra
             continue
         foot = add(row(state.payload_position, e), mul(matrow(state.payload_rotation, e), tuple(anchor)))
         span = float(np.linalg.norm(sub(hook_position(e, n, state, world.rig.hooks), foot)))
+        # A resting cable is stretched by T/k: a soft one, by more than 1 %, may start like that.
         most = max(MOST_STRETCH * length[n], MOST_TENSION * system.resting_tension[n] / stiffness[n])
         if span > length[n] + most:
             raise ValueError(

@@ -73,9 +73,11 @@ def evaluate_parallel(
     import ray
     from ray import cloudpickle
 
+    # No more than a worker's share, or some would have nothing to do.
     size = min(_PART if writer is None else _RECORDED, -(-episodes // workers))
     parts = [(first, min(size, episodes - first)) for first in range(0, episodes, size)]
     values = build_config(config.model_dump(), {"env.num_threads": 1}).model_dump(mode="json")
+    # Once for all parts, and by value: what makes the policy may be a function of a script or a closure.
     task = ray.put(cloudpickle.dumps((values, make_policy, seed, factors, writer is not None)))
     crew = [_idle.pop() if _idle else _Worker() for _ in parts[:workers]]
     waiting, flown, head = list(parts), dict[int, dict[str, np.ndarray]](), _ray.Head()
@@ -84,6 +86,7 @@ def evaluate_parallel(
             for worker in crew:
                 if worker.part is None and waiting:
                     worker.fly(task, waiting.pop(0))
+            # A second at most, so that a head node or a worker that is gone is noticed.
             ray.wait([worker.result for worker in crew if worker.part is not None], timeout=1.0)
             head.check()
             for worker in crew:
@@ -95,6 +98,7 @@ def evaluate_parallel(
                     writer.put(first, recorded)
                 if progress is not None:
                     progress(sum(count for begin, count in parts if begin in flown))
+    # Ctrl-C, too: no process is left behind.
     except BaseException:
         for worker in crew:
             worker.end()
@@ -104,6 +108,7 @@ def evaluate_parallel(
             worker.end()
         else:
             _idle.append(worker)
+    # In the order of the episodes, not in that in which parts came back.
     return {name: np.concatenate([flown[first][name] for first, _ in parts]) for name in flown[0]}
 
 
@@ -147,6 +152,7 @@ class _Worker:
                 found: tuple[dict[str, np.ndarray], dict[str, np.ndarray]] = ray.get(self.result)
                 return found
         except ray.exceptions.RayTaskError as error:
+            # What the worker raised, as it would be raised here.
             raise error.cause from error
         except (ray.exceptions.RayActorError, ray.exceptions.ObjectLostError, _ray.Silent):
             assert self.part is not None
@@ -195,6 +201,7 @@ def _fly_part(task: bytes, first: int, count: int) -> tuple[dict[str, np.ndarray
 
     values, make_policy, seed, factors, records = cloudpickle.loads(task)
     config = build_config(values, {})
+    # Where the policy has brought torch along; others need not wait for its import.
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
     arrays = make_arrays(MultiliftVec(build_config(values, {"env.num_envs": 1})), count) if records else {}

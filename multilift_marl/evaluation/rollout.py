@@ -77,6 +77,7 @@ def run_episodes(
     for done in range(0, episodes, _BATCH):
         count = min(_BATCH, episodes - done)
         part = build_config(config.model_dump(), {"env.num_envs": count})
+        # Numbered through all batches: episode i is the first of environment i, however many are simulated at once.
         vec = MultiliftVec(part, purpose, first_env=first + done)
         observation, _ = vec.reset(seed=seed, options=_fix_parameters(vec, factors) if factors else None)
         policy, on_step = make_policy(vec), None if record is None else record(done)
@@ -94,6 +95,7 @@ def _fix_parameters(vec: MultiliftVec, factors: Mapping[str, Any]) -> dict[str, 
     for name, factor in factors.items():
         whole = getattr(nominal, name)
         relative = name.startswith("vehicle_")  # these are factors themselves
+        # `whole[:1]`: before a reset the parameters of all environments are the nominal ones.
         fixed[name] = np.broadcast_to(np.asarray(factor) * (1.0 if relative else whole[:1]), whole.shape)
     return {"randomization": fixed}
 
@@ -159,9 +161,11 @@ def measure_episodes(
             policy.reset(over)
             previous[over] = 0.0
     failed = result["failure_cause"] > 0
+    # Episodes that fail before the window have no steps in it, and their means are not used below.
     steps = np.maximum(final_steps, 1)
     limit = vec.max_steps * dt
     rms = np.sqrt(square / np.maximum(counted, 1))
+    # One drone has no distance from others.
     if vec.num_drones == 1:
         del result["min_separation_m"]
     distance = final_distance / steps
@@ -169,6 +173,7 @@ def measure_episodes(
     return result | {
         **meter.result(np.logical_not(failed | result["success_rate"].astype(bool))),
         "precise_rate": ~failed & (distance <= PRECISE[0]) & (angle <= PRECISE[1]),
+        # Failed episodes stand at the bound: means over the little that they flew would flatter them.
         "payload_position_error_m": np.where(failed, MAX_DISTANCE, distance),
         "payload_attitude_error_deg": np.where(failed, 180.0, angle),
         "payload_tilt_deg": np.where(failed, 180.0, final_tilt / steps),
@@ -202,6 +207,7 @@ def _along_axes(vec: MultiliftVec) -> np.ndarray:
     of their ψ = atan2(-R01, R11).
     """
     errors, yaw = vec.task.errors, vec.task.goal.yaw
+    # Turned by -ψ about the vertical, which leaves z and the turn about it as they are.
     c, s = np.cos(yaw), np.sin(yaw)
     (x, y, z), (roll, pitch, turn) = errors.position.T, np.rad2deg(errors.rotation.T)
     return np.stack([c * x + s * y, c * y - s * x, z, c * roll + s * pitch, c * pitch - s * roll, turn])

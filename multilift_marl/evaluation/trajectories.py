@@ -89,6 +89,7 @@ class Recording:
             else:
                 self._arrays[name][self._first + chosen, 0] = np.nan
         self._arrays["steps"][self._first + chosen] = self._step
+        # Those that have just ended have their last row: what follows there is of other episodes.
         self._running = chosen[~vec.ended[chosen]] if self._step else chosen
         self._step += 1
 
@@ -136,6 +137,7 @@ class TrajectoryWriter:
                 f"trajectories of {episodes} episodes take {needed / 1e9:.1f} GB, but {folder} has {free / 1e9:.1f}; "
                 "ask for fewer episodes, or give another folder by out=<folder>"
             )
+        # On the disk of the files themselves, so that whole ones are only renamed at the end.
         self._folder = Path(tempfile.mkdtemp(dir=folder, prefix=".trajectories-"))
         self._arrays: Arrays = {
             name: np.lib.format.open_memmap(self._folder / f"{name}.npy", "w+", np.float64, shape)
@@ -160,6 +162,7 @@ class TrajectoryWriter:
         """
         for name in self._shapes:
             for rows, steps in zip(self._arrays[name], self._arrays["steps"], strict=True):
+                # Past its end an episode has no numbers, where a new file has zeros.
                 rows[steps + 1 :] = np.nan
         more = {"steps": self._arrays["steps"], "time": self._time(), "about": np.array(json.dumps(self._about()))}
         for name, array in more.items():
@@ -169,6 +172,7 @@ class TrajectoryWriter:
             for name in (*more, *self._shapes):
                 mapped = self._arrays.get(name)
                 if isinstance(mapped, np.memmap):
+                    # The file is read by its name below, and has to hold what was written to memory.
                     mapped.flush()
                 entry = zipfile.ZipInfo(f"{name}.npy")  # without a date: the same flights are the same file
                 with (
@@ -230,6 +234,7 @@ def _write_csv(path: Path, columns: list[str], rows: Iterator[np.ndarray]) -> No
         writer.writerow(columns)
         for block in rows:
             for episode, step, *values in block.tolist():
+                # Only NaN differs from itself.
                 writer.writerow([int(episode), int(step), *("" if value != value else value for value in values)])
 
 

@@ -188,6 +188,7 @@ class StateComponents(NamedTuple):
 
     def listed(self, num_drones: int, action_size: int) -> tuple[Component, ...]:
         """Return all components, one after the other."""
+        # The order in which `observation_kernels.compose_state` writes.
         return (*self.team, *num_drones * (*self.drone, previous_action(action_size)), *self.rest)
 
     def size(self, num_drones: int, action_size: int) -> int:

@@ -44,9 +44,11 @@ class ArrayView:
     """
 
     def __init__(self, record: Any, rows: Any, shared: Container[str] = ()):
+        # Past `__setattr__`, which refuses everything.
         vars(self).update(_record=record, _rows=rows, _shared=shared)
 
     def __getattr__(self, name: str) -> Any:
+        # Copies ask for names before there is a `_record`: to search for that would lead here again, for ever.
         if name.startswith("_"):
             raise AttributeError(name)
         if isinstance(self._record, View):
@@ -69,6 +71,7 @@ class ArrayView:
 def _freeze(value: Any, rows: Any) -> Any:
     """Return rows of an array, or of those of a tuple, read-only."""
     if isinstance(value, np.ndarray):
+        # A view of the array: that it is read-only leaves the array itself as it is.
         value = value[rows]
         value.flags.writeable = False
     elif hasattr(value, "_fields"):
@@ -212,6 +215,7 @@ class NumpyFunctions:
         for at, part, function in self._observed:
             value, numbers = self._evaluate(function, lo, hi)[""], slice(at, at + part.size)
             frame = goal.slot_frame[lo:hi]
+            # From the world into the slot frame: a turn by minus its azimuth, of the same cosine and minus the sine.
             self._observation[lo:hi, :, numbers] = _turned(part, value, frame[..., 0], -frame[..., 1])
             self._observation[lo:hi, :, numbers] *= self._factors[numbers]
         for at, part, function in self._of_state:
@@ -226,6 +230,7 @@ class NumpyFunctions:
         values = self._call(function, function.whole, lo, hi)
         if count > 1 and function.what not in self._compared:
             self._compared.add(function.what)
+            # The last one alone: as that is fewer than all, no further comparison follows.
             for name, alone in self._evaluate(function, hi - 1, hi).items():
                 self._compare(function, values[name][-1], alone[0])
         return values

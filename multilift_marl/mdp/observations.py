@@ -78,6 +78,7 @@ def thrust_axis(e, n, v):
 @inlined
 def relative_heading(e, n, v):
     """Cosine and sine of the own heading relative to the one at rest."""
+    # Not wrapped to ± π: cosine and sine are the same a full turn on.
     yaw = heading(mat(v.estimated.drone_rotation, e, n)) - v.goal.yaw[e] - v.rig.heading[n]
     return cos(yaw), sin(yaw)
 
@@ -157,6 +158,7 @@ def payload_rotation_error(e, n, v):
 @inlined
 def payload_angular_velocity(e, n, v):
     """Angular velocity of the payload."""
+    # Body rates are in the payload's frame, but vectors leave here in the world frame, to be turned like all others.
     k = load_row(n, v)
     return mul(mat(v.payload_estimate.rotation, e, k), vec(v.payload_estimate.body_rates, e, k))
 
@@ -234,6 +236,7 @@ OBSERVATION_SIZE = sum(part.size for part in OBSERVATION)
 
 def kernels_first(parts: Iterable[Component]) -> tuple[Component, ...]:
     """Return the components in their order, NumPy functions last: where kernels write does not depend on these."""
+    # Sorting is stable: each of the two groups keeps its order, which policies depend on.
     return tuple(sorted(parts, key=lambda part: is_plain(part.value)))
 
 
@@ -251,6 +254,7 @@ def list_components(action: str, extra: tuple[Component, ...] = ()) -> tuple[Com
 
 def previous_action(size: int) -> Component:
     """Return the component of the last action, which is copied rather than computed."""
+    # `own_velocity` only fills the place of a value: kernels copy the action and never call it.
     return Component("previous_action", size, "-", "-", "own last action", own_velocity, False)
 
 

@@ -57,6 +57,7 @@ class RestBounds(NamedTuple):
                 raise ConfigError(
                     f"the task's Options have no {name}; add the field, or override prepare() to set `settings`"
                 )
+        # Bounds of motion that the options do not have are infinite: every motion keeps to them.
         speed, body_rate = (getattr(options, f"success_{name}", np.inf) for name in ("speed", "body_rate"))
         return cls(options.success_distance, radians(options.success_angle), speed, body_rate)
 
@@ -82,6 +83,7 @@ def resolve_reward(
         if given.margin is not None and len(given.margin) != count:
             raise ConfigError(f"reward.{name}.margin lists {len(given.margin)} numbers, but the term has {count}")
     weights = np.array([term.weight for term in terms.values()], float)
+    # As wide as the term with most margins needs; what the others leave over is never read.
     margins = np.ones((len(terms), max((len(term.margins) for term in terms.values()), default=0)))
     for i, (name, term) in enumerate(terms.items()):
         given = values.get(name, RewardTerm())
@@ -102,6 +104,7 @@ def compose_reward(terms: Mapping[str, Term], is_good: Callable[..., Any], updat
     functions = {"is_good": is_good} | ({"update": update} if update else {})
     lines = ["def reward(lo, hi, v, weights, margins):", "    for e in range(lo, hi):"]
     for i, (name, term) in enumerate(terms.items()):
+        # A NumPy function writes column i itself, see `NumpyFunctions.judge`.
         if is_plain(term.value):
             continue
         functions[f"{name}_value"] = term.value
@@ -142,6 +145,7 @@ def failure(e, v):
 def stillness(e, v, speed, body_rate):
     """Payload slow, and turning slowly."""
     velocity, rates = norm(row(v.state.payload_velocity, e)), norm(row(v.state.payload_body_rates, e))
+    # A product pays for both at once; a sum would pay half for a payload that spins on the spot.
     return tolerance(velocity, speed) * tolerance(rates, body_rate)
 
 

@@ -85,6 +85,7 @@ def set_flat_state(position, rotation, yaw, load, team, w, x):
     """
     count = team.force.shape[0]
     q = 6 + 2 * count
+    # At the three poses in the middle: forces and places there are differentiated in turn.
     for i in range(3):
         _place_team(i, position, rotation, load, team, w)
     middle = _matrix(rotation, 2)
@@ -92,6 +93,7 @@ def set_flat_state(position, rotation, yaw, load, team, w, x):
     roll, pitch, turned = euler_angles(middle)
     x[3], x[4], x[5] = roll, pitch, yaw + wrap(turned - yaw)
     put(x[q : q + 3], scale(0.5 / STEP, sub(row(position, 3), row(position, 1))))
+    # The mean angular velocity over two steps, from the world into the payload's frame.
     put(x[q + 3 : q + 6], tmul(middle, scale(0.5 / STEP, _turned(rotation, 1, 3))))
     for n in range(count):
         before, here, after = unit(vec(w.force, 0, n)), unit(vec(w.force, 1, n)), unit(vec(w.force, 2, n))
@@ -99,6 +101,7 @@ def set_flat_state(position, rotation, yaw, load, team, w, x):
         for i in range(2):
             x[6 + 2 * n + i] = here[i]
             x[q + 6 + 2 * n + i] = (after[i] - before[i]) * (0.5 / STEP)
+        # Newton's law of the drone, whose thrust holds the cable, its weight and its inertia: F = f + m (p̈ + g e_z).
         middle_place = vec(w.place, 1, n)
         moved = sub(add(vec(w.place, 0, n), vec(w.place, 2, n)), scale(2.0, middle_place))
         thrust = add(f, scale(m, add(scale(1.0 / STEP**2, moved), (0.0, 0.0, GRAVITY))))
@@ -134,15 +137,19 @@ def _place_team(i, position, rotation, load, team, w):
     velocity = scale(0.5 / STEP, sub(row(position, i + 2), row(position, i)))
     change = sub(add(row(position, i), row(position, i + 2)), scale(2.0, here))
     rates = scale(0.5 / STEP, _turned(rotation, i, i + 2))
+    # Angular acceleration: the difference of the mean rates of the step before and of the one after.
     spin = scale(1.0 / STEP**2, sub(_turned(rotation, i + 1, i + 2), _turned(rotation, i, i + 1)))
+    # What the cables have to exert: inertia, weight and drag, less the other force that is known of.
     force = scale(model.payload_mass + load[6], add(scale(1.0 / STEP**2, change), (0.0, 0.0, GRAVITY)))
     force = sub(add(force, scale(model.drag * norm(velocity), velocity)), (load[0], load[1], load[2]))
     body_rates, body_spin = tmul(attitude, rates), tmul(attitude, spin)
+    # Euler's equation in the payload's frame, J ω̇ + ω × J ω; the result goes back to the world frame.
     moment = add(_times(model.inertia, body_spin), cross(body_rates, _times(model.inertia, body_rates)))
     moment = mul(attitude, sub(moment, (load[3], load[4], load[5])))
     psi = heading(attitude)
     c, s = cos(psi), sin(psi)
     for n in range(team.force.shape[0]):
+        # The resting forces turn with the heading alone, as the formation does; only what they lack is distributed.
         nominal = turn(c, s, row(team.force, n))
         put(w.force[i, n], nominal)
         force = sub(force, nominal)

@@ -32,6 +32,7 @@ def slopes(x, model, w):
             w.tension_slope[n, column] += change
             for i in range(6):
                 right[i, column] += w.by_arm[n, k, i] * w.tension[n] + w.arm[n, i] * change
+    # A a = b: the derivatives solve A a' = b' - A' a, by the factors that `accelerations` has left in `mass`.
     solve_factorised(w.mass, right, 6, size)
     for i in range(6):
         for k in range(size):
@@ -49,11 +50,13 @@ def _slope_alone(x, q, model, right):
     l0 = j[0, 0] * w0 + j[0, 1] * w1 + j[0, 2] * w2
     l1 = j[1, 0] * w0 + j[1, 1] * w1 + j[1, 2] * w2
     l2 = j[2, 0] * w0 + j[2, 1] * w1 + j[2, 2] * w2
+    # Drag: the derivative of |v| v_i by v_k is |v| (i = k) + v_i v_k/|v|.
     for i in range(3):
         right[i, q + i] -= model.drag * speed
         for k in range(3):
             right[i, q + k] -= model.drag * x[q + i] * x[q + k] / speed
     for k in range(3):
+        # The derivative of ω × J ω by ω_k is e_k × J ω + ω × J e_k.
         e0, e1, e2 = 1.0 * (k == 0), 1.0 * (k == 1), 1.0 * (k == 2)
         right[3, q + 3 + k] -= e1 * l2 - e2 * l1 + w1 * j[2, k] - w2 * j[1, k]
         right[4, q + 3 + k] -= e2 * l0 - e0 * l2 + w2 * j[0, k] - w0 * j[2, k]
@@ -68,6 +71,7 @@ def _slope_locally(x, n, q, model, w):
     by_tension[:] = 0.0
     by_across[:] = 0.0
     by_arm[:] = 0.0
+    # Where the numbers that its law depends on are in the state: attitude, body rates and thrust; then c and ċ.
     for i in range(3):
         column[i], column[3 + i], column[10 + i] = 3 + i, q + 3 + i, 2 * q + 3 * n + i
     for i in range(2):
@@ -104,6 +108,7 @@ def _slope_by_swing(x, n, q, model, w):
     z = d[2]
     turned = d[0] * swing[0] + d[1] * swing[1]
     for k in range(2):
+        # d_z = √(1 - |c|²) changes by -c_k/d_z, and ḋ_z = -(c · ċ)/d_z by -ċ_k/d_z - (c · ċ) c_k/d_z³.
         b, s, by_arm = w.by_c[n, k], w.by_c_swing[n, k], w.by_arm[n, 6 + k]
         b[0], b[1], b[2] = 1.0 * (k == 0), 1.0 * (k == 1), -d[k] / z
         s[0], s[1], s[2] = 0.0, 0.0, -swing[k] / z - turned * d[k] / z**3
@@ -122,11 +127,13 @@ def _slope_cable(n, q, size, model, w):
     d, h, swing, length, slope = w.direction[n], w.across[n], w.swing[n], model.length[n], w.slope
     along = d[0] * h[0] + d[1] * h[1] + d[2] * h[2]
     fast = swing[0] ** 2 + swing[1] ** 2 + swing[2] ** 2
+    # L c̈ = h - d (d · h) - L |ḋ|² d: by what changes h, ...
     for k in range(LOCAL):
         column, change = w.column[n, k], w.by_across[n, k]
         pulled = d[0] * change[0] + d[1] * change[1] + d[2] * change[2]
         for i in range(2):
             slope[6 + 2 * n + i, column] += (change[i] - d[i] * pulled) / length
+    # ... then by d and ḋ themselves.
     for k in range(2):
         b, s = w.by_c[n, k], w.by_c_swing[n, k]
         turned = h[0] * b[0] + h[1] * b[1] + h[2] * b[2]

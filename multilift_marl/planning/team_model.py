@@ -45,6 +45,7 @@ class TeamModel(NamedTuple):
 
 def make_model(system: System) -> TeamModel:
     """Return the nominal model of a team."""
+    # The model's cables do not stretch: they are as long as real ones under the resting load.
     stretched = system.cable_length + np.linalg.norm(system.formation_force, axis=1) / system.cable_stiffness
     return TeamModel(
         payload_mass=float(system.payload_mass + 0.5 * system.cable_mass.sum()),
@@ -110,6 +111,7 @@ def set_rotation(x, rotation, turning):
     rotation[0, 0], rotation[0, 1], rotation[0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
     rotation[1, 0], rotation[1, 1], rotation[1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
     rotation[2, 0], rotation[2, 1], rotation[2, 2] = -sp, cp * sr, cp * cr
+    # A roll turns the columns R e_y and R e_z into each other, a yaw (last lines) the rows x and y.
     for i in range(3):
         turning[0, i, 0], turning[0, i, 1], turning[0, i, 2] = 0.0, rotation[i, 2], -rotation[i, 1]
     turning[1, 0, 0], turning[1, 0, 1], turning[1, 0, 2] = -cy * sp, cy * cp * sr, cy * cp * cr
@@ -133,6 +135,7 @@ def factorise(matrix, size):
 @kernel
 def solve_factorised(factor, right, size, columns):
     """Replace `right` (size, columns) by the solution with a matrix that `factorise` took apart."""
+    # Forward, L y = b, ...
     for i in range(size):
         for k in range(i):
             part = factor[i, k]
@@ -141,6 +144,7 @@ def solve_factorised(factor, right, size, columns):
         part = 1.0 / factor[i, i]
         for c in range(columns):
             right[i, c] *= part
+    # ... and back, Lᵀ x = y.
     for i in range(size - 1, -1, -1):
         for k in range(i + 1, size):
             part = factor[k, i]
@@ -182,6 +186,7 @@ def accelerations(x, model, load, w):
         for k in range(3):
             mass[3 + i, 3 + k] = j[i, k]
     right[2, 0] -= payload_mass * GRAVITY
+    # Euler's equation in the payload's frame: J α = moment - ω × J ω.
     right[3, 0] = load[3] - (w1 * l2 - w2 * l1)
     right[4, 0] = load[4] - (w2 * l0 - w0 * l2)
     right[5, 0] = load[5] - (w0 * l1 - w1 * l0)
@@ -213,12 +218,15 @@ def _place_cable(x, n, q, model, w):
     """Write direction and swing of cable n, its arm g, and the anchor's centripetal acceleration κ = ω × (ω × r)."""
     arm = model.anchors[n]
     cx, cy, dx, dy = x[6 + 2 * n], x[7 + 2 * n], x[q + 6 + 2 * n], x[q + 7 + 2 * n]
+    # Bounded, so that a trial state of an optimiser with a cable near the horizontal does not divide by zero.
     z = sqrt(max(1.0 - cx * cx - cy * cy, _STEEPEST**2))
     w.direction[n, 0], w.direction[n, 1], w.direction[n, 2] = cx, cy, z
+    # ḋ_z from d · ḋ = 0, as d stays a unit vector.
     w.swing[n, 0], w.swing[n, 1], w.swing[n, 2] = dx, dy, -(cx * dx + cy * dy) / z
     w0, w1, w2 = x[q + 3], x[q + 4], x[q + 5]
     along, square = w0 * arm[0] + w1 * arm[1] + w2 * arm[2], w0 * w0 + w1 * w1 + w2 * w2
     spin = w.spin[n]
+    # ω × (ω × r) = ω (ω · r) - r |ω|², in the payload's frame.
     spin[0], spin[1], spin[2] = w0 * along - arm[0] * square, w1 * along - arm[1] * square, w2 * along - arm[2] * square
     g = w.arm[n]
     g[0], g[1], g[2] = cx, cy, z
@@ -259,6 +267,7 @@ def _swing_cable(x, n, q, model, w):
     for i in range(3):
         anchor = a[i] + w.rotation[i, 0] * c0 + w.rotation[i, 1] * c1 + w.rotation[i, 2] * c2
         h[i] = x[2 * q + 3 * n + i] / model.drone_mass[n] - anchor
+    # h = F/m - g e_z - (a + R (α × r + κ)). The tension, along d, has no part in what is across d.
     h[2] -= GRAVITY
     along, fast = 0.0, 0.0
     for i in range(3):
@@ -271,6 +280,8 @@ def _swing_cable(x, n, q, model, w):
 @kernel
 def euler_rates(roll, pitch):
     """Return six numbers of the matrix T by which T ω are the rates of roll, pitch and yaw: those beside 0 and 1."""
+    # With φ, θ, ψ of Rz(ψ) Ry(θ) Rx(φ): φ̇ = p + tan θ (q sin φ + r cos φ), θ̇ = q cos φ - r sin φ,
+    # ψ̇ = (q sin φ + r cos φ)/cos θ.
     sr, cr, tp, cp = sin(roll), cos(roll), tan(pitch), cos(pitch)
     return (sr * tp, cr * tp, cr, -sr, sr / cp, cr / cp)
 
@@ -286,6 +297,7 @@ def move_to_middle(x, u, h, model, middle):
     w0, w1, w2 = x[q + 3], x[q + 4], x[q + 5]
     for i in range(q):
         middle[i] += 0.5 * h * x[q + i]
+    # Body rates are no rates of angles: these three, which the loop has moved like the others, are written anew.
     middle[3] = x[3] + 0.5 * h * (w0 + t[0] * w1 + t[1] * w2)
     middle[4] = x[4] + 0.5 * h * (t[2] * w1 + t[3] * w2)
     middle[5] = x[5] + 0.5 * h * (t[4] * w1 + t[5] * w2)
@@ -315,6 +327,7 @@ def step_state(x, u, h, model, load, w, after):
     for i in range(q):
         after[i] = x[i] + h * x[q + i] + 0.5 * h * h * a[i]
         after[q + i] = x[q + i] + h * a[i]
+    # The mean body rates of the step, as the matrix of the angles' rates stays that of its start.
     w0, w1, w2 = x[q + 3] + 0.5 * h * a[3], x[q + 4] + 0.5 * h * a[4], x[q + 5] + 0.5 * h * a[5]
     after[3] = x[3] + h * (w0 + t[0] * w1 + t[1] * w2)
     after[4] = x[4] + h * (t[2] * w1 + t[3] * w2)

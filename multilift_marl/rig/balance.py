@@ -44,12 +44,14 @@ def formation_forces(
     n = len(anchors)
     share = weight / n * strength
     pulling = []
+    # First what was asked for, then shares with lower bounds, where a cable would push or lie flat.
     for shares, measure in _tried_shares(anchors, weight, point, share, strength, angle, azimuth):
         force = _balanced_forces(anchors, weight, angle, point, shares, measure, azimuth)
         if _all_pull(force, share):
             if _is_held(force, angle, azimuth):
                 return force
             pulling.append(force)
+    # With all directions free: this tells anchors that hold no payload from angles that hold none.
     free = [
         _balanced_forces(anchors, weight, float(np.mean(angle)), point, *tried, None)
         for tried in _tried_shares(anchors, weight, point, share, strength, angle, None)
@@ -61,8 +63,10 @@ def formation_forces(
             f"payload.anchors: cable {pushing} would have to push; move the anchors around the centre of mass",
             drones=[pushing], anchors=[pushing],
         )  # fmt: skip
+    # Rather one whose cables lean out at all, so that the message does not propose upright ones.
     leaning = [force for force in pulling if (_lean(force)[0] >= _LEAST_LEAN * np.asarray(angle)).all()]
     nearest = min(leaning or pulling, key=lambda force: _astray(force, angle, azimuth))
+    # 0.0 added makes 0.0 of -0.0.
     lean, towards = ((np.round(np.rad2deg(each), 2) + 0.0).tolist() for each in _lean(nearest))
     raise RigError(
         "cables that lean as cable.angle and cable.azimuth say cannot hold the payload level, whatever their tensions; "
@@ -77,11 +81,14 @@ def _tried_shares(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:  # fmt: skip
     """Yield shares of the weight (N,) [N] and by what the deviation of each cable counts (N,) [-], in order."""
     yield share, strength
+    # RMS distance of the anchors from the vertical axis: moments over it count as forces do.
     lever = np.sqrt((anchors[:, :2] ** 2).sum(axis=1).mean()) or 1.0
     upright = [np.ones(len(anchors)), anchors[:, 0] / lever, anchors[:, 1] / lever]
     balances = [] if point else [np.stack(upright)]
     if azimuth is not None and np.ndim(angle):  # the directions of all cables are held: what is left are their tensions
         slope = np.tan(angle)
+        # For each newton that a cable lifts, its force along the direction that is held; the lift goes to the first
+        # row.
         pull = np.stack([slope * np.cos(azimuth), slope * np.sin(azimuth), np.ones(len(anchors))], axis=1)
         moments = np.cross(anchors, pull).T / lever
         balances.append(np.concatenate([pull.T[[2, 0, 1]], moments[: 0 if point else 3]]))
@@ -102,6 +109,7 @@ def nominal_forces(
     centre = anchors[:, :2].mean(axis=0)
     radial = anchors[:, :2] - centre
     distance = np.linalg.norm(radial, axis=1, keepdims=True)
+    # An anchor in the middle has no way outward: as many even directions as there are drones.
     even = 2 * np.pi * np.arange(n) / n
     radial = np.where(
         distance > 1e-6, radial / np.maximum(distance, 1e-6), np.stack([np.cos(even), np.sin(even)], axis=1)
@@ -137,7 +145,9 @@ def _balanced_forces(
     flat, each = nominal.ravel(), np.repeat(measure, 3)
     if np.ndim(angle) or azimuth is not None:
         flat = _held_forces(nominal, balance, load, angle, azimuth, each)
+    # Least Σ |Δf_i / measure_i|²: with Δf = W y it is the least |y| of (B W) y = what is missing.
     force = (flat + each * (np.linalg.pinv(balance * each) @ (load - balance @ flat))).reshape(n, 3)
+    # The pseudoinverse solves least squares where nothing balances; what is left of the load shows that.
     residual = np.abs(balance @ force.ravel() - load).max()
     if residual > 1e-6 * weight:
         raise RigError(
@@ -166,6 +176,7 @@ def _held_forces(
     for _ in range(_NEWTON_STEPS):
         force, rows = flat.reshape(n, 3), []
         level = np.linalg.norm(force[:, :2], axis=1)
+        # A free azimuth follows the force from step to step, which is what makes the equations non-linear.
         turns = ~fixed & (level > 0)
         along[turns] = force[turns, :2] / level[turns, None]
         for i in range(n):
@@ -195,6 +206,7 @@ def _is_held(force: np.ndarray, angle: float | np.ndarray, azimuth: np.ndarray |
         return False
     if azimuth is None:
         return True
+    # Wrapped to ± half a turn, and times sin(lean): an upright cable has no azimuth.
     turned = np.abs((towards - azimuth + np.pi) % (2 * np.pi) - np.pi)
     return bool((np.sin(lean) * turned).max() < _HELD and (lean >= _LEAST_LEAN * np.asarray(angle)).all())
 
@@ -203,6 +215,7 @@ def _astray(force: np.ndarray, angle: float | np.ndarray, azimuth: np.ndarray | 
     """Return the largest angle between a cable and how it was to lean [rad], whose azimuth may be any if None."""
     lean, towards = _lean(force)
     asked = towards if azimuth is None else azimuth
+    # The spherical law of cosines, of two directions with the vertical as third.
     cosine = np.cos(lean) * np.cos(angle) + np.sin(lean) * np.sin(angle) * np.cos(towards - asked)
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)).max())
 
@@ -227,6 +240,7 @@ def _bounded_shares(balance: np.ndarray, weight: float, share: np.ndarray) -> np
     """
     own = share / weight
     balance = own * balance
+    # Of a load of one, what is left for x once every cable has its least share.
     lacking = np.eye(len(balance))[0] - _LEAST_SHARE * balance.sum(axis=1)
     stacked = np.concatenate([_EXACT * balance, np.eye(len(own))])
     beyond = nonnegative_least_squares(stacked, np.concatenate([_EXACT * lacking, np.full(len(own), 1 - _LEAST_SHARE)]))

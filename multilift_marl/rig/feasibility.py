@@ -54,6 +54,7 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
     thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in vehicles])
     if thrust.sum() < MIN_THRUST_TO_WEIGHT * system.weight:
         lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"
+        # The hint supposes a payload that would take 70 % of all thrust: a mistaken unit shows against it.
         load = system.payload_mass
         hint = unit_hint(load, "kg", load + (0.7 * thrust.sum() - system.weight) / GRAVITY, 30.0)
         raise ConfigError(
@@ -62,6 +63,7 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
         )
     cable_weight = system.hook_force - system.formation_force
     own = (1 + ranges.vehicle_mass) * GRAVITY * system.drone_mass[:, None] * [0, 0, 1]
+    # As vectors: a leaning cable takes thrust beside what it lifts.
     hover = np.linalg.norm(heaviest * system.formation_force + cable_weight + own, axis=1)
     # The weakest rotors under the heaviest drone; `cable_weight` does not vary with the payload.
     thrust *= 1 - ranges.vehicle_thrust_coefficient
@@ -87,6 +89,7 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
         )
     shortest = (1 - ranges.cable_length) * system.cable_length
     if (fastest := system.bending_rate(shortest)) * system.timestep > MAX_BENDING:
+        # Which of the two it is: without damping the rate is that of the stiffness.
         undamped = replace(system, bending_damping=0 * system.bending_damping)
         name = "bending_stiffness" if undamped.bending_rate(shortest) == fastest else "bending_damping"
         lower = "randomization.cable_length, " if ranges.cable_length else ""
@@ -146,6 +149,7 @@ def _check_hooks(system: System, ranges: RandomizationConfig) -> None:
     for i, vehicle in enumerate(system.vehicles):
         force = cable_forces[i] + [0, 0, (1 + ranges.vehicle_mass) * vehicle.mass * GRAVITY]
         cable_force = np.reshape(thrust_frame(tuple(force), 0.0), (3, 3)).T @ cable_forces[i]
+        # The rotors exert hook × P against the moment of the cable, hook × (-P).
         wrench = [np.linalg.norm(force), *np.cross(system.hooks[i], cable_force)]
         rotors = np.linalg.solve(vehicle.allocation, wrench)
         least = vehicle.thrust_coefficient * vehicle.rotor_speed_min**2
@@ -191,6 +195,7 @@ def _check_controller(config: SystemConfig, system: System) -> None:
     position = control.position_frequency or attitude / 5  # null: as fast as motors allow, see control/gains.py
     for loop, frequency in (("attitude", attitude), ("position", position)):
         damping = getattr(control, f"{loop}_damping")
+        # An explicit step h takes the share 2 ζ ω h from a velocity: beyond 1 that changes its sign.
         if 2 * damping * frequency > rate:
             raise ConfigError(
                 f"control.{loop}_frequency={frequency:g} rad/s with control.{loop}_damping={damping:g} damps within "
@@ -226,6 +231,8 @@ def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, sys
             f"vehicle.drag of {max(vehicle.drag):g} kg/s stops a drone of vehicle.mass={vehicle.mass:g} kg within less "
             f"than sim.timestep={step:g} s; lower the drag or the time step, or raise the mass"
         )
+    # Rotors that damp the climb by c [kg/s] damp the roll by c a²/2, each a/√2 off the axis: c h is to be below m and
+    # 2 J/a².
     least = min(lightest, 2 * inertia.min() / vehicle.arm**2)
     if system.inflow and vehicle.inflow_damping * (1 + ranges.vehicle_thrust_coefficient) * step > least:
         raise ConfigError(
@@ -242,6 +249,7 @@ def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, sys
             f"within sim.timestep={step:g} s, more than {MAX_SPIN_UP:g} rad/s; raise vehicle.inertia, or lower "
             "vehicle.rotor_thrust_max, vehicle.arm or vehicle.torque_ratio"
         )
+    # Of two rotors of one sense at full speed, while the others stand.
     momentum = 2 * vehicle.rotor_inertia * vehicle.rotor_speed_max
     gyroscopic = momentum / min(np.sqrt(inertia[0] * inertia[1]), inertia[2])  # nutation; spin after two rotors stop
     if gyroscopic * step > 1 or gyroscopic > MAX_NUTATION:
@@ -270,6 +278,7 @@ def _check_payload(ranges: RandomizationConfig, wind: float, system: System) -> 
             f"randomization.payload_force={ranges.payload_force:g} N is more than {MAX_LOAD:g} × the weight of the "
             f"lightest payload, {lightest * GRAVITY:.3g} N; lower it or raise payload.mass"
         )
+    # ½ ρ C_d A |v| v: at a speed |v| it acts like a linear drag of |v| times that.
     drag = 0.5 * AIR_DENSITY * system.payload_drag_area * (1 + ranges.payload_drag)
     if drag * (wind + _OWN_SPEED) * step > lightest:
         hint = unit_hint(system.payload_drag_area, "m²", system.payload_size.max() ** 2, 100.0)
@@ -289,6 +298,7 @@ def _check_swing(ranges: RandomizationConfig, system: System) -> None:
     fast = f"sim.timestep={step:g} s resolves" if swing.rate * step > 1 else f"{MAX_SWING:g} rad/s"
     lower = "" if swing.rate > MAX_SWING else ", or lower sim.timestep"
     drone = swing.body - 1
+    # Without any ranges: if that is slow enough, the ranges are to blame and not the rig.
     nominal = fastest_swing(system, RandomizationConfig()).rate
     if nominal * step <= 1 and nominal <= MAX_SWING:
         raise ConfigError(
@@ -337,6 +347,7 @@ def _check_cables(ranges: RandomizationConfig, system: System) -> None:
     if not system.cable_mass.any():
         return
     node, link = system.cable_mass / (system.cable_segments - 1), shortest / system.cable_segments
+    # h √(T/(m l)), with mass m of a node and length l of a link of the shortest cable, which weighs less, too.
     lightness = system.timestep * np.sqrt(tension / (node * link * shortest / system.cable_length))
     if np.any(lightness > MAX_LIGHTNESS):
         i = int(np.argmax(lightness))

@@ -119,6 +119,7 @@ def divergence_rate(
     for i, (force, anchor, vehicle) in enumerate(zip(system.hook_force, anchors, system.vehicles, strict=True)):
         shift = slice(6 + 6 * i, 9 + 6 * i)
         direction = force / np.linalg.norm(force)
+        # How fast the cable grows longer by each coordinate: its ends part along u, and u · (θ × r) = θ · (r × u).
         along = np.zeros(6 + 6 * n)
         along[:3], along[3:6], along[shift] = -direction, -np.cross(anchor, direction), direction
         stiffness += system.cable_stiffness[i] * np.outer(along, along)
@@ -152,6 +153,7 @@ def warn_of_instability(system: System, frequency: np.ndarray, ranges: Randomiza
         raised = replace(system, anchors=system.anchors + [0.0, 0.0, rise])
         return divergence_rate(raised, frequency, load, center) <= _SLOW
 
+    # Bisection for the least rise of the anchors at which the payload hangs stable.
     low, enough = 0.0, 2 * float(np.abs(system.anchors).max() + system.payload_size.max())
     for _ in range(_HALVINGS):
         middle = (low + enough) / 2

@@ -38,6 +38,7 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
     # cables are limits of tendons or act as loads: there are no springs and dampers to evaluate
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
     _add_world(spec, visuals)
+    # The payload first: `Layout` and compiled loops find the drones' joints after its own.
     _add_payload(spec, system)
     for i in range(system.num_drones):
         body = spec.worldbody.add_body(name=f"drone_{i}", pos=system.slots[i] + [0, 0, 1.5])
@@ -63,12 +64,14 @@ def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
     option.tolerance = 1e-18
     option.iterations = 1000  # elliptic cones: 300 leave 2 mm/s in rare steps of 16 drones that rattle on the ground
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    # AUTORESET would put a diverged simulation back to its start unnoticed; `World.diverged` marks it instead.
     option.disableflags |= disable.mjDSBL_REFSAFE | disable.mjDSBL_AUTORESET | disable.mjDSBL_ISLAND
 
 
 def build_model(system: System, visuals: bool = False) -> tuple[mujoco.MjModel, Layout]:
     """Return the compiled model and where its bodies are."""
     model = build_spec(system, visuals).compile()
+    # After compiling, which computes the inverse weights that stiffness and damping of cables are scaled by.
     CABLE_MODELS[system.cable_model].set_constants(model, system)
     point = system.payload_shape == "point"
     drones = tuple(model.body(f"drone_{i}").id for i in range(system.num_drones))
@@ -78,12 +81,14 @@ def build_model(system: System, visuals: bool = False) -> tuple[mujoco.MjModel, 
 def _add_world(spec: mujoco.MjSpec, visuals: bool) -> None:
     world = spec.worldbody
     floor = world.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.05])
+    # The top view is a little off straight down, where `right` would be 0/0.
     for name, pos, forward in (("side", [0.0, -5.2, 3.4], [0, 1, -0.3]), ("top", [0.0, 0.0, 8.0], [0, 1e-3, -1])):
         forward = np.asarray(forward, float) / np.linalg.norm(forward)
         right = np.cross(forward, [0, 0, 1])
         right /= np.linalg.norm(right)
         up = np.cross(right, forward)
         quat = np.zeros(4)
+        # A camera of MuJoCo has its view along -z, x to the right and y up.
         mujoco.mju_mat2Quat(quat, np.stack([right, up, -forward], axis=1).ravel())
         world.add_camera(name=name, pos=pos, quat=quat, fovy=45)
     if visuals:
@@ -94,6 +99,7 @@ def _add_payload(spec: mujoco.MjSpec, system: System) -> None:
     point = system.payload_shape == "point"  # its slide joints count from the body's place, so that must be the origin
     body = spec.worldbody.add_body(name="payload", pos=[0, 0, 0 if point else 1.5])
     body.mass = system.payload_mass
+    # Stated, or MuJoCo would compute it from the geom and its density. The frame's origin is the centre of mass.
     body.explicitinertial = True
     body.inertia = system.payload_inertia
     body.ipos = [0, 0, 0]
@@ -123,6 +129,7 @@ def _payload_form(system: System, margin: float = 0.0) -> dict[str, Any]:
     pos = system.payload_center
     mesh = system.payload_mesh
     if mesh is not None:
+        # Vertices count from the mesh's own origin: its middle goes to where the payload's is.
         return {"type": _GEOM.mjGEOM_MESH, "meshname": "payload", "pos": pos - mesh.middle}
     if system.payload_shape == "cylinder":
         return {"type": _GEOM.mjGEOM_CYLINDER, "size": [half[0], half[2], 0], "pos": pos}
@@ -137,6 +144,7 @@ def _add_drone(body: mujoco.MjsBody, system: System, i: int, visuals: bool) -> N
     body.inertia = vehicle.inertia
     body.ipos = [0, 0, 0]
     colour = DRONE_COLOURS[i % len(DRONE_COLOURS)]
+    # Transparent where a rotorcraft is drawn in place of its collision box.
     body.add_geom(
         name=name, type=_GEOM.mjGEOM_BOX, size=drone_half_size(vehicle),
         rgba=[*colour[:3], 0.0 if visuals else 1.0],
@@ -159,6 +167,7 @@ def _add_surroundings(spec: mujoco.MjSpec, floor: mujoco.MjsGeom) -> None:
     visual.map.shadowclip = 1.2
     visual.rgba.haze = [*horizon, 1]
     visual.rgba.fog = [*horizon, 1]
+    # Distances of `map` are in units of `stat.extent`.
     visual.map.fogstart = 2.5
     visual.map.fogend = 7.0
     visual.map.znear = 0.01
@@ -212,6 +221,7 @@ def _add_target(spec: mujoco.MjSpec, system: System, margin: float, form: dict[s
         margin: by which it is larger on every side [m].
         form: type, size and place of its geom, `margin` included; a point has a form of its own.
     """
+    # Below the ground until the first picture puts it where the goal is.
     body = spec.worldbody.add_body(name="target", mocap=True, pos=[0, 0, -10])
     plain = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP}
     faint = [0.0, 0.75, 0.35, 0.18]
@@ -230,6 +240,7 @@ def _add_target(spec: mujoco.MjSpec, system: System, margin: float, form: dict[s
 def _edges(half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the ends of the twelve edges of a box."""
     corners = half * np.array(list(product((-1, 1), repeat=3)))
+    # Corners that differ along one axis alone are the ends of an edge.
     return [(a, b) for a, b in combinations(corners, 2) if np.count_nonzero(a != b) == 1]
 
 

@@ -111,6 +111,7 @@ class World:
         self.thrust = np.zeros((num_envs, self.num_drones, 4))
         self.state = SystemState.zeros(num_envs, self.num_drones)
         self.parameters = nominal_parameters(system, num_envs)
+        # `payload_mass` is the parameters' own array: what `set_parameters` writes counts here, too.
         self.hidden_loads = HiddenLoads(
             payload_mass=self.parameters.payload_mass, payload_force=np.zeros((num_envs, 3)),
             wind=np.tile(system.wind, (num_envs, 1)), motors_off=np.zeros((num_envs, self.num_drones), bool),
@@ -153,6 +154,7 @@ class World:
         if self._pushing is not None:
             for e in np.flatnonzero(mask).tolist():
                 self.seed_pushes(e, np.random.SeedSequence(self.seed, spawn_key=(e, 1)))
+        # Last: it writes the state into simulations, whose parameters have to be set by then.
         self.load(mask)
         return state
 
@@ -182,6 +184,8 @@ class World:
     def advance(self, shard: Shard, nstep: int) -> None:
         """Advance one shard with the thrusts in `thrust`; see `step`."""
         for _ in range(nstep):
+            # In this order: `apply` writes the loads of the step, pushes and cables add to them, and `read` takes over
+            # what MuJoCo has made of them.
             shard.apply()
             if shard.push is not None:
                 shard.push()
@@ -192,6 +196,7 @@ class World:
             try:
                 shard.batch.step()
             except SimulationError as error:
+                # Those named kept their state, the others were stepped: the shard goes on.
                 self.diverged[shard.lo + np.asarray(error.ids, int)] = True
             shard.read()
             if self.breakable:
@@ -233,6 +238,7 @@ class World:
             mask = changed[shard.lo : shard.hi]
             if mask.any():
                 own = self._shard_parameters(shard)
+                # Masses first: from them follow MuJoCo's weights, and from these the law of the cables.
                 write_masses(shard.batch, self.layout, self.system, own, mask, names)
                 self.cable_model.update_models(shard.batch, self.system, own, mask, names, shard.broken)
 
@@ -264,6 +270,7 @@ class World:
         for shard in self.shards:
             local = mask[shard.lo : shard.hi]
             if local.any():
+                # Cables are whole again in the models, too, before a state is written that takes them to be.
                 self._sync_broken(shard)
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
                 self.cable_model.write_state(shard.rows, mask, self._data, self.cables)
@@ -311,6 +318,7 @@ class World:
             ValueError: it is of another system, or not what `state_dict` returned; nothing is changed then.
         """
         check_saved(saved, self.state_dict(), "diverged", "system")
+        # By `set_parameters` first, which brings the models into line; the arrays alone would leave them as they are.
         parameters = {name: saved[f"parameters.{name}"] for name in Parameters._fields}
         self.set_parameters(np.ones(self.num_envs, bool), **parameters)
         for prefix, group in self._groups().items():
@@ -340,18 +348,21 @@ class World:
         return Parameters(*(array[shard.lo : shard.hi] for array in self.parameters))
 
     def _make_shards(self, num_threads: int) -> list[Shard]:
+        # Shares that differ by one environment at most.
         edges = np.linspace(0, self.num_envs, min(num_threads, self.num_envs) + 1).astype(int).tolist()
         shards = []
         radii = body_radii(self.system)
         air_constants = make_air(self.system)
         air = None if air_constants.still else (self.air, air_constants)
         for lo, hi in zip(edges[:-1], edges[1:], strict=True):
+            # One thread each: the thread that runs a shard is all that it has.
             batch = Batch(self.model, hi - lo, nthread=1)
             rows = make_rows(self.layout, batch, lo)
             loads = self.thrust, self.hidden_loads
             apply = bind(apply_loads, rows, *loads, self._data, air_constants.drones, air, self._varied)
             push = None if self._pushing is None else bind(apply_pushes, rows, *self._pushing)
             advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
+            # As the compiled model is: contacts are searched. Flags are only written where this changes.
             proximity = np.full(hi - lo, NEAR, np.int8)
             find = bind(find_close, lo, self.state, proximity, radii, self.system.timestep)
             broken = np.zeros((hi - lo, self.num_drones), bool)

@@ -109,6 +109,7 @@ def target_position(e, t, v):
     gates, gap_y = v.settings, v.own.gap_y
     x = gates.reach * (2.0 * ease(t, gates.begin, gates.duration)[0] - 1.0)
     y, before, last = 0.0, -gates.reach, 0.0
+    # The path is straight from 0.25 m before a wall to 0.25 m behind it.
     for g in range(gates.x.shape[0]):
         # Eased over x in place of time: the same curve, however fast it is followed.
         y += (gap_y[e, g] - last) * ease(x, before, gates.x[g] - 0.25 - before)[0]
@@ -169,6 +170,7 @@ def own_gap(e, n, state, v):
 @inlined
 def _reach(frame, half, axis):
     """Return how far a box of `half` edges reaches along a world axis [m]."""
+    # Support of a turned box along axis i: Σ |R_ij| h_j.
     return abs(frame[3 * axis]) * half[0] + abs(frame[3 * axis + 1]) * half[1] + abs(frame[3 * axis + 2]) * half[2]
 
 
@@ -354,6 +356,7 @@ class Gate(Task):
             radius=option.start_radius,
             drone=drone,
             clear=clear,
+            # The team is turned by 90° (see the start): its slots' y lies along the path.
             passed=float((np.abs(self.rig.slots[:, 1]) + clear).max()),
             payload=system.payload_size / 2,
             center=triple(system.payload_center),

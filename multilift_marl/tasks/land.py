@@ -90,6 +90,7 @@ class LandSettings(NamedTuple):
 def start_above_origin(e, rng, v, equilibrium, ranges):
     """Draw the pad; write a team at rest above the origin. Ranges are x and y [m], heading [rad], height [m]."""
     goal, (xy, yaw, height) = v.goal, ranges
+    # A payload on the ground has its centre of mass at `ground.payload`: the course leads down, z < 0.
     put(v.own.course[e], (rng.uniform(-xy, xy), rng.uniform(-xy, xy), v.settings.ground.payload - height))
     set_resting_goal(e, goal, (0.0, 0.0, height))
     putmat(goal.rotation[e], rot_z(rng.uniform(-yaw, yaw)))
@@ -103,13 +104,17 @@ def advance(e, v):
     """Move the goal on: to the pad, down, slowly onto it; then cable forces fade and drones come closer."""
     goal, rig, own, ground, t = v.goal, v.rig, v.own, v.settings.ground, v.time[e]
     course = row(own.course, e)
+    # At every control step, and not only after a policy step, in which a payload could touch and bounce unseen.
     see_touchdown(e, v)
+    # The slow part is no longer than the whole descent, where teams start low.
     near = min(NEAR * ground.size, -course[2])
+    # The start again, from the course alone; the three phases add up on it.
     set_resting_goal(e, goal, (0.0, 0.0, ground.payload - course[2]))
     move_goal(e, goal, (course[0], course[1], 0.0), ease(t, APPROACH[0], APPROACH[1]))
     move_goal(e, goal, (0.0, 0.0, course[2] + near), ease(t, DESCEND[0], DESCEND[1]))
     move_goal(e, goal, (0.0, 0.0, -near), ease(t, SETTLE[0], SETTLE[1]))
     place_formation(e, goal, rig)
+    # After the formation, which writes slots and full cable forces anew in each step: both are changed from there.
     own.pull_fraction[e] = 1.0 - ease(t, RELEASE[0], RELEASE[1])[0]
     lower = ease(t, LOWER[0], LOWER[1])
     for n in range(rig.slots.shape[0]):
@@ -117,6 +122,7 @@ def advance(e, v):
         put(goal.slots[e, n], add(vec(goal.slots, e, n), scale(-SHORTER * lower[0], chord)))
         put(goal.slot_velocity[e, n], scale(-SHORTER * lower[1], chord))
         put(goal.slot_acceleration[e, n], scale(-SHORTER * lower[2], chord))
+        # After the slot's acceleration, from which it takes the load's inertia that is not moved along.
         scale_cable_force(e, n, v, own.pull_fraction[e], ground.cable_weight)
 
 
@@ -153,12 +159,14 @@ def off_pad(e, v):
 def _drone_clear(e, n, v):
     """Return whether drone n of environment e is clear of payload and ground."""
     drone = vec(v.state.drone_position, e, n)
+    # In the payload's frame, with whose axes its box is aligned.
     away = tmul(matrow(v.state.payload_rotation, e), sub(drone, row(v.state.payload_position, e)))
     center, half = v.limits.payload_center, v.limits.payload_half  # a cylinder counts as the box about it
     # Distance of the drone's centre from a box, 0 inside.
     x = max(abs(away[0] - center[0]) - half[0], 0.0)
     y = max(abs(away[1] - center[1]) - half[1], 0.0)
     z = max(abs(away[2] - center[2]) - half[2], 0.0)
+    # The ground is as far as the centre is high. A drone counts as the sphere about its box, whatever its tilt.
     return min(norm((x, y, z)), drone[2]) - v.settings.drone_half >= v.settings.clearance
 
 
@@ -173,6 +181,7 @@ def is_put_down(e, v):
     """Payload at rest on the pad, every cable slack, every drone clear."""
     good = off_pad(e, v) <= v.settings.radius
     for n in range(v.action.shape[1]):
+        # Exactly 0: a slack massless cable has no tension at all, and a chain's own weight is cut off.
         good = good and _excess(e, n, v) == 0.0 and _drone_clear(e, n, v)
     return good and norm(row(v.state.payload_velocity, e)) <= _AT_REST and load_height(e, v.state, v.limits) < TOUCH
 
@@ -251,6 +260,7 @@ class Land(Task):
         ranges = option.pad_xy, radians(option.pad_yaw), option.start_height
         start_above_origin(env, rng, self.view_for(start_above_origin), self.equilibrium, ranges)
         self.own.touch[env], self.own.speed[env], self.time[env] = AIRBORNE, 0.0, 0.0
+        # At t = 0 it writes what is fed forward and what is ignored, which are still those of the last episode's end.
         advance(env, self.view_for(advance))
 
     def succeeded(self) -> np.ndarray:
@@ -281,6 +291,7 @@ def _level(state: SystemState, course: np.ndarray) -> np.ndarray:
 
 def lowest_points(state: SystemState, limits: Limits) -> np.ndarray:
     """Return heights of the payloads' lowest points (E,) [m], see `load_height`."""
+    # The third row of R holds the heights of the body axes, as in `failures.payload_height`.
     up, half = state.payload_rotation[:, 2], limits.payload_half
     if limits.payload_round:
         reach = np.hypot(up[:, 0], up[:, 1]) * half[0] + np.abs(up[:, 2]) * half[2]

@@ -106,12 +106,14 @@ def stop_motors(e, v):
         v.disturbances.motors_off[e, who] = True
         if v.settings.snap:
             v.state.cable_broken[e, who] = True
+    # Here, at every control step: a snatch is over within a policy step.
     update_peak_tension(e, v, v.own.peak_tension)
 
 
 @inlined
 def snatch(e, v):
     """Rise of the episode's largest tension in this step above 75 % of the limit, over that limit."""
+    # Rises alone add up to the episode's peak, whatever the steps: an old snatch does not count again.
     counted = max(v.own.counted_tension[e], HARMLESS * v.settings.tension)
     return max(v.own.peak_tension[e] - counted, 0.0) / v.settings.tension
 
@@ -152,6 +154,7 @@ def lost_direction(e, n, v):
 @inlined
 def planned_offset(e, n, v):
     """By how much the own slot is to move after a loss, in its frame."""
+    # Before a loss is known, drone 0 and any time are read; the factor 0 below takes that out.
     who, seconds = v.own.known_who[e, n], v.time[e] - v.own.known_when[e, n]
     cosine = cos(v.rig.azimuth[who] - v.rig.azimuth[n])
     offset = plan_offset(seconds, v.settings.offsets[who, n], cosine, not v.settings.snap)
@@ -221,6 +224,7 @@ class Loss(Task):
         changes = expect_changes(world.system, gains.mass)
         by_cable = self._notice_by_cable(changes)
         self._ranges = make_ranges(option)
+        # Or models are not brought into line with cables that the task breaks: these would go on pulling.
         world.breakable = world.breakable or option.snap
         offsets = redistributed_slots(world.system, gains, not option.snap, control.max_offset)
         self.own = LossArrays(
@@ -250,6 +254,7 @@ class Loss(Task):
             return False
         why = ""
         if known.sensing == "onboard":
+            # The diagonal is a drone's own loss, which it need not feel.
             felt = (np.linalg.norm(changes, axis=2) >= LEAST_CHANGE) | np.eye(len(changes), dtype=bool)
             if felt.all() and early >= SETTLED:
                 return True
@@ -275,6 +280,7 @@ class Loss(Task):
 
     def succeeded(self) -> np.ndarray:
         """At rest throughout the last seconds, with a drone less, and never too large a tension."""
+        # An episode that was over before the loss shows nothing.
         rested = super().succeeded() & self.mask.lost.any(axis=1)
         return rested & (self.own.peak_tension <= self.options.success_tension)
 

@@ -177,6 +177,7 @@ class Pose(Task):
 
     def count_limits(self) -> dict[str, tuple[int, int]]:
         """Bound what kernels index by, see `Task`."""
+        # `pose` has the start and K targets: the stage is from 0 to K - 1.
         return {"plan.stage": (0, self.own.plan.pose.shape[1] - 2)}
 
     def prepare(self) -> None:
@@ -191,6 +192,7 @@ class Pose(Task):
             )
         length = self.config.env.episode_seconds
         hold = min(option.target_seconds, length)
+        # The last target may have less time than the others; round-off must not add one that has none.
         targets = ceil(length / hold - 1e-9)
         self.own = PoseArrays(Plan.zeros(e, targets, n), np.zeros((e, targets), bool))
         if option.plan:  # actions point as observations do
@@ -216,6 +218,7 @@ class Pose(Task):
                 "this team can hold hardly any of the poses of task pose; lower task_options.target_tilt, raise "
                 "target_height or change the rig"
             )
+        # Before the start is written: to compare candidates overwrites time, stage and planned pose.
         if self.options.plan:
             select_candidate(env, self.view_for(select_candidate))
         start_at_first_pose(env, self.view_for(start_at_first_pose), self.equilibrium)
@@ -235,6 +238,7 @@ class Pose(Task):
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
+        # Stated where `succeeded` is overridden, for `says_criteria` trusts no older ones: here they are the same.
         return super().criteria()
 
     def success_windows(self) -> tuple[tuple[float, float], ...]:
@@ -246,5 +250,6 @@ class Pose(Task):
     def in_error_window(self, time: float, length: float) -> bool:
         """Count the last second of every target."""
         settings = self.settings
+        # Time since the present target began; at its very end it still is the present one, hence ceil - 1, not floor.
         gone = time - settings.hold * (ceil(time / settings.hold - 1e-9) - 1)
         return time > length - settings.success_seconds + 1e-9 or gone > settings.hold - settings.success_seconds + 1e-9

@@ -106,6 +106,7 @@ class TrackSettings(NamedTuple):
 @kernel
 def _turn_target(e, t, table, goal, rig):
     """Write heading of the target of environment e by a file, and how its formation moves as it turns with it."""
+    # The yaw comes as the first of three numbers, so that `differences` takes it like a place.
     before, after = spline_yaw(table, t - STEP), spline_yaw(table, t + STEP)
     outer, last = spline_yaw(table, t - 2.0 * STEP), spline_yaw(table, t + 2.0 * STEP)
     yaw, rate, change, jerk = differences(outer, before, spline_yaw(table, t), after, last)
@@ -118,6 +119,7 @@ def _turn_target(e, t, table, goal, rig):
         # level' = w across, across' = -w level.
         arm = sub(vec(goal.slots, e, n), row(goal.position, e))
         level, across = (arm[0], arm[1], 0.0), (-arm[1], arm[0], 0.0)
+        # Hence level'' = w' across - w² level and level''' = (w'' - w³) across - 3 w w' level.
         put(goal.slot_velocity[e, n], scale(w, across))
         put(goal.slot_acceleration[e, n], sub(scale(dw, across), scale(w * w, level)))
         put(goal.slot_jerk[e, n], sub(scale(ddw - w**3, across), scale(3.0 * w * dw, level)))
@@ -133,7 +135,9 @@ def aim(e, t, v):
         return
     place_formation(e, goal, rig)
     if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
+        # The tangent of a circle is a quarter of a turn ahead of its radius.
         set_heading(e, path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi, goal, rig)
+        # ω dτ/dt, by a central difference of the path's own time: 0 at the start, ω after the ramp.
         goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
 
 
@@ -141,6 +145,7 @@ def aim(e, t, v):
 def start_on_path(e, rng, v, equilibrium):
     """Write goal and team at the start of the path, with the target's velocity."""
     goal, path = v.goal, v.own.path
+    # Without a centre `place` returns where the bare curve begins, which the centre then takes away.
     put(path.centre[e], (0.0, 0.0, 0.0))
     begin = place(e, 0.0, path, v.settings.table)
     # every path but a file's starts above the origin
@@ -229,6 +234,7 @@ def _preview(times, path, table, position, rotation):
     """Write places (E, M, 3) and attitudes (E, M, 3, 3) of the targets at times (E, M)."""
     for e in range(times.shape[0]):
         for m in range(times.shape[1]):
+            # Planners take differences about the start, too; before it the target stands where it begins.
             t = max(times[e, m], 0.0)
             put(position[e, m], place(e, t, path, table))
             yaw = spline_yaw(table, t)[0] if path.kind[e] == FILE else path.heading[e]
@@ -293,6 +299,7 @@ class Track(Task):
         """See `Task.prepare`."""
         option, world, e = self.options, self.world, self.world.num_envs
         seconds = self.config.env.episode_seconds
+        # Of an episode that is over by then all errors count, rather than none.
         self.rmse_after = option.rmse_from if option.rmse_from < seconds else 0.0
         file = self._file()
         table = NO_FILE
@@ -334,6 +341,7 @@ class Track(Task):
         elif kind == RANDOM:
             path.curve[env] = draw_curve(rng, np.array(option.room))
             fastest, hardest = largest_rates(path.curve[env])
+            # At r way-points a second, speeds are r times and accelerations r² times those at one.
             path.rate[env] = min(v / fastest, sqrt(a / hardest))
         start_on_path(env, rng, self.view_for(start_on_path), self.equilibrium)
         self.own.worst[env] = 0.0

@@ -41,7 +41,9 @@ def free_fall(fast: bool) -> Result:
         result.compare(name, "speed without drag [m/s], relative error", GRAVITY * seconds, speed, 1e-12)
         depth = _START - float(bare.state.payload_position[0, 2])
         terminal = float(np.sqrt(system.payload_mass * GRAVITY / (0.5 * AIR_DENSITY * system.payload_drag_area)))
+        # m v' = m g - ½ ρ C_d A v² from rest: v = v_t tanh(g t/v_t).
         falling = terminal * float(np.tanh(GRAVITY * seconds / terminal))
+        # m v' = -d v along x, whatever the fall: the drag of a drone is linear.
         coasting = cast * float(np.exp(-system.vehicle.drag[0] / system.vehicle.mass * seconds))
         found = (
             ("depth without drag", "m", 0.5 * GRAVITY * seconds**2, depth),
@@ -143,7 +145,9 @@ def swing(fast: bool) -> Result:
     result = Result(plots=[plot])
     seconds = 5.0 if fast else 20.0
     start = np.deg2rad(30.0)
+    # Stretched as it hangs at rest, by m g/k.
     length = 1.0 + GRAVITY / 1e5
+    # Exact for any amplitude: 2π √(L/g)/agm(1, cos(θ/2)), agm being the arithmetic-geometric mean (Gauss).
     period = 2 * np.pi * np.sqrt(length / GRAVITY) / _mean(1.0, np.cos(start / 2))
     losses = []
     for timestep in STEPS:
@@ -155,6 +159,7 @@ def swing(fast: bool) -> Result:
         losses.append(1 - float(energy[-window:].mean()) / float(energy[:window].mean()))
         limit = 0.01 if timestep == 4e-3 else np.inf
         result.check("swinging load", f"energy lost in {seconds:g} s at {ms(timestep)}, share", losses[-1], limit)
+        # Once in each period it passes the vertical from the same side; the moment is interpolated between steps.
         down = np.flatnonzero((angle[:-1] > 0) & (angle[1:] <= 0))
         crossing = time[down] + timestep * angle[down] / (angle[down] - angle[down + 1])
         found = float(np.diff(crossing).mean())
@@ -198,6 +203,7 @@ def ground(fast: bool) -> Result:
         state = world.state
         half = drone_half_size(system.vehicle)[2]
         frame = np.zeros(9)
+        # A turn by 10° about x: quaternions have half the angle.
         mujoco.mju_quat2Mat(frame, np.array([np.cos(np.deg2rad(5)), np.sin(np.deg2rad(5)), 0, 0]))
         state.payload_position[0] = [0, 0, system.payload_size[2] / 2 + 0.3]
         outward = system.slots[:, :2] / np.linalg.norm(system.slots[:, :2], axis=1, keepdims=True)
@@ -258,6 +264,7 @@ def release_drones(preset: str, start: np.ndarray) -> tuple[np.ndarray, np.ndarr
     reference = Reference.zeros(count, 1)
     state = world.state
     reference.position[:] = [0.0, 0.0, _RELEASE_HEIGHT]
+    # Out of the way; the cable is broken below, so that the drone flies alone.
     state.payload_position[:] = [0.0, 50.0, 0.0]
     state.drone_position[:] = reference.position
     state.drone_rotation[:, 0] = start
@@ -271,4 +278,5 @@ def release_drones(preset: str, start: np.ndarray) -> tuple[np.ndarray, np.ndarr
         world.step(world.thrust)
         lowest = np.minimum(lowest, state.drone_position[:, 0, 2])
     away = np.linalg.norm(state.drone_position - reference.position, axis=-1)[:, 0]
+    # `not a < b`, so that NaN counts as lost.
     return _RELEASE_HEIGHT - lowest, ~(away < _BACK)

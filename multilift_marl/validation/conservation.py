@@ -45,6 +45,7 @@ def totals(world: World, env: int = 0) -> Totals:
     rotation = np.concatenate([state.payload_rotation[env][None], state.drone_rotation[env]])
     rates = np.vstack([state.payload_body_rates[env], state.drone_body_rates[env]])
     inertia = np.vstack([system.payload_inertia, [vehicle.inertia for vehicle in system.vehicles]])
+    # R J ω, own angular momenta in the world frame: of bodies whose principal axes are the axes of their frames.
     spin = np.einsum("bij,bj->bi", rotation, inertia * rates)
     stored = 0.0
     for n in range(world.num_drones):
@@ -53,6 +54,7 @@ def totals(world: World, env: int = 0) -> Totals:
         stretch = np.linalg.norm(np.diff(points, axis=0), axis=1) - p.cable_length[env, n] / links
         # Links of chains resist being pushed together, massless cables do not.
         stretch = stretch if world.nodes is not None else np.maximum(stretch, 0.0)
+        # ½ (n k) s² for each of n links, which in series have the stiffness k of the whole cable.
         stored += 0.5 * links * p.cable_stiffness[env, n] * float((stretch**2).sum())
         if world.nodes is not None:
             mass = np.append(mass, np.full(links - 1, system.cable_mass[n] / (links - 1)))
@@ -94,6 +96,7 @@ def tumbling_team(
     state.drone_body_rates[0] = np.einsum("nji,j->ni", state.drone_rotation[0], turning)
     state.rotor_speed[:] = 0.0
     world.load(np.ones(1, bool))
+    # After `load`, which lets motors run again.
     world.hidden_loads.motors_off[:] = True
     return world
 
@@ -230,6 +233,7 @@ def massless_balance(team: Team, seconds: float) -> tuple[float, float]:
         force = force + mass[:, None] * [0, 0, -GRAVITY]
         span = np.linalg.norm(r[1:] - r[0] - system.anchors @ attitude[0].T, axis=1)
         tied = span > system.cable_length
+        # Any stretched cable holds the payload; a drone is held by its own alone.
         free = np.concatenate([[not tied.any()], ~tied])[:, None]
         gyroscopic = np.cross(w, inertia * w) - world.cables.gyroscopic[0]
         gyroscopic += free * (np.cross(turned, inertia * w) + np.cross(w, inertia * turned))
@@ -249,6 +253,7 @@ def momentum_drift(team: Team, seconds: float) -> np.ndarray:
     def total() -> tuple[np.ndarray, np.ndarray, float]:
         """Return linear and angular momentum about the origin (6,), the centre of mass (3,) and the weight [N]."""
         sums = totals(world)
+        # About the origin it is that about the centre of mass, and c × p (König).
         about = sums.angular + np.cross(sums.center, sums.linear)
         return np.concatenate([sums.linear, about]), sums.center, sums.mass * GRAVITY
 

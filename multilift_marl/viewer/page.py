@@ -83,12 +83,14 @@ class Page:
 
     def draw(self) -> None:
         """Send what has changed to all browsers."""
+        # Under the lock only what reads the simulation; to send takes as long as browsers do.
         with self._session.locked():
             self._stage.update(0)
             if self._follow:
                 self._middle = self._session.vec.world.state.payload_position[0].copy()
             groups = _group(self._stage.scene)
         with self._server.atomic():
+            # Shapes of which there is none any more count, too, or the last ones would stay in the picture.
             for key in self._batches.keys() | groups.keys():
                 if key not in self._batches:
                     kind, mesh, clear = key
@@ -96,6 +98,7 @@ class Page:
                     self._batches[key] = _Batch(self._server, name, self._mesh(kind, mesh), clear)
                 self._batches[key].show(groups.get(key))
             self._world.position = tuple(-self._middle)
+        # The first picture comes before the controls, which are added last.
         if hasattr(self, "controls"):
             text = self._session.status()
             if text != self.controls["status"].content:
@@ -145,6 +148,7 @@ class Page:
             )
             made["push"] = gui.add_button("Push for half a second")
         for name in ("pause", "step", "reset", "next", "push"):
+            # `name=name` keeps each button's own; a name looked up later would be the loop's last for all.
             made[name].on_click(lambda _, name=name: self.press(name))
         for name in ("speed", "policy", "follow"):
             made[name].on_update(lambda _, name=name: self.press(name))
@@ -212,6 +216,7 @@ class _Batch:
             geoms = tuple(np.zeros((0, width), np.float32) for width in (3, 4, 3, 4))
         count = len(geoms[0])
         if self._handle is None or count > self._slots:
+            # A batch keeps its number of geoms: one with twice as many takes its place, so that this is seldom done.
             self._slots = max(self._slots, _SLOTS)
             while self._slots < count:
                 self._slots *= 2
@@ -220,6 +225,7 @@ class _Batch:
                 self._handle.remove()
         spare = self._slots - count  # of no size
         place, turn, size, colour = (np.pad(array, ((0, spare), (0, 0))) for array in geoms)
+        # No turn: a quaternion of zeros is no rotation.
         turn[count:, 0] = 1.0
         colours = np.rint(255 * np.clip(colour[:, :3], 0, 1) ** _GAMMA).astype(np.uint8)
         opacity = colour[:, 3]
@@ -247,6 +253,7 @@ def _group(scene: mujoco.MjvScene) -> dict[tuple[int, int, bool], tuple[np.ndarr
         if kind == _GEOM.mjGEOM_PLANE or geom.rgba[3] == 0.0:
             continue
         clear = bool(geom.rgba[3] < 1.0)
+        # Capsules are shown without their caps. A geom that is no mesh has no number of one, hence -1.
         key = (int(_GEOM.mjGEOM_CYLINDER) if kind == _GEOM.mjGEOM_CAPSULE else kind, -1, clear)
         size = geom.size
         if kind == _GEOM.mjGEOM_MESH:

@@ -118,6 +118,7 @@ class Flight:
             self._run(self._landing, self._take_over(self._landing, self._task.world), "landing")
             world = self._landing.world
         for autopilot in self.team.offboard:
+            # By force: PX4 itself may not have noticed yet that it has landed.
             autopilot.arm(False, force=True)
         self.team.settle(world)  # so that they do, and close their logs
         return result
@@ -129,6 +130,7 @@ class Flight:
         self._say("waiting for the autopilots")
         self.team.prepare(vec.world)
         self._say(f"armed after {self.team.time:.0f} s; take-off")
+        # While they armed, drones may have moved a little: references begin where they are now.
         vec.controller.start(0)
         return observation
 
@@ -157,6 +159,7 @@ class Flight:
 
     def _drawn(self) -> dict[str, np.ndarray]:
         """Return what is hidden in the task, which is the same all along."""
+        # Not the bias: it is one of the numbers observed, and other tasks observe others.
         drawn = self._task.current()[1]["randomization"]
         return {name: array[0] for name, array in drawn.items() if name != "observation_bias"}
 
@@ -170,7 +173,9 @@ class Flight:
 
     def _go(self, world: World, begin: Goal, end: Goal) -> None:
         """Move the formation along a line, at rest at both ends."""
+        # Wrapped to [-π, π): the team turns the shorter way round.
         way, turn = end.slots - begin.slots, np.remainder(end.yaw - begin.yaw + np.pi, 2 * np.pi) - np.pi
+        # As long as the farthest drone takes at SPEED and the turn at 0.5 rad/s, a second at least.
         seconds = max(float(np.linalg.norm(way, axis=1).max()) / SPEED, abs(turn) / 0.5, 1.0)
         ticks = round((seconds + _HOLD) * self.config.sim.control_hz)
         for tick in range(ticks):

@@ -85,6 +85,7 @@ class AutopilotTeam:
         self._sensors: Sensors | None = None
         self._places: deque[tuple[int, np.ndarray]] = deque(maxlen=_PAST)
         self._stack = ExitStack()
+        # Whatever fails in here closes all that was opened before; `pop_all` keeps it open once nothing has failed.
         with ExitStack() as opened:
             opened.callback(self.close)
             for i in range(system.num_drones):
@@ -92,6 +93,7 @@ class AutopilotTeam:
                 self._stack.callback(self.links[i].close)
                 self.offboard.append(OffboardLink(settings.first + i))
                 self._stack.callback(self.offboard[i].close)
+            # Processes after ports: each PX4 connects as soon as it runs.
             if settings.build is not None:
                 own = [{**rig_parameters(system, i), **settings.parameters} for i in range(system.num_drones)]
                 self.autopilots = self._stack.enter_context(
@@ -128,6 +130,7 @@ class AutopilotTeam:
         """
         sensors = self._sensors
         assert sensors is not None
+        # With the time that this tick's sensors are going to be stamped with.
         self._places.append((self._time_us + round(self._dt * 1e6), world.state.drone_position[0].copy()))
         # The first sample is that of `Sensors.reset`.
         if self._ticks:
@@ -143,6 +146,7 @@ class AutopilotTeam:
             for link in self.links:
                 link.receive(self._time_us)
         except FlightError:
+            # An autopilot that has ended is a better reason than the answer that did not come.
             self._check(1.0)
             raise
         for i, link in enumerate(self.links):
@@ -157,6 +161,7 @@ class AutopilotTeam:
             autopilot.poll()
             if self._is_due(HEARTBEAT_RATE):
                 autopilot.heartbeat()
+            # Places are sent in its local frame, of which it has to say first where that begins.
             if np.isfinite(autopilot.origin).all():
                 send(i)
 
@@ -175,10 +180,12 @@ class AutopilotTeam:
 
         steps = world.system.control_interval
         while not all(each.armed and each.mode == OFFBOARD for each in self.offboard):
+            # Set-points go out all the while: PX4 accepts offboard mode only as long as they come.
             self.tick(world, stay)
             world.step(world.thrust, steps)
             if self.time > _SETTLE and self._is_due(HEARTBEAT_RATE):
                 for autopilot in self.offboard:
+                    # First the mode: armed in another one, PX4 would not follow the set-points.
                     if autopilot.mode != OFFBOARD:
                         autopilot.set_mode(OFFBOARD)
                     elif not autopilot.armed:
@@ -202,6 +209,7 @@ class AutopilotTeam:
         thrust = self._feedforward.acceleration(i, velocity, acceleration, cable_force, yaw)
         vectors, north = swap_enu_ned(np.stack([velocity, thrust])), float(swap_yaw(yaw))
         if place:
+            # By way of latitude and longitude: PX4's local frame begins elsewhere, and has a projection of its own.
             local = project_local(self.settings.site.to_geodetic(position), self.offboard[i].origin)
             self.offboard[i].send_position(self._time_us, local, vectors[0], vectors[1], north)
         else:

@@ -32,6 +32,7 @@ from multilift_marl.deploy.ros.reading import Reader
 from multilift_marl.deploy.ros.types import typestore
 from multilift_marl.errors import FlightError
 
+# Without multicast, participants find each other by the ports that belong to indices 0 to 50 of this host.
 _LOOPBACK = """<CycloneDDS><Domain>
 <General><Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General>
@@ -80,6 +81,7 @@ class Node:
             self._participant = DomainParticipant(domain)
             self._arrivals = WaitSet(self._participant)
             self._publishers = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+            # `_changed` has what was not read yet, `_alive` all publishers that there are.
             seen = ViewState.Any | InstanceState.Any | SampleState.NotRead
             self._changed = ReadCondition(self._publishers, seen)
             self._alive = ReadCondition(self._publishers, ViewState.Any | InstanceState.Alive | SampleState.Any)
@@ -131,6 +133,7 @@ class Node:
         if now < self._look_at:
             return
         self._look_at = now + _LOOK
+        # To read marks as read: without anything new since the last time the long list is not gone through.
         if not self._publishers.read(_MOST, self._changed):
             return
         others: dict[str, set[Any]] = {}

@@ -147,6 +147,7 @@ class PolicyNode:
         self._node.check_publishers()
         self._bodies.poll(now)
         self._hear_wishes()
+        # Landing is for good: whatever is heard then, no step is made any more.
         if self.mode != LANDING and self._bodies.are_due() and not self._bodies.missing(now, HOLD_AFTER):
             self._bodies.take_step()
             self._step()
@@ -185,6 +186,7 @@ class PolicyNode:
             if self._plans:
                 continue
             away = float(np.linalg.norm(position - self._bodies.measured["payload_position"]))
+            # In the air the task would fail by such a target, and the team land; before, it is but a reason to wait.
             if self.mode in (FLYING, HOLDING) and away > MAX_DISTANCE:
                 self._refuse_target(away)
             else:
@@ -203,13 +205,17 @@ class PolicyNode:
     def _step(self) -> None:
         """Make a policy step with what is measured, if one can be made."""
         positions, velocities = self._bodies.positions()
+        # By the payload's clock, which is the last: each body may have one of its own.
         stamp = int(self._bodies.stamps[-1])
         if self._before is not None:
+            # A clock that was set back would give a negative time.
             elapsed = max(1e-9 * (stamp - self._before[2]), 0.0)
             off = np.linalg.norm(positions - self._before[0] - elapsed * self._before[1], axis=1).max()
             # Farther than the last velocity and the largest acceleration lead.
             self._leaps = self._leaps + 1 if off > _LEAP + 0.5 * _LEAP_ACCELERATION * elapsed**2 else 0
             self._why = "the team has been put elsewhere" if self._leaps else ""
+            # A few may be wrong measurements, which no step is made of; after more in a row the team really is
+            # elsewhere.
             if 0 < self._leaps < _LEAPS:
                 return
         observation = self._begin() if self._before is None or self._leaps else self._observe()
@@ -229,6 +235,7 @@ class PolicyNode:
         self._why = f"the task has failed where the team is, {self.team.failure}" if self.team.failure else ""
         if not self._wanted and not self._why:
             self._change(READY, "true on /fly lets it fly")
+            # Drones are asked to stay where they are, so that who follows set-points has some before the flight.
             reference = self.team.reference  # which begins where the drones are
             self._publish(reference.position[0], reference.yaw[0])
         if self._why or not self._wanted:
@@ -256,6 +263,7 @@ class PolicyNode:
         except Exception as error:  # a policy of others may fail in any way, and drones are in the air
             self.land(f"the policy has failed ({type(error).__name__}: {error})")
             return False
+        # Receivers of poses smooth them and get the command; PX4 gets our smoothed reference with its derivatives.
         if not self._names.is_report:
             self._publish(reference.command[0], reference.command_yaw[0])
             return True
@@ -268,6 +276,7 @@ class PolicyNode:
         elapsed = now - self._sent
         if elapsed > 0.9 * self.team.task.dt:
             places, yaws = self._setpoints
+            # Bounded, so that a pause of this process does not become one deep step.
             sink(places, self.mode == LANDING, min(elapsed, HOLD_AFTER))
             self._publish(places, yaws)
 
