@@ -159,7 +159,8 @@ def _compare(policy: LearnedPolicy, path: Path) -> float:
             observation = normalizer.shift.numpy() + spread / normalizer.scale.numpy()
             action, *after = session.run(None, {"observation": observation} | memory)
             memory = {"memory": after[0]} if gru else {}
-            worst = max(worst, float(np.abs(action - learned.act(observation)).max()))
+            # Not Python's max, which drops NaN.
+            worst = float(np.maximum(worst, np.abs(action - learned.act(observation)).max()))
     if not worst <= _TOLERANCE:
         raise RuntimeError(
             f"{path} differs from {policy.source} by {worst:.1e} in its actions, more than {_TOLERANCE:.0e}; use other "

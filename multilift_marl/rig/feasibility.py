@@ -148,7 +148,7 @@ def _check_hooks(system: System, ranges: RandomizationConfig) -> None:
     cable_forces = heaviest * system.formation_force + system.hook_force - system.formation_force
     for i, vehicle in enumerate(system.vehicles):
         force = cable_forces[i] + [0, 0, (1 + ranges.vehicle_mass) * vehicle.mass * GRAVITY]
-        cable_force = np.reshape(thrust_frame(tuple(force), 0.0), (3, 3)).T @ cable_forces[i]
+        cable_force = np.reshape(thrust_frame(tuple(force), float(system.heading[i])), (3, 3)).T @ cable_forces[i]
         # The rotors exert hook × P against the moment of the cable, hook × (-P).
         wrench = [np.linalg.norm(force), *np.cross(system.hooks[i], cable_force)]
         rotors = np.linalg.solve(vehicle.allocation, wrench)

@@ -190,7 +190,7 @@ def stiff_cables(fast: bool) -> Result:
             fastest = 0.0
             for _ in range(round(0.3 / timestep)):
                 world.step(thrust)
-                fastest = max(fastest, float(np.abs(world.state.payload_velocity).max()))
+                fastest = float(np.maximum(fastest, np.abs(world.state.payload_velocity).max()))
             name = f"k = 1e6 N/m, {cable}, {ms(timestep)}"
             warnings = int(world.shards[0].batch.warning[:, :, 1].sum()) + int(world.diverged.sum())
             result.check(name, "warnings of MuJoCo in 0.3 s after a push of 0.2 m/s", warnings, 0)

@@ -77,6 +77,16 @@ def test_the_network_acts_as_the_policy_for_any_teams(tmp_path, kind, history, a
     assert ("asinh(20 x" in contract["inside"]["normaliser"]) == bool(asinh)
 
 
+def test_a_network_whose_actions_are_not_numbers_is_not_taken_for_the_policy(tmp_path, monkeypatch):
+    class Broken(onnxruntime.InferenceSession):
+        def run(self, *arguments):
+            return [np.full_like(output, np.nan) for output in super().run(*arguments)]
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Broken)
+    with pytest.raises(RuntimeError, match="differs from the test by nan"):
+        export_policy(policy(), tmp_path)
+
+
 @pytest.mark.slow
 def test_files_say_nothing_of_the_machine_they_were_made_on(tmp_path):
     contract = export_policy(policy(), tmp_path)

@@ -191,3 +191,21 @@ def test_drones_that_face_elsewhere_keep_their_hooks_where_they_were():
 def test_an_impossible_hook_is_refused(overrides, complaint):
     message = refuse_system(4, **overrides)
     assert re.match(complaint, message), message
+
+
+@pytest.mark.parametrize("heading", ["target", "outward"])
+def test_the_rotors_that_hold_a_hook_are_those_of_the_drone_as_it_faces(heading):
+    hook = np.array([0.15, 0.04, 0.0])
+    message = refuse_system(4, **STILL, **{"cable.hook": hook.tolist(), "control.heading": heading})
+    drone = int(re.match(r"drone (\d)", message)[1])
+    low, high = (float(x) for x in re.search(r"need (\S+) to (\S+) N", message).groups())
+    system = make_system(4, **STILL)
+    pull, vehicle = system.formation_force[drone], system.vehicles[drone]
+    force = pull + [0, 0, vehicle.mass * 9.81]
+    yaw = np.arctan2(pull[1], pull[0]) if heading == "outward" else 0.0
+    up = force / np.linalg.norm(force)
+    left = np.cross(up, [np.cos(yaw), np.sin(yaw), 0])
+    left /= np.linalg.norm(left)
+    moment = np.cross(hook, np.stack([np.cross(left, up), left, up]) @ pull)
+    rotors = np.linalg.solve(vehicle.allocation, [np.linalg.norm(force), *moment])
+    assert (rotors.min(), rotors.max()) == pytest.approx((low, high), abs=0.006)
