@@ -10,6 +10,7 @@ import numpy as np
 from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.mdp.failures import TOUCH
 from multilift_marl.physical import GRAVITY
+from multilift_marl.planning.feasibility import find_violation
 from multilift_marl.planning.path_table import COLUMNS, KEY, SAMPLING, read_table
 from multilift_marl.planning.spline import fit_spline, sample_spline
 from multilift_marl.rig.system import System
@@ -63,12 +64,24 @@ def load_path(
     table = fit_spline(thin)
     _check_height(name, table, system)
     _check_thrust(name, table, system, ranges, "" if ramp else ", or give it task_options.file_ramp=2 to do so")
+    _warn_of_limits(name, table, system, ranges)
+    warn_of_length(f"{KEY}={name}", table, seconds)
+    return table
+
+
+def warn_of_length(source: str, table: np.ndarray, seconds: float) -> None:
+    """Warn of a path that takes longer than an episode of `seconds`; `source` is its key, and a file's path."""
     if (lasts := table[-1, 0]) > seconds:
         warn_once(
-            "tasks", f"{KEY}={name} takes {lasts:.4g} s, but an episode ends after {seconds:g} s; set "
+            "tasks", f"{source} takes {lasts:.4g} s, but an episode ends after {seconds:g} s; set "
             f"env.episode_seconds={ceil(lasts)} to fly all of it",
         )  # fmt: skip
-    return table
+
+
+def _warn_of_limits(name: str, table: np.ndarray, system: System, ranges: RandomizationConfig) -> None:
+    """Warn of a path on which a team that followed it without error would exceed its limits."""
+    if violation := find_violation(table, system, ranges):
+        warn_once("tasks", f"{KEY}={name} leads the team beyond its limits: {violation}; make it slower or smoother")
 
 
 def read_rows(reference: str) -> np.ndarray:
@@ -78,7 +91,7 @@ def read_rows(reference: str) -> np.ndarray:
         ConfigError: no such file, or not the table that is expected.
     """
     path, content = read_pinned(KEY, reference)
-    rows = read_table(path, content)
+    rows = read_table(f"{KEY}={path}", content)
     if rows.ndim != 2 or rows.shape[1] not in (4, 5):
         shape = f"{rows.shape[1]} columns" if rows.ndim == 2 else f"an array of shape {rows.shape}"
         raise ConfigError(f"{KEY}={path} holds {shape}; give 4 columns t, x, y, z or 5 with yaw")

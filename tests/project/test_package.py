@@ -18,6 +18,7 @@ import multilift_marl as ml
 from multilift_marl.cli.benchmark import main as benchmark
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.cli.export import main as export
+from multilift_marl.cli.plan import main as plan
 from multilift_marl.cli.train import main as train
 from multilift_marl.errors import pip_install
 from multilift_marl.evaluation import plots
@@ -215,6 +216,7 @@ MAINS = {
     "evaluate.py": evaluate,
     "multilift_marl.export": export,
     "multilift_marl.benchmark": benchmark,
+    "multilift_marl.plan": plan,
 }
 
 
