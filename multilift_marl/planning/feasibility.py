@@ -27,7 +27,7 @@ from multilift_marl.rig.system import System
 from multilift_marl.schema.sections import RandomizationConfig
 
 MAX_CABLE_ANGLE = 90.0  # [deg] from a drone's thrust: beyond it the failure is `failures.CABLE`
-LARGEST = ("thrust", "tilt", "cable angle")  # quantities that have largest values; the others have least ones
+LARGEST = ("thrust", "tilt", "turning", "cable angle")  # of the other quantities the least values are limited
 SPACING = 0.02  # [s] between the times that are looked at, of paths up to ...
 MAX_TIMES = 50_000
 
@@ -36,7 +36,7 @@ class Quantity(NamedTuple):
     """What is limited: a column for each drone, of `height` one for the payload before them."""
 
     name: str
-    """thrust, tilt, cable angle, cable lift, distance or height."""
+    """thrust, tilt, turning (angular acceleration of the thrust), cable angle, cable lift, distance or height."""
     unit: str
     values: np.ndarray
     """(T, N), (T, 1 + N)."""
@@ -130,7 +130,10 @@ def assess_motion(
     write_motion(positions, rotations, np.zeros(7), team, FlatWork.of(n), np.zeros(state_size(n)), motion)
     middle = SAMPLES // 2
     payload = positions[:, middle], rotations[:, middle]
-    quantities = _measure(motion, payload, team, system, 1 - ranges.vehicle_thrust_coefficient)
+    quantities = (
+        *_measure_drones(motion, times, system, 1 - ranges.vehicle_thrust_coefficient),
+        *_measure_places(motion, payload, team, system),
+    )
     margins, violations = [], []
     for quantity in quantities:
         spare = quantity.spare()
@@ -180,43 +183,55 @@ def _heaviest_team(system: System, ranges: RandomizationConfig) -> FlatTeam:
     return team._replace(force=load * team.force)
 
 
-def _measure(
-    motion: TeamMotion, payload: tuple[np.ndarray, np.ndarray], team: FlatTeam, system: System, strength: float
-) -> tuple[Quantity, ...]:
-    """Return the quantities of a motion; `payload` are its places (T, 3) and attitudes, `strength` that of rotors."""
+def _measure_drones(motion: TeamMotion, times: np.ndarray, system: System, strength: float) -> tuple[Quantity, ...]:
+    """Return the quantities of each drone alone; `strength` is that of its rotors over the nominal one [-]."""
     count, n = motion.place.shape[:2]
     # drag of the drones, its two lateral coefficients taken as equal
-    drag = np.array([vehicle.drag for vehicle in system.vehicles])
+    vehicles = system.vehicles
+    drag = np.array([vehicle.drag for vehicle in vehicles])
     up = motion.thrust / np.linalg.norm(motion.thrust, axis=-1, keepdims=True)
     climb = (up * motion.velocity).sum(axis=-1, keepdims=True) * up
     across = drag[:, :2].mean(axis=1, keepdims=True)
     thrust = motion.thrust + drag[:, 2:] * climb + across * (motion.velocity - climb)
     size = np.linalg.norm(thrust, axis=-1)
-    largest = strength * np.array([4 * vehicle.rotor_thrust_max for vehicle in system.vehicles])
-    quantities = [
-        Quantity("thrust", "N", size, np.tile(largest, (count, 1))),
-        Quantity("tilt", "deg", np.degrees(np.arccos(thrust[..., 2] / size)), np.full((count, n), MAX_TILT)),
-    ]
+    axis = thrust / size[..., None]
+
+    # angular acceleration of that axis, which takes rotors away from their mean thrust, each no farther than its limits
+    turning = np.gradient(np.cross(axis, np.gradient(axis, times, axis=0)), times, axis=0)
+    rotors = strength * np.array([[v.thrust_coefficient * v.rotor_speed_min**2, v.rotor_thrust_max] for v in vehicles])
+    levers = [np.abs(v.allocation[1:3]).sum(axis=1) / np.array(v.inertia)[:2] for v in vehicles]
+    room = np.minimum(size / 4 - rotors[:, 0], rotors[:, 1] - size / 4)
 
     # of each cable from its drone's thrust, at which its failure is
     pull = motion.force / np.linalg.norm(motion.force, axis=-1, keepdims=True)
-    angle = np.degrees(np.arccos(np.clip((pull * thrust).sum(axis=-1) / size, -1, 1)))
-    quantities.append(Quantity("cable angle", "deg", angle, np.full((count, n), MAX_CABLE_ANGLE)))
+    angle = np.degrees(np.arccos(np.clip((pull * axis).sum(axis=-1), -1, 1)))
+    return (
+        Quantity("thrust", "N", size, np.tile(4 * rotors[:, 1], (count, 1))),
+        Quantity("tilt", "deg", np.degrees(np.arccos(axis[..., 2])), np.full((count, n), MAX_TILT)),
+        Quantity("turning", "rad/s²", np.linalg.norm(turning, axis=-1), room * np.min(levers, axis=1)),
+        Quantity("cable angle", "deg", angle, np.full((count, n), MAX_CABLE_ANGLE)),
+    )
 
+
+def _measure_places(
+    motion: TeamMotion, payload: tuple[np.ndarray, np.ndarray], team: FlatTeam, system: System
+) -> tuple[Quantity, ...]:
+    """Return the quantities of the team; `payload` are its places (T, 3) and attitudes (T, 3, 3)."""
+    count, n = motion.place.shape[:2]
     # `set_flat_state` keeps cable forces that would push at their least, and then lacks the rest of the wrench
     least = MIN_LIFT * (1 + 1e-9) * team.force[:, 2]
-    quantities.append(Quantity("cable lift", "N", motion.force[..., 2], np.tile(least, (count, 1))))
+    lift = Quantity("cable lift", "N", motion.force[..., 2], np.tile(least, (count, 1)))
 
     limits = make_limits(system)
-    apart = np.linalg.norm(motion.place[:, :, None] - motion.place[:, None], axis=-1)
-    nearest = (apart - limits.separation + np.where(np.eye(n), np.inf, 0.0)).argmin(axis=-1)
-    distance = np.take_along_axis(apart, nearest[..., None], axis=-1)[..., 0]
-    quantities.append(Quantity("distance", "m", distance, limits.separation[np.arange(n), nearest]))
+    gaps = np.linalg.norm(motion.place[:, :, None] - motion.place[:, None], axis=-1)
+    nearest = (gaps - limits.separation + np.where(np.eye(n), np.inf, 0.0)).argmin(axis=-1)
+    distance = np.take_along_axis(gaps, nearest[..., None], axis=-1)[..., 0]
+    apart = Quantity("distance", "m", distance, limits.separation[np.arange(n), nearest])
 
     place, attitude = payload
     down = attitude[:, 2] @ np.array(limits.payload_center) - np.abs(attitude[:, 2]) @ limits.payload_half  # of a box
     height = np.column_stack([place[:, 2] + down, motion.place[..., 2] - limits.drone_half[:, 2]])
-    return *quantities, Quantity("height", "m", height, np.full((count, 1 + n), TOUCH))
+    return lift, apart, Quantity("height", "m", height, np.full((count, 1 + n), TOUCH))
 
 
 def _margin(quantity: Quantity, times: np.ndarray, spare: np.ndarray, i: int, k: int) -> Margin:

@@ -17,6 +17,7 @@ from multilift_marl.planning.approach import Approach, begin_approaches, write_a
 from multilift_marl.planning.load_estimator import LoadEstimator
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
+from multilift_marl.policies.full_state_command import FullStateCommand
 from multilift_marl.sensing.load_sensing import CAMERA_DELAY
 
 if TYPE_CHECKING:
@@ -24,17 +25,23 @@ if TYPE_CHECKING:
 
 
 SHARE = 0.4  # of what sensors say beside the prediction, by which states are corrected
-ENOUGH = 10.0, 8.0  # [m/s²], [rad/s] full scales of actions that limit no usual flight
+ENOUGH = {  # full scales of actions that limit no usual flight, and those to set
+    "acc_rates": {"max_acceleration": (10.0, 25.0), "max_tilt_rate": (8.0, 15.0)},
+    "full_state": {
+        "max_offset": (1.0, 2.0), "max_velocity": (3.0, 5.0), "max_acceleration": (10.0, 25.0),
+        "max_jerk": (100.0, 300.0), "max_cable_force": (1.5, 5.0),
+    },
+}  # fmt: skip
 
 
 class TeamMpc:
     """Central: it reads of `vec` what the drones know of themselves and of the payload, and where the target will be.
 
     Args:
-        vec: environments with the interface `acc_rates`; read at every `act`.
+        vec: environments with one of the interfaces; read at every `act`.
 
     Class attributes:
-        INTERFACE: by which it acts.
+        INTERFACE, INTERFACES: by which it acts, and those by which it can.
 
     Attributes:
         planner: TeamPlanner.
@@ -45,6 +52,7 @@ class TeamMpc:
     """
 
     INTERFACE: ClassVar[str] = "acc_rates"
+    INTERFACES: ClassVar[tuple[str, ...]] = ("acc_rates", "full_state")
 
     def __init__(self, vec: MultiliftVec):
         system, config, n = vec.world.system, vec.config, vec.num_drones
@@ -67,20 +75,22 @@ class TeamMpc:
             late = CAMERA_DELAY if config.env.sensing == "mocap" else 0.0
             self._observer = TeamObserver(self.planner.model, vec.num_envs, SHARE, late)
         lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)
+        self._full_state = None
+        if config.control.action == "full_state":
+            self._full_state = FullStateCommand(vec, self.planner.model, settings.delay)
         self._lead = lag + 0.5 * self._dt if settings.lead is None else settings.lead
         self._drag = np.array([vehicle.drag for vehicle in system.vehicles], float)
         self._lift = np.array([vehicle.thrust_coefficient for vehicle in system.vehicles], float)
         under_way = round(settings.delay / self._dt)
         self._sent = np.zeros((under_way + 1, vec.num_envs, 3 * n))
         self._fresh = np.ones(vec.num_envs, bool)
+        self._unloaded = np.zeros((vec.num_envs, 7))
         self._approach = Approach.zeros(vec.num_envs)
         self._offsets = np.zeros((vec.num_envs, settings.steps + 1, 12))
-        if config.acting.max_acceleration < ENOUGH[0] or config.acting.max_tilt_rate < ENOUGH[1]:
-            warn_once(
-                "mpc",
-                "actions of these full scales limit what policy=mpc can command; set control.max_acceleration=25 and "
-                "control.max_tilt_rate=15",
-            )
+        enough = ENOUGH[config.control.action]
+        if any(getattr(config.acting, key) < least for key, (least, _) in enough.items()):
+            cure = " ".join(f"control.{key}={wide:g}" for key, (_, wide) in enough.items())
+            warn_once("mpc", f"actions of these full scales limit what policy=mpc can command; set {cure}")
         self._limits = config.acting.max_acceleration, config.acting.max_tilt_rate
 
     def reset(self, mask: np.ndarray | None = None) -> None:
@@ -88,7 +98,7 @@ class TeamMpc:
         self._fresh[... if mask is None else mask] = True
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (E, N, 5) in [-1, 1] for the present state of the environments, whose observations these are.
+        """Return actions (E, N, A) in [-1, 1] for the present state of the environments, whose observations these are.
 
         Raises:
             ValueError: observations of another number of environments.
@@ -130,6 +140,8 @@ class TeamMpc:
         thrust = plans.states[:, 0, -3 * shape[1] :].reshape(*shape, 3) + self._lead * rate
         self._sent[:-1] = self._sent[1:]
         self._sent[-1] = thrust.reshape(shape[0], -1)
+        if self._full_state is not None:
+            return self._full_state.act(states, self._unloaded if loads is None else loads, thrust, rate, drag)
         return self._command(thrust, rate, drag)
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,19 +7,22 @@ import pytest
 from conftest import GRAVITY, make, make_system
 
 from multilift_marl.config.load import load_config
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.planning import waypoints
 from multilift_marl.planning.feasibility import Margin, assess_path, find_violation
 from multilift_marl.planning.minimum_snap import fit_minimum_snap
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.schema.sections import RandomizationConfig
 
 NOTHING = RandomizationConfig()
+RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
 
 
 def table_of(rows) -> np.ndarray:
     """Return a minimum-snap path through rows t, x, y, z, yaw as a spline."""
     rows = np.array(rows, float)
     spline = fit_minimum_snap(rows[:, 0], rows[:, 1:])
-    t = np.linspace(0, rows[-1, 0], 20 * round(rows[-1, 0]) + 1)
+    t = np.linspace(0, rows[-1, 0], int(20 * rows[-1, 0]) + 1)
     return np.hstack([t[:, None], spline(t), spline(t, 1), spline(t, 2)])
 
 
@@ -40,7 +43,7 @@ def test_at_rest_it_is_the_resting_team():
     low = 2 - system.payload_size[2] / 2 + system.payload_center[2]
     assert of(found, "height").values[0, 0] == pytest.approx(low)
     assert found.violation is None and [margin.quantity for margin in found.margins] == [
-        "thrust", "tilt", "cable angle", "cable lift", "distance", "height"
+        "thrust", "tilt", "turning", "cable angle", "cable lift", "distance", "height"
     ]  # fmt: skip
 
 
@@ -79,7 +82,7 @@ def test_what_episodes_draw_counts():
     ("rows", "quantity", "drone"),
     [
         ([[0, 0, 0, 2, 0], [1, 3, 0, 2, 0]], "thrust", None),
-        ([[0, 0, 0, 5, 0], [1.7, 0, 0, 2, 0]], "tilt", None),
+        ([[0, 0, 0, 5, 0], [1.7, 0, 0, 2, 0]], "turning", None),
         ([[0, 0, 0, 1, 0], [2, 0, 0, -0.2, 0], [4, 0, 0, 1, 0]], "height", -1),
     ],
 )
@@ -104,13 +107,27 @@ def test_payloads_without_an_attitude_are_not_assessed():
     assert find_violation(fast, make_system(3, **{"payload.shape": "point"}), NOTHING) is None
 
 
+@pytest.mark.parametrize(("seconds", "flies"), [(1.6, False), (1.8, True)])
+def test_the_limits_are_where_flights_begin_to_fail(seconds, flies, monkeypatch):
+    """Down by 2.5 m: what is refused policy=mpc cannot fly, and what is not it flies within a centimetre."""
+    monkeypatch.setattr(waypoints, "find_violation", lambda *team: None)
+    places, times = [[0, 0, 4], [0, 0, 1.5]], [0.0, seconds]
+    options = {"path": "waypoints", "waypoints": places, "waypoint_times": times, "start_radius": 0.0, "rmse_from": 0.0}
+    overrides = RATES | {f"task_options.{key}": value for key, value in options.items()}
+    config = load_config("track", overrides | {"env.episode_seconds": 3.0, "env.num_threads": 1})
+    flown = run_episodes(config, lambda vec: make_scripted("mpc", vec), 1, 77)
+    assert (
+        find_violation(table_of([[0, 0, 0, 4, 0], [seconds, 0, 0, 1.5, 0]]), config.system, NOTHING) is None
+    ) == flies
+    assert bool(flown["success_rate"][0] and flown["payload_rmse_m"][0] < 0.01) == flies
+
+
 @pytest.mark.parametrize("num_drones", [pytest.param(3, marks=pytest.mark.slow), 4])
 def test_a_flight_needs_what_was_planned(num_drones):
     """Tensions and rotor thrusts of a team under policy=mpc, which keeps to the path within millimetres."""
-    rates = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
     places = [[0, 0, 1.5], [3, 1, 2, 0.5], [4, -2, 1.2, 1.0], [0, 0, 1.5]]
     options = {"path": "waypoints", "waypoints": places, "speed": 3.0, "acceleration": 4.0, "start_radius": 0.0}
-    overrides = rates | {f"task_options.{key}": value for key, value in options.items()}
+    overrides = RATES | {f"task_options.{key}": value for key, value in options.items()}
     vec = make("track", num_envs=1, num_drones=num_drones, **overrides)
     observation, _ = vec.reset(seed=0)
     policy = make_scripted("mpc", vec)

@@ -186,7 +186,7 @@ def test_the_command_writes_what_is_flown_and_says_what_is_left(tmp_path, capsys
     assert plan([*arguments, "plot=path.png"]) == 0
     said = capsys.readouterr().out
     assert "way-points at 0.00, " in said and "4 drones" in said
-    assert all(name in said for name in ("thrust", "tilt", "cable lift", "distance", "height"))
+    assert all(name in said for name in ("thrust", "tilt", "turning", "cable lift", "distance", "height"))
     assert Path("path.png").read_bytes().startswith(b"\x89PNG")
     rows = np.loadtxt("to/path.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(rows[[0, -1], 1:], [[0, 0, 1.5, 0], [3, 1, 2, 0.5]], atol=1e-8)
