@@ -177,7 +177,7 @@ class TeamMpc:
 
     def _command(self, thrust: np.ndarray, rate: np.ndarray, drag: np.ndarray) -> np.ndarray:
         """Return the actions that ask for thrust vectors (E, N, 3) [N] which change at a rate [N/s]."""
-        vec, goal, gains = self._vec, self._vec.task.goal, self._vec.controller.gains
+        vec, goal, gains = self._vec, self._vec.task.planned, self._vec.controller.gains
         mass, load = gains.mass[:, None], gains.load_share[:, None]
         # the controller feeds the cable's force, weight and its share of the load forward, and drag where it is told to
         rotors = thrust + drag
