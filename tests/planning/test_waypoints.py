@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from conftest import make, refusal, zeros
 import multilift_marl as ml
 from multilift_marl.cli.plan import main as plan
 from multilift_marl.config.load import build_config
+from multilift_marl.errors import warn_once
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.planning.minimum_snap import fit_minimum_snap
 from multilift_marl.planning.path_file import load_path
@@ -137,6 +139,12 @@ def test_the_file_is_pinned(tmp_path):
     assert "has changed" in refusal(ml.make_vec, config, num_envs=1)
 
 
+def test_a_file_beside_a_yaml_file_is_found(tmp_path):
+    save(tmp_path, "x,y,z\n0,0,1.5\n3,1,2\n")
+    own = save(tmp_path, "base: track\ntask_options: {path: waypoints, waypoints: gates.csv}\n", "mine.yaml")
+    assert ml.load_config(own).task_options["waypoints"].startswith(f"{tmp_path / 'gates.csv'}#sha256=")
+
+
 def test_without_scipy_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.interpolate", None)
     assert '".[plan]"' in refusal(plan_waypoints, PLACES, (0, 2, 4, 6), *FAST, system())
@@ -169,6 +177,20 @@ def test_a_path_written_to_a_file_is_flown_as_it_was_planned(tmp_path, limits):
     read, planned = sample_spline(table, t), sample_spline(path.table, t)
     for derivative, tolerance in enumerate((1e-4, 1e-2, 0.2)):
         np.testing.assert_allclose(read[derivative], planned[derivative], atol=tolerance)
+
+
+def test_a_file_that_leads_the_team_beyond_its_limits_is_warned_of(tmp_path, caplog):
+    """Down by 2.5 m: in 1.6 s drones would have to turn faster than their rotors can, in 1.8 s they need not."""
+    config = ml.load_config("track")
+    for seconds, limit in ((1.8, False), (1.6, True)):
+        rows = sample_rows(plan_waypoints([[0, 0, 4], [0, 0, 1.5]], (0.0, seconds), *FAST, config.system).table)
+        file = tmp_path / f"{seconds}.csv"
+        np.savetxt(file, rows, delimiter=",", header="t,x,y,z,yaw", comments="")
+        warn_once.cache_clear()
+        with caplog.at_level(logging.WARNING):
+            load_path(pin_file(str(file)), 0.1, 0.0, (0, 0, 0), 60.0, config.system, config.randomization)
+        said = "leads the team beyond its limits: at " in caplog.text and "the turning of drone" in caplog.text
+        assert said == limit
 
 
 @pytest.mark.parametrize(("policy", "most"), [("formation_lead", 0.15), ("mpc", 0.003)])
