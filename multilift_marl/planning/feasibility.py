@@ -65,8 +65,10 @@ class Margin(NamedTuple):
     def __str__(self) -> str:
         """Say whose it is, when, and what the limit is."""
         who = "the payload" if self.drone < 0 else f"drone {self.drone}"
-        bound = "most" if self.quantity in LARGEST else "least"
-        amount = f"{self.value:.3g} {self.unit}, at {bound} {self.limit:.3g} {self.unit}"
+        bound = "at most" if self.quantity in LARGEST else "at least"
+        if self.quantity == "cable lift":  # a value at its limit stands for any below
+            bound = "which must be more than"
+        amount = f"{self.value:.3g} {self.unit}, {bound} {self.limit:.3g} {self.unit}"
         return f"at {self.time:.2f} s the {self.quantity} of {who} is {amount}"
 
 

@@ -6,7 +6,8 @@ the least J = ∫ |snap|² (Mellinger and Kumar, ICRA 2011): a quadrotor's momen
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,12 +26,8 @@ def fit_minimum_snap(times: np.ndarray, values: np.ndarray) -> BSpline:
     Raises:
         ConfigError: scipy is not installed.
     """
-    try:
-        from scipy.interpolate import make_interp_spline
-    except ModuleNotFoundError:
-        raise ConfigError(f"minimum-snap polynomials need scipy; {pip_install('plan')}") from None
     rest = [(derivative, np.zeros(values.shape[1])) for derivative in (1, 2, 3)]
-    return make_interp_spline(times, values, _DEGREE, bc_type=(rest, rest))
+    return _scipy("interpolate").make_interp_spline(times, values, _DEGREE, bc_type=(rest, rest))
 
 
 def allocate_times(values: np.ndarray, speed: float, acceleration: float) -> np.ndarray:
@@ -46,14 +43,21 @@ def allocate_times(values: np.ndarray, speed: float, acceleration: float) -> np.
     gaps = np.diff(values, axis=0)
     shares = np.linalg.norm(gaps, axis=1) ** 0.5
     if len(shares) > 1:
-        from scipy.optimize import minimize
-
-        shares = np.exp(minimize(_relative_cost, np.log(shares), (values,), "L-BFGS-B", jac=True).x)
+        found = _scipy("optimize").minimize(_relative_cost, np.log(shares), (values,), "L-BFGS-B", jac=True)
+        shares = np.exp(found.x)
     times = np.append(0.0, np.cumsum(shares)) / shares.sum()
     spline = fit_minimum_snap(times, values)
     t = np.unique(times[:-1, None] + np.diff(times)[:, None] * np.linspace(0, 1, _SAMPLES + 1))
     fastest, hardest = (_largest(spline(t, derivative)) for derivative in (1, 2))
     return times * max(fastest / speed, np.sqrt(hardest / acceleration))
+
+
+def _scipy(module: str) -> Any:
+    """Return a module of scipy, which is imported here alone."""
+    try:
+        return import_module(f"scipy.{module}")
+    except ModuleNotFoundError:
+        raise ConfigError(f"minimum-snap polynomials need scipy; {pip_install('plan')}") from None
 
 
 def _relative_cost(logs: np.ndarray, values: np.ndarray) -> tuple[float, np.ndarray]:

@@ -22,7 +22,6 @@ MAX_WAYPOINTS = 1000
 _STEP = 0.05  # [s] between the rows of a table, quintics between which are the polynomials to well below 1 µm
 _EXACT = 1e-6  # [m], [rad] by which way-points may be missed: round-off where times differ by orders of magnitude
 
-
 Waypoints = str | tuple[tuple[float, ...], ...]
 Range = tuple[float, float]
 

@@ -320,9 +320,9 @@ class Track(Task):
         """Refuse files and way-points that the path does not fly, and a path without them, by a ConfigError."""
         option = self.options
         forms = ",".join(option.path)
-        for form, value in (("file", option.file), ("waypoints", option.waypoints)):
+        for form, value, kind in (("file", option.file, "path"), ("waypoints", option.waypoints, "list or CSV file")):
             if form in option.path and not value:
-                raise ConfigError(f"task_options.path={form} needs task_options.{form}; set task_options.{form}=<path>")
+                raise ConfigError(f"task_options.path={form} needs one; set task_options.{form}=<{kind}>")
             if value and form not in option.path:
                 raise ConfigError(
                     f"task_options.{form} is given, but task_options.path={forms} does not fly it; set "

@@ -107,7 +107,7 @@ def test_a_file_of_columns_is_the_same_as_a_list(tmp_path):
             {"waypoint_times": [0, 0.01, 100, 100.01, 400]},
             "round-off",
         ),
-        (None, {}, "task_options.path=waypoints needs task_options.waypoints"),
+        (None, {}, "path=waypoints needs one; set task_options.waypoints=<list or CSV file>"),
         (PLACES, {"path": "circle"}, "task_options.path=circle does not fly it"),
         (PLACES, {"path": ["file", "waypoints"], "file": "a.csv"}, "has a file and way-points"),
         (None, {"path": "circle", "waypoint_times": [1, 2]}, "task_options.waypoint_times means nothing"),
@@ -146,8 +146,10 @@ def test_a_file_beside_a_yaml_file_is_found(tmp_path):
 
 
 def test_without_scipy_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "scipy.interpolate", None)
+    for module in ("scipy.interpolate", "scipy.optimize"):
+        monkeypatch.setitem(sys.modules, module, None)
     assert '".[plan]"' in refusal(plan_waypoints, PLACES, (0, 2, 4, 6), *FAST, system())
+    assert '".[plan]"' in refusal(plan_waypoints, PLACES, None, *FAST, system())
 
 
 def test_the_target_moves_through_them():
