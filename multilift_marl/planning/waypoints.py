@@ -10,7 +10,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.mdp.failures import TOUCH
 from multilift_marl.planning.feasibility import Margin, find_violation
 from multilift_marl.planning.minimum_snap import allocate_times, fit_minimum_snap
-from multilift_marl.planning.path_file import MAX_ROWS, warn_of_length
+from multilift_marl.planning.path_file import MAX_ROWS, check_height, check_thrust, warn_of_length
 from multilift_marl.planning.path_table import SAMPLING, read_columns
 from multilift_marl.planning.spline import sample_spline
 from multilift_marl.rig.system import System
@@ -54,6 +54,8 @@ def load_waypoints(
     path = plan_waypoints(waypoints, times, speed, acceleration, system)
     if violation := find_violation(path.table, system, ranges):
         raise ConfigError(describe_violation(path, violation))
+    check_height(path.name, path.table, system)  # of teams that are not assessed, too
+    check_thrust(path.name, path.table, system, ranges)
     warn_of_length(path.name, path.table, seconds)
     return path.table
 

@@ -117,6 +117,15 @@ def test_what_cannot_be_is_refused_in_a_sentence(places, more, said):
     assert said in refusal(make, "track", num_envs=1, **options(places, **more))
 
 
+@pytest.mark.parametrize("rig", [{"num_drones": 1}, {"payload.shape": "point"}])
+def test_teams_that_are_not_assessed_are_refused_what_is_too_fast_or_low(rig):
+    fast = options([[0, 0, 2], [3, 0, 2]], waypoint_times=[0, 0.8])
+    assert "task_options.waypoints is too fast: at " in refusal(make, "track", num_envs=1, **fast, **rig)
+    low = options([[0, 0, 1], [2, 0, 0.1], [3, 0, 0.1], [4, 0, 1]])  # between the second and the third
+    assert "the payload would touch the ground" in refusal(make, "track", num_envs=1, **low, **rig)
+    make("track", num_envs=1, **options(speed=2.0, acceleration=2.0), **rig).reset(seed=0)
+
+
 def test_damaged_files_are_refused(tmp_path):
     def complaint(text, name="gates.csv"):
         return refusal(make, "track", num_envs=1, **options(save(tmp_path, text, name)))
