@@ -35,36 +35,39 @@ class FullStateCommand:
         self._scales = np.array([getattr(vec.config.acting, number.limit) for number in scales])
 
     def act(
-        self, states: np.ndarray, loads: np.ndarray, thrust: np.ndarray, rate: np.ndarray, drag: np.ndarray
-    ) -> np.ndarray:
+        self, present: np.ndarray, states: np.ndarray, loads: np.ndarray, thrust: np.ndarray, rate: np.ndarray,
+        drag: np.ndarray,
+    ) -> np.ndarray:  # fmt: skip
         """Return actions (E, N, 16) in [-1, 1].
 
         Args:
+            present: (E, 12 + 7 N) the states when the environments were observed.
             states: (E, 12 + 7 N) where plans begin.
             loads: (E, 7) on the payload, see `team_model.accelerations`.
             thrust, rate: (E, N, 3) to be exerted beside the drag [N], and how it changes [N/s].
             drag: (E, N, 3) of the drones [N].
         """
         vec, goal, gains = self._vec, self._vec.task.planned, self._vec.controller.gains
+        own = vec.task.view.estimated
         position, velocity, acceleration = self._drone_motion(states, loads)
+        # Set-points are for what drones know of themselves, which states that fit the whole team may not agree with.
+        was, moved, _ = self._drone_motion(present, loads)
+        position, velocity = position + own.drone_position - was, velocity + own.drone_velocity - moved
         total = (gains.mass + gains.load_share)[:, None]
         rotors = thrust if vec.config.control.drag_feedforward else thrust + drag
         force = rotors - total * acceleration - gains.mass[:, None] * [0.0, 0.0, GRAVITY]
 
         # the slots when actions are applied
         t = self._ahead
-        moved, fast, hard = (
-            (of[:, None] + own) for of, own in (
-                (goal.velocity, goal.slot_velocity), (goal.acceleration, goal.slot_acceleration),
-                (goal.jerk, goal.slot_jerk),
-            )
-        )  # fmt: skip
-        slot = goal.slots + t * moved + t**2 / 2 * fast + t**3 / 6 * hard
+        speed = goal.velocity[:, None] + goal.slot_velocity
+        change = goal.acceleration[:, None] + goal.slot_acceleration
+        jerk = goal.jerk[:, None] + goal.slot_jerk
+        slot = goal.slots + t * speed + t**2 / 2 * change + t**3 / 6 * jerk
         beside = [
             position - slot,
-            velocity - moved - t * fast - t**2 / 2 * hard,
-            acceleration - fast - t * hard,
-            rate / total - hard,
+            velocity - speed - t * change - t**2 / 2 * jerk,
+            acceleration - change - t * jerk,
+            rate / total - jerk,
             (force - goal.cable_force) / np.linalg.norm(goal.cable_force, axis=-1, keepdims=True),
         ]
         c, s = goal.slot_frame[..., 0], goal.slot_frame[..., 1]

@@ -134,6 +134,7 @@ class TeamMpc:
         if self._estimator is not None:
             self._estimator.estimate.fresh[planner.plans.fresh] = True
             loads = self._estimator.update(states, self._dt)
+        present = states.copy()
         planner.predict(states, self._sent, self._dt, loads)
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
         rate = plans.inputs[:, 0].reshape(*shape, 3)
@@ -141,7 +142,7 @@ class TeamMpc:
         self._sent[:-1] = self._sent[1:]
         self._sent[-1] = thrust.reshape(shape[0], -1)
         if self._full_state is not None:
-            return self._full_state.act(states, self._unloaded if loads is None else loads, thrust, rate, drag)
+            return self._full_state.act(present, states, self._unloaded if loads is None else loads, thrust, rate, drag)
         return self._command(thrust, rate, drag)
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

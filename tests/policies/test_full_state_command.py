@@ -58,7 +58,7 @@ def test_the_controller_exerts_the_planned_thrust(feedforward):
     vec, policy, states, _ = flying(**{"control.drag_feedforward": feedforward})
     rng, command, goal, gains = np.random.default_rng(0), policy._full_state, vec.task.goal, vec.controller.gains
     thrust, rate, drag = states[:, -12:].reshape(2, 4, 3), rng.normal(size=(2, 4, 3)), 0.1 * rng.normal(size=(2, 4, 3))
-    action = command.act(states, np.zeros((2, 7)), thrust, rate, drag) * command._scales
+    action = command.act(states, states, np.zeros((2, 7)), thrust, rate, drag) * command._scales
     c, s = goal.slot_frame[..., 0], goal.slot_frame[..., 1]
     zero, one = np.zeros_like(c), np.ones_like(c)
     turn = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(2, 4, 3, 3)
@@ -70,6 +70,18 @@ def test_the_controller_exerts_the_planned_thrust(feedforward):
     exerted = total * acceleration + cable + gains.mass[:, None] * [0, 0, GRAVITY]
     np.testing.assert_allclose(exerted, thrust if feedforward else thrust + drag, atol=1e-9)
     np.testing.assert_allclose(total * (jerk + goal.jerk[:, None]), rate, atol=1e-9)
+
+
+def test_set_points_are_for_what_the_drones_know_of_themselves():
+    """Hooks off the centres, and states of the team that are 3 cm off: positions are the drones' own."""
+    vec, policy, states, _ = flying(20, **{"cable.hook": [0.02, 0.0, -0.03]})
+    command, goal, t = policy._full_state, vec.task.goal, vec.task.control_dt
+    states[:, :3] += 0.03
+    thrust = states[:, -12:].reshape(2, 4, 3)
+    action = command.act(states, states, np.zeros((2, 7)), thrust, 0 * thrust, 0 * thrust) * command._scales
+    moved = goal.velocity[:, None] + t / 2 * goal.acceleration[:, None]
+    height = goal.slots[..., 2] + t * moved[..., 2] + action[..., 2]
+    np.testing.assert_allclose(height, vec.world.state.drone_position[..., 2], atol=1e-6)
 
 
 def fly(interface, **overrides):
