@@ -28,11 +28,12 @@ class FullStateCommand:
 
     def __init__(self, vec: MultiliftVec, model: TeamModel, ahead: float):
         self._vec, self._model = vec, model
-        self._ahead = ahead + (vec.task.control_dt if vec.task.KERNELS.plan else 0.0)  # as goals are, see `follow`
+        # A goal that moves is a control step further on when the controllers read it.
+        self._ahead = ahead + (vec.task.control_dt if vec.task.KERNELS.plan else 0.0)
         self._work = ModelWork.of(vec.num_drones)
         self._tension = np.zeros((vec.num_envs, vec.num_drones))
-        scales = vec.controller.interface.numbers
-        self._scales = np.array([getattr(vec.config.acting, number.limit) for number in scales])
+        numbers = vec.controller.interface.numbers
+        self._scales = np.array([getattr(vec.config.acting, number.limit) for number in numbers])
 
     def act(
         self, present: np.ndarray, states: np.ndarray, loads: np.ndarray, thrust: np.ndarray, rate: np.ndarray,
