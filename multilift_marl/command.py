@@ -46,6 +46,7 @@ _EXTRAS = {
     "rosbags": "ros",
     "cyclonedds": "ros",
     "ray": "ray",
+    "scipy": "plan",
 }  # of all other packages: train
 
 

@@ -148,7 +148,12 @@ FLIGHTS: dict[str, Flight] = {
 
 SCRIPTED = {"control.action": "reference"}
 """Actions of the baselines, whatever those of the learned policies that they are compared with."""
-MPC = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
+MPC = {
+    "control.action": "acc_rates",
+    "control.max_acceleration": 25.0,
+    "control.max_tilt_rate": 15.0,
+    "control.disturbance": "none",
+}
 """Actions of the central planner, which knows all states and the path ahead."""
 PLANNED_EPISODES = 250
 """Of the central planner, which takes a millisecond a step of each."""

@@ -21,7 +21,8 @@ from multilift_marl.agents.logging import package_versions
 from multilift_marl.agents.networks import Actor, Normalizer
 from multilift_marl.agents.policy import CONTRACT_FORMAT, LearnedPolicy, TrainedPolicy
 from multilift_marl.config.config import Config
-from multilift_marl.control.actions import ACTIONS, THRUST, ControlContext
+from multilift_marl.control.action_interface import THRUST, ControlContext
+from multilift_marl.control.actions import ACTIONS
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.setpoints import Setpoint

@@ -13,7 +13,8 @@ from multilift_marl.agents.mappo import Learner
 from multilift_marl.agents.policy import LearnedPolicy, find_checkpoint, shipped_policies
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.control.actions import ACTIONS, THRUST
+from multilift_marl.control.action_interface import THRUST
+from multilift_marl.control.actions import ACTIONS
 from multilift_marl.errors import ConfigError
 from multilift_marl.mdp.observations import observation_names
 from multilift_marl.policies.baselines import SCRIPTED

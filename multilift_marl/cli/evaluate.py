@@ -43,9 +43,9 @@ _USAGE = """Evaluate a team on fixed seeds, beside the baselines on the same epi
   python evaluate.py policy=formation config=pose_easy baseline=payload_geometric [key=value ...]
 
 Baselines are formation, formation_integral, formation_feedback, formation_gusts, formation_lead, formation_narrow,
-formation_redistributed and payload_geometric; hold_velocity, hold_acceleration, hold_acc_rates, hold_ctbr, hold_ctbm
-and hold_rotor with these action interfaces. task=<other> keeps the configuration's vehicles, payload, cables and
-control, see python train.py --help.
+formation_redistributed and payload_geometric; hold_velocity, hold_acceleration, hold_acc_rates, hold_full_state,
+hold_ctbr, hold_ctbm and hold_rotor with these action interfaces. task=<other> keeps the configuration's vehicles,
+payload, cables and control, see python train.py --help.
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
 
 

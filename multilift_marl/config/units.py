@@ -16,12 +16,12 @@ from multilift_marl.rig.system import System
 from multilift_marl.schema.sections import ControlConfig
 
 _POWERS = {  # of length and time in each unit
-    "m": (1, 0), "m/s": (1, -1), "m/s²": (1, -2), "m s": (1, 1), "s": (0, 1), "rad/s": (0, -1), "rad/s²": (0, -2),
-    "rad s": (0, 1), "rad": (0, 0), "-": (0, 0),
+    "m": (1, 0), "m/s": (1, -1), "m/s²": (1, -2), "m/s³": (1, -3), "m s": (1, 1), "s": (0, 1), "rad/s": (0, -1),
+    "rad/s²": (0, -2), "rad s": (0, 1), "rad": (0, 0), "-": (0, 0),
 }  # fmt: skip
 _FULL_SCALES = {
     "max_offset": "m", "max_velocity": "m/s", "max_acceleration": "m/s²", "max_tilt_rate": "rad/s",
-    "max_yaw_rate": "rad/s", "max_angular_acceleration": "rad/s²",
+    "max_yaw_rate": "rad/s", "max_angular_acceleration": "rad/s²", "max_jerk": "m/s³",
 }  # fmt: skip
 
 

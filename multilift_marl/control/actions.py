@@ -1,125 +1,33 @@
-"""Action interfaces: what the numbers in [-1, 1] mean. One class each, all in the table at the end.
-
-An interface turns actions into set-points once for each policy step (`set_action`), and set-points into rotor thrusts
-at the control rate (`control_step`). Vectors are given in the drone's slot frame (x outward from the payload, y to the
-left of it, z up), body rates in the slot body frame: the body's, turned about its z axis so that x points outward. So a
-number means the same to all drones, which share a network. Zero hovers as well as the interface can.
-"""
+"""The action interfaces, one class each, all in the table at the end; see `action_interface.py`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import cos, sin
-from typing import ClassVar, NamedTuple
-
 import numpy as np
 
+from multilift_marl.control.action_interface import (
+    AXES,
+    THRUST,
+    YAW_RATE,
+    ActionComponent,
+    Call,
+    ControlContext,
+    Interface,
+    from_slot_body,
+    in_world,
+    moment_component,
+    tilt_rate_components,
+    vector_components,
+)
 from multilift_marl.control.allocation import allocate
-from multilift_marl.control.formation import Goal, Reference, Smoothing, smooth, smooth_moving, to_goal_frame
-from multilift_marl.control.gains import Gains, drone_gains
+from multilift_marl.control.formation import Reference, Smoothing, smooth, smooth_moving, to_goal_frame
+from multilift_marl.control.full_state import FullStateAction
+from multilift_marl.control.gains import drone_gains
 from multilift_marl.control.geometric import fly, fly_rates, hook_moment
-from multilift_marl.control.setpoints import Setpoint, smooth_velocity, track_own_state, track_own_state_to_yaw
+from multilift_marl.control.setpoints import smooth_velocity, track_own_state, track_own_state_to_yaw
 from multilift_marl.kernels.jit import bind, kernel
-from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, turn, vec
+from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, vec
 from multilift_marl.physical import GRAVITY
 from multilift_marl.schema.sections import ControlConfig
-from multilift_marl.sim.state import SystemState
-
-Call = Callable[[], None]
-
-
-class ActionComponent(NamedTuple):
-    """One number of an action, in [-1, 1]."""
-
-    name: str
-    frame: str
-    unit: str
-    limit: str
-    """Key of `control` with what 1 stands for, -1 for its opposite; THRUST where drones have limits of their own."""
-    meaning: str
-
-
-THRUST = ""
-"""The limit of thrusts: -1 is the least that the rotors can give, 0 the one at rest, 1 the largest."""
-
-
-def vector_components(unit: str, limit: str, meaning: str) -> tuple[ActionComponent, ...]:
-    """Return the three numbers of a vector in the slot frame; `meaning` says of what."""
-    return tuple(
-        ActionComponent(name, "slot", unit, limit, f"{meaning}, {where}")
-        for name, where in (("outward", "away from the payload"), ("sideways", "to the left of that"), ("up", "upward"))
-    )
-
-
-AXES = "about the axis that points outward", "about that to its left", "about body z"
-
-
-def tilt_rate_components(meaning: str) -> tuple[ActionComponent, ...]:
-    """Return the body rates that tilt a drone; `meaning` says of what."""
-    names = ("outward_rate", "sideways_rate")
-    return tuple(
-        ActionComponent(name, "slot body", "rad/s", "max_tilt_rate", f"{meaning} {axis}")
-        for name, axis in zip(names, AXES[:2], strict=True)
-    )
-
-
-def moment_component(name: str, axis: str) -> ActionComponent:
-    """Return the moment about one of `AXES`, as the angular acceleration that it causes."""
-    full = "max_angular_acceleration"
-    return ActionComponent(f"{name}_moment", "slot body", "rad/s²", full, f"angular acceleration {axis}")
-
-
-YAW_RATE = ActionComponent("yaw_rate", "world", "rad/s", "max_yaw_rate", "change of the heading, about the vertical")
-
-
-class ControlContext(NamedTuple):
-    """What an interface reads and writes."""
-
-    state: SystemState
-    goal: Goal
-    reference: Reference
-    setpoint: Setpoint
-    cable_force: np.ndarray
-    """(E, N, 3) force of the drones on their cables, any rejected disturbance included [N]."""
-    thrust: np.ndarray
-    """(E, N, 4) rotor thrusts, written [N]."""
-    gains: Gains
-
-
-class Interface:
-    """An action interface.
-
-    Class attributes:
-        numbers: of an action, each with its frame, unit and full scale.
-        by_rates: whether actions are about body rates: drones observe their own in the slot body frame, too.
-        supports: values of `control.disturbance` that go with it, beside "none".
-    """
-
-    numbers: ClassVar[tuple[ActionComponent, ...]]
-    by_rates: ClassVar[bool] = False
-    supports: ClassVar[tuple[str, ...]] = ()
-
-    def __init__(self, settings: ControlConfig, dt: float):
-        self.settings = settings
-        self.dt = dt
-
-    def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
-        """Return the call that turns `action` (E, N, A) in [-1, 1] of environments lo to hi into set-points."""
-        raise NotImplementedError
-
-    def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
-        """Return what is called in turn at every control step, the last of them for the thrusts."""
-        return (bind(fly, lo, hi, team.state, team.reference, team.cable_force, team.thrust, team.gains, None),)
-
-    def control_step_moving_goal(
-        self, lo: int, hi: int, plan: Call, set_action: Call, team: ControlContext
-    ) -> tuple[Call, ...]:
-        """Return the same as `control_step` for goals that move, by calling `plan`, at every control step."""
-        return plan, *self.control_step(lo, hi, team)
-
-    def thrusts(self, team: ControlContext) -> np.ndarray:
-        """Return the thrusts (E, N, K) [N] that the last action set itself, K of its numbers."""
-        return team.thrust[..., :0]
 
 
 class ReferenceAction(Interface):
@@ -279,34 +187,11 @@ class RotorAction(Interface):
 
 
 @kernel
-def _in_world(e, n, action, goal, full):
-    """Return the first three numbers of an action, times `full`, turned from the slot frame into the world."""
-    commanded = (full * action[e, n, 0], full * action[e, n, 1], full * action[e, n, 2])
-    return turn(goal.slot_frame[e, n, 0], goal.slot_frame[e, n, 1], commanded)
-
-
-@kernel
-def from_slot_body(vector, yaw, slot_frame):
-    """Return a vector of the slot body frame in the body frame of a drone with heading `yaw` [rad]."""
-    c, s = cos(yaw), sin(yaw)
-    along, across = slot_frame[0], slot_frame[1]  # cosine and sine of the slot's heading
-    return turn(c * along + s * across, c * across - s * along, vector)
-
-
-@kernel
-def to_slot_body(vector, yaw, slot_frame):
-    """Return a vector of the body frame of a drone with heading `yaw` [rad] in the slot body frame."""
-    c, s = cos(yaw), sin(yaw)
-    along, across = slot_frame[0], slot_frame[1]
-    return turn(c * along + s * across, s * along - c * across, vector)
-
-
-@kernel
 def _command_offset(lo, hi, action, team, max_offset, max_yaw):
     goal, g = team.goal, team.gains
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            put(team.reference.command[e, n], add(vec(goal.slots, e, n), _in_world(e, n, action, goal, max_offset)))
+            put(team.reference.command[e, n], add(vec(goal.slots, e, n), in_world(e, n, action, goal, max_offset)))
             team.reference.command_yaw[e, n] = goal.drone_yaw[e] + g.heading[n] + max_yaw * action[e, n, 3]
 
 
@@ -314,7 +199,7 @@ def _command_offset(lo, hi, action, team, max_offset, max_yaw):
 def _command_vector(lo, hi, action, goal, reference, vector, largest, max_yaw_rate):
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            put(vector[e, n], _in_world(e, n, action, goal, largest))
+            put(vector[e, n], in_world(e, n, action, goal, largest))
             reference.yaw_rate[e, n] = max_yaw_rate * action[e, n, 3]
 
 
@@ -323,7 +208,7 @@ def _command_acc_rates(lo, hi, action, team, max_acceleration, max_tilt_rate):
     reference, goal = team.reference, team.goal
     for e in range(lo, hi):
         for n in range(action.shape[1]):
-            put(reference.acceleration[e, n], _in_world(e, n, action, goal, max_acceleration))
+            put(reference.acceleration[e, n], in_world(e, n, action, goal, max_acceleration))
             asked = (max_tilt_rate * action[e, n, 3], max_tilt_rate * action[e, n, 4], 0.0)
             put(team.setpoint.rates[e, n], from_slot_body(asked, reference.yaw[e, n], goal.slot_frame[e, n]))
             reference.command_yaw[e, n] = goal.drone_yaw[e] + team.gains.heading[n]
@@ -398,6 +283,7 @@ ACTIONS: dict[str, type[Interface]] = {
     "velocity": VelocityAction,
     "acceleration": AccelerationAction,
     "acc_rates": AccRatesAction,
+    "full_state": FullStateAction,
     "ctbr": CtbrAction,
     "ctbm": CtbmAction,
     "rotor": RotorAction,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from multilift_marl.config.config import Config
-from multilift_marl.control.actions import ACTIONS, Call, ControlContext
+from multilift_marl.control.action_interface import Call, ControlContext
+from multilift_marl.control.actions import ACTIONS
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
 from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.gains import make_gains
@@ -71,8 +72,9 @@ class Controller:
         """
         state, thrust, g = self.state, self.world.thrust, self.gains
         rejection = self.disturbance
-        # The same array in every step: kernels are bound to it.
-        cable_force = goal.cable_force if rejection is None else rejection.cable_force
+        # The same arrays in every step: kernels are bound to them.
+        nominal = self._setpoint.cable_force if self.interface.commands_force else goal.cable_force
+        cable_force = nominal if rejection is None else rejection.cable_force
         team = ControlContext(state, goal, self.reference, self._setpoint, cable_force, thrust, g)
         set_action = self.interface.set_action(lo, hi, action, team)
         control_step = (
@@ -82,7 +84,7 @@ class Controller:
         )
         if rejection is None:
             return set_action, control_step
-        known = (state, self.reference, goal.cable_force)
+        known = (state, self.reference, nominal)
         estimate = bind(REJECTIONS[self._kind], lo, hi, *known, rejection, self._rejection)
         return set_action, (*control_step[:-1], estimate, control_step[-1])
 

@@ -16,7 +16,7 @@ from multilift_marl.math3d import add, put, scale, sub, vec
 
 
 class Setpoint(NamedTuple):
-    """What drones are to do below the position, until the next action."""
+    """What drones are to do beside or below a position, until the next action."""
 
     velocity: np.ndarray
     """(E, N, 3) world frame [m/s]."""
@@ -24,12 +24,16 @@ class Setpoint(NamedTuple):
     """(E, N, 3) body rates [rad/s]."""
     thrust: np.ndarray
     """(E, N) total thrust [N]."""
+    full_state: np.ndarray
+    """(E, N, 16) motion and cable force beside the slot's, see `full_state.py`."""
+    cable_force: np.ndarray
+    """(E, N, 3) force on each cable, where an interface commands it, world frame [N]."""
 
     @classmethod
     def zeros(cls, num_envs: int, num_drones: int) -> Setpoint:
         """Return set-points of zero."""
         e, n = num_envs, num_drones
-        return cls(*(np.zeros(shape) for shape in ((e, n, 3), (e, n, 3), (e, n))))
+        return cls(*(np.zeros(shape) for shape in ((e, n, 3), (e, n, 3), (e, n), (e, n, 16), (e, n, 3))))
 
 
 @kernel

@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from multilift_marl.evaluation.rollout import Trace
+from multilift_marl.planning.feasibility import Feasibility
+from multilift_marl.planning.spline import sample_spline
 from multilift_marl.sim.scene import DRONE_COLOURS
 
 # Told apart by the colour-blind too (Okabe & Ito, Color Universal Design, 2008).
@@ -86,6 +88,36 @@ def plot_paths(path: str | Path, trace: Trace, title: str = "", pdf: bool = Fals
     figure.suptitle(title, fontsize=11)
     _legend(figure, axes)
     _save(figure, path, pdf)
+
+
+def plot_plan(path: str | Path, table: np.ndarray, feasibility: Feasibility) -> None:
+    """Plot place [m] and speed [m/s] of a planned path, cable tensions [N] and thrusts [N] over time [s].
+
+    Args:
+        path: of the PNG; its folder is made.
+        table: (K, 13) spline of the path, see `spline.fit_spline`.
+        feasibility: of the path. The least of the limits of thrust is drawn, too.
+    """
+    times = feasibility.times
+    place, rate = sample_spline(table, times)[:2]
+    thrust = next(quantity for quantity in feasibility.quantities if quantity.name == "thrust")
+    figure = Figure(figsize=(6.4, 8.0), layout="constrained")
+    position, speed, tension, rotors = figure.subplots(4, 1, sharex=True)
+    for k, name in enumerate("xyz"):
+        position.plot(times, place[:, k], color=POLICY_COLOURS[k], label=name)
+    position.legend(frameon=False, ncols=3, fontsize=9)
+    speed.plot(times, np.linalg.norm(rate[:, :3], axis=1), color=PAYLOAD_COLOUR)
+    for n in range(thrust.values.shape[1]):
+        tension.plot(times, feasibility.tension[:, n], **_drone_style(n))
+        rotors.plot(times, thrust.values[:, n], **_drone_style(n), label=f"drone {n}")
+    rotors.plot(times, thrust.limits.min(axis=1), color="0.4", linewidth=0.9, linestyle="--", label="limit")
+    labels = (position, "position [m]"), (speed, "speed [m/s]"), (tension, "cable tension [N]"), (rotors, "thrust [N]")
+    for axes, label in labels:
+        _label(axes, "time [s]" if axes is rotors else None, label)
+    for axes in (speed, tension, rotors):
+        axes.set_ylim(bottom=0)
+    _legend(figure, rotors)
+    _save(figure, path)
 
 
 def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]], pdf: bool = False) -> None:

@@ -47,7 +47,8 @@ LOAD_GROUND = 0  # the payload's contact with the ground, to be ignored apart fr
 MAX_DISTANCE = 3.0  # [m]
 _CABLE_DISTANCE = 0.1  # [m] for the span of a falcon
 TOUCH = 0.005  # [m] what is no higher touches the ground
-_MIN_UP = cos(radians(80.0))
+MAX_TILT = 80.0  # [deg] of a drone
+_MIN_UP = cos(radians(MAX_TILT))
 _MIN_CABLE_PAYLOAD = cos(radians(135.0))
 
 

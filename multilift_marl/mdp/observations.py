@@ -13,7 +13,8 @@ from collections.abc import Callable, Iterable, Sequence
 from math import cos, sin
 from typing import Any, NamedTuple
 
-from multilift_marl.control.actions import ACTIONS, to_slot_body
+from multilift_marl.control.action_interface import to_slot_body
+from multilift_marl.control.actions import ACTIONS
 from multilift_marl.kernels.jit import inlined, is_plain
 from multilift_marl.math3d import add, column, heading, mat, matrow, mul, row, scale, sub, vec
 from multilift_marl.mdp.env_data import load_row

@@ -10,6 +10,7 @@ import numpy as np
 from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.mdp.failures import TOUCH
 from multilift_marl.physical import GRAVITY
+from multilift_marl.planning.feasibility import find_violation
 from multilift_marl.planning.path_table import COLUMNS, KEY, SAMPLING, read_table
 from multilift_marl.planning.spline import fit_spline, sample_spline
 from multilift_marl.rig.system import System
@@ -61,14 +62,27 @@ def load_path(
             f"{KEY}={name} has rows {step:.2g} s apart, less than {_MIN_STEP:g} s; raise task_options.file_spacing"
         )
     table = fit_spline(thin)
-    _check_height(name, table, system)
-    _check_thrust(name, table, system, ranges, "" if ramp else ", or give it task_options.file_ramp=2 to do so")
+    check_height(f"{KEY}={name}", table, system, ", or lift it by task_options.file_offset")
+    slower = "" if ramp else ", or give it task_options.file_ramp=2 to do so"
+    check_thrust(f"{KEY}={name}", table, system, ranges, slower)
+    _warn_of_limits(name, table, system, ranges)
+    warn_of_length(f"{KEY}={name}", table, seconds)
+    return table
+
+
+def warn_of_length(source: str, table: np.ndarray, seconds: float) -> None:
+    """Warn of a path that takes longer than an episode of `seconds`; `source` is its key, and a file's path."""
     if (lasts := table[-1, 0]) > seconds:
         warn_once(
-            "tasks", f"{KEY}={name} takes {lasts:.4g} s, but an episode ends after {seconds:g} s; set "
+            "tasks", f"{source} takes {lasts:.4g} s, but an episode ends after {seconds:g} s; set "
             f"env.episode_seconds={ceil(lasts)} to fly all of it",
         )  # fmt: skip
-    return table
+
+
+def _warn_of_limits(name: str, table: np.ndarray, system: System, ranges: RandomizationConfig) -> None:
+    """Warn of a path on which a team that followed it without error would exceed its limits."""
+    if violation := find_violation(table, system, ranges):
+        warn_once("tasks", f"{KEY}={name} leads the team beyond its limits: {violation}; make it slower or smoother")
 
 
 def read_rows(reference: str) -> np.ndarray:
@@ -78,7 +92,7 @@ def read_rows(reference: str) -> np.ndarray:
         ConfigError: no such file, or not the table that is expected.
     """
     path, content = read_pinned(KEY, reference)
-    rows = read_table(path, content)
+    rows = read_table(f"{KEY}={path}", content)
     if rows.ndim != 2 or rows.shape[1] not in (4, 5):
         shape = f"{rows.shape[1]} columns" if rows.ndim == 2 else f"an array of shape {rows.shape}"
         raise ConfigError(f"{KEY}={path} holds {shape}; give 4 columns t, x, y, z or 5 with yaw")
@@ -202,22 +216,29 @@ def _sample_all(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t, sample_spline(table, t)
 
 
-def _check_height(name: str, table: np.ndarray, system: System) -> None:
-    """Refuse a path on which the payload, level, would touch the ground; drones hang above it."""
+def check_height(source: str, table: np.ndarray, system: System, cure: str = "") -> None:
+    """Refuse a path on which the payload, level, would touch the ground; drones hang above it.
+
+    Args:
+        source: key of the path, and a file's path, for the message.
+        table: (K, 13) spline of the path.
+        system: that is to fly it.
+        cure: what else can be done.
+    """
     t, motion = _sample_all(table)
     lowest = int(np.argmin(motion[0, :, 2]))
     least = TOUCH + system.payload_size[2] / 2 - system.payload_center[2]
     if motion[0, lowest, 2] < least:
         raise ConfigError(
-            f"{KEY}={name}: at {t[lowest]:.2f} s z is {motion[0, lowest, 2]:.3g} m and the payload would touch the "
-            f"ground; z is up and in metres, keep it above {least:.3g} m, or lift it by task_options.file_offset"
+            f"{source}: at {t[lowest]:.2f} s z is {motion[0, lowest, 2]:.3g} m and the payload would touch the "
+            f"ground; z is up and in metres, keep it above {least:.3g} m{cure}"
         )
 
 
-def _check_thrust(name: str, table: np.ndarray, system: System, ranges: RandomizationConfig, cure: str) -> None:
+def check_thrust(source: str, table: np.ndarray, system: System, ranges: RandomizationConfig, cure: str = "") -> None:
     """Refuse a path that is too fast for the team, its heaviest payload and its weakest rotors included.
 
-    What begins or ends in motion is given a `cure`.
+    What begins or ends in motion is given a `cure`; for the others see `check_height`.
 
     A team that accelerates by a hangs as at rest, but in gravity g - a: hovering thrusts grow by |a + g e_z| / g.
     Drones of a formation that turns also accelerate about its middle.
@@ -227,7 +248,7 @@ def _check_thrust(name: str, table: np.ndarray, system: System, ranges: Randomiz
     if gravity[:, 2].min() < _MIN_WEIGHT * GRAVITY:
         i = np.argmin(gravity[:, 2])
         raise ConfigError(
-            f"{KEY}={name} is too fast: at {t[i]:.2f} s its target falls at {-bend[i, 2]:.3g} m/s² and the cables "
+            f"{source} is too fast: at {t[i]:.2f} s its target falls at {-bend[i, 2]:.3g} m/s² and the cables "
             f"would go slack; make the path slower or smoother (t in s, x, y, z in m; it begins and ends at rest{cure})"
         )
     own = (1 + ranges.vehicle_mass) * system.drone_mass
@@ -239,7 +260,7 @@ def _check_thrust(name: str, table: np.ndarray, system: System, ranges: Randomiz
     i, n = np.unravel_index(np.argmax(thrust / most), thrust.shape)
     if not isfinite(thrust[i, n]) or thrust[i, n] > most[n]:
         raise ConfigError(
-            f"{KEY}={name} is too fast: at {t[i]:.2f} s its target accelerates at {np.linalg.norm(bend[i, :3]):.3g} "
+            f"{source} is too fast: at {t[i]:.2f} s its target accelerates at {np.linalg.norm(bend[i, :3]):.3g} "
             f"m/s² and {bend[i, 3]:.3g} rad/s², for which drone {n} would need {thrust[i, n]:.3g} N of its "
             f"{most[n]:.3g} N; make the path slower or smoother (t in s, x, y, z in m, yaw in rad; it begins and ends "
             f"at rest{cure})"

@@ -16,7 +16,15 @@ from multilift_marl.policies.formation import (
     FormationNarrow,
     FormationRedistributed,
 )
-from multilift_marl.policies.hold import HoldAcceleration, HoldAccRates, HoldCtbm, HoldCtbr, HoldRotor, HoldVelocity
+from multilift_marl.policies.hold import (
+    HoldAcceleration,
+    HoldAccRates,
+    HoldCtbm,
+    HoldCtbr,
+    HoldFullState,
+    HoldRotor,
+    HoldVelocity,
+)
 from multilift_marl.policies.mpc import TeamMpc
 from multilift_marl.policies.payload_geometric import PayloadGeometric
 from multilift_marl.policies.policy import OwnPolicy, Policy
@@ -37,6 +45,7 @@ LINEAR: dict[str, type[Formation]] = {
     "hold_velocity": HoldVelocity,
     "hold_acceleration": HoldAcceleration,
     "hold_acc_rates": HoldAccRates,
+    "hold_full_state": HoldFullState,
     "hold_ctbr": HoldCtbr,
     "hold_ctbm": HoldCtbm,
     "hold_rotor": HoldRotor,
@@ -103,8 +112,9 @@ def check_interface(name: str, action: str, role: str = "") -> None:
     """
     if name not in (*TUNED, *SCRIPTED) or (role == "train.residual" and name == "formation"):
         return
-    known = _by_name(name).INTERFACE
-    if action != known:
+    policy = _by_name(name)
+    known = policy.INTERFACE
+    if action not in getattr(policy, "INTERFACES", (known,)):
         holds = [other for other, script in SCRIPTED.items() if script.INTERFACE == action and action != "reference"]
         fits = f"take {f'{role}=' if role else ''}{holds[0]}, set" if holds else "set"
         raise ConfigError(

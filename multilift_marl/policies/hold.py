@@ -1,8 +1,9 @@
-"""Baselines for the action interfaces below `reference`: velocity, acceleration, acc_rates, ctbr, ctbm, rotor.
+"""Baselines for the action interfaces other than `reference`: `hold_<interface>`.
 
-One linear PD law with an integral for the acceleration of each drone, converted to each interface. All are linear maps
-of the observation, so that a learned policy can start from them (`train.residual`) and gains can be tuned by CMA-ES
-(`results/search_gains.py`). Conversions are those of the first vehicle where a team has several.
+One linear PD law with an integral for the acceleration of each drone, converted to each interface; `full_state`, whose
+slots the controller holds, needs the integral alone. All are linear maps of the observation, so that a learned policy
+can start from them (`train.residual`) and gains can be tuned by CMA-ES (`results/search_gains.py`). Conversions are
+those of the first vehicle where a team has several.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 
 from multilift_marl.config.units import unit_size
 from multilift_marl.physical import GRAVITY
-from multilift_marl.policies.formation import PLANNED, Formation
+from multilift_marl.policies.formation import PLANNED, Formation, FormationIntegral
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -114,6 +115,12 @@ class HoldAccRates(HoldAcceleration):
             for column in self._planned("velocity", axis):
                 matrix[rate, column] -= gain
         return matrix
+
+
+class HoldFullState(FormationIntegral):
+    """Slots that the controller holds, moved against the integral of the payload's error."""
+
+    INTERFACE = "full_state"
 
 
 class HoldCtbr(HoldAcceleration):

@@ -19,7 +19,8 @@ from multilift_marl.planning.approach import Approach, begin_approaches, write_a
 from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
-from multilift_marl.policies.hold import HoldAccRates
+from multilift_marl.policies.full_state_command import FullStateCommand
+from multilift_marl.policies.hold import HoldAccRates, HoldFullState
 from multilift_marl.policies.last_plan import LastPlan
 from multilift_marl.sensing.load_sensing import CAMERA_DELAY
 
@@ -28,27 +29,34 @@ if TYPE_CHECKING:
 
 
 SHARE = 0.6  # of what sensors say beside the prediction, by which states are corrected
-ENOUGH = 10.0, 8.0  # [m/s²], [rad/s] full scales of actions that limit no usual flight
+ENOUGH = {  # full scales of actions that limit no usual flight, and those to set
+    "acc_rates": {"max_acceleration": (10.0, 25.0), "max_tilt_rate": (8.0, 15.0)},
+    "full_state": {
+        "max_offset": (1.0, 2.0), "max_velocity": (3.0, 5.0), "max_acceleration": (10.0, 25.0),
+        "max_jerk": (100.0, 300.0), "max_cable_force": (1.5, 5.0),
+    },
+}  # fmt: skip
 
 
 class TeamMpc:
     """Central: it reads of `vec` what the drones know of themselves and of the payload, and where the target will be.
 
     Args:
-        vec: environments with the interface `acc_rates`; read at every `act`.
+        vec: environments with one of the interfaces; read at every `act`.
 
     Class attributes:
-        INTERFACE: by which it acts.
+        INTERFACE, INTERFACES: by which it acts, and those by which it can.
 
     Attributes:
         planner: TeamPlanner.
 
     Raises:
         ConfigError: a task that it cannot fly, see `Task.CAN_PLAN`; a team that flies elsewhere; a payload on one point
-            or one cable, which has no attitude to plan.
+            or one cable, which has no attitude to plan; drones that reject the forces that it estimates.
     """
 
     INTERFACE: ClassVar[str] = "acc_rates"
+    INTERFACES: ClassVar[tuple[str, ...]] = ("acc_rates", "full_state")
 
     def __init__(self, vec: MultiliftVec):
         system, config, n = vec.world.system, vec.config, vec.num_drones
@@ -61,6 +69,11 @@ class TeamMpc:
             raise ConfigError("policy=mpc reads rotor speeds, which are not measured of this team; take another policy")
         if vec.task.rig.is_point or n < 2:
             raise ConfigError("policy=mpc plans for payloads on two cables or more; take another policy for this rig")
+        if config.planner.estimate and config.control.disturbance != "none":
+            raise ConfigError(
+                f"policy=mpc estimates unknown forces, and control.disturbance={config.control.disturbance} would reject "
+                "them once more; set control.disturbance=none, or planner.estimate=false"
+            )
         self._vec, settings = vec, config.planner
         self.planner = TeamPlanner(system, settings, vec.num_envs)
         self._dt = vec.task.dt
@@ -71,6 +84,9 @@ class TeamMpc:
             late = CAMERA_DELAY if config.env.sensing == "mocap" else 0.0
             self._observer = TeamObserver(self.planner.model, vec.num_envs, SHARE, late)
         lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)
+        self._full_state = None
+        if config.control.action == "full_state":
+            self._full_state = FullStateCommand(vec, self.planner.model, settings.delay)
         self._lead = lag + 0.5 * self._dt if settings.lead is None else settings.lead
         self._drag = np.array([vehicle.drag for vehicle in system.vehicles], float)
         self._lift = np.array([vehicle.thrust_coefficient for vehicle in system.vehicles], float)
@@ -78,15 +94,13 @@ class TeamMpc:
         self._sent = np.zeros((under_way + 1, vec.num_envs, 3 * n))
         self._fresh = np.ones(vec.num_envs, bool)
         self._last = LastPlan(self.planner.plans, settings.step, self._dt)
-        self._without_plan = HoldAccRates(vec)
+        self._without_plan = HoldAccRates(vec) if self._full_state is None else HoldFullState(vec)
         self._approach = Approach.zeros(vec.num_envs)
         self._offsets = np.zeros((vec.num_envs, settings.steps + 1, 12))
-        if config.acting.max_acceleration < ENOUGH[0] or config.acting.max_tilt_rate < ENOUGH[1]:
-            warn_once(
-                "mpc",
-                "actions of these full scales limit what policy=mpc can command; set control.max_acceleration=25 and "
-                "control.max_tilt_rate=15",
-            )
+        enough = ENOUGH[config.control.action]
+        if any(getattr(config.acting, key) < least for key, (least, _) in enough.items()):
+            cure = " ".join(f"control.{key}={wide:g}" for key, (_, wide) in enough.items())
+            warn_once("mpc", f"actions of these full scales limit what policy=mpc can command; set {cure}")
         self._deadline = np.inf if settings.deadline is None else settings.deadline
         self._patience = settings.patience
         self._limits = config.acting.max_acceleration, config.acting.max_tilt_rate
@@ -102,7 +116,7 @@ class TeamMpc:
         return self._last.metrics()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return actions (E, N, 5) in [-1, 1] for the present state of the environments, whose observations these are.
+        """Return actions (E, N, A) in [-1, 1] for the present state of the environments, whose observations these are.
 
         Raises:
             ValueError: observations of another number of environments.
@@ -141,6 +155,7 @@ class TeamMpc:
         self._fresh &= unknown
         if self._estimator is not None:
             self._estimator.update(states, self._dt)
+        present = states.copy()
         planner.predict(states, self._sent, self._dt, loads)
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
         late = (perf_counter() - begin) / shape[0] > self._deadline
@@ -149,7 +164,11 @@ class TeamMpc:
         thrust = self._last.states()[:, -3 * shape[1] :].reshape(*shape, 3) + self._lead * rate
         self._sent[:-1] = self._sent[1:]
         self._sent[-1] = thrust.reshape(shape[0], -1)
-        action = self._command(thrust - forces.reshape(thrust.shape), rate, drag)
+        own = thrust - forces.reshape(thrust.shape)  # of the rotors: what else acts is part of the planned ones
+        if self._full_state is not None:
+            action = self._full_state.act(present, states, loads, own, rate, drag)
+        else:
+            action = self._command(own, rate, drag)
         lost = self._last.without > self._patience
         if lost.any():
             action[lost] = self._without_plan.act(observation)[lost]
@@ -196,7 +215,7 @@ class TeamMpc:
 
     def _command(self, thrust: np.ndarray, rate: np.ndarray, drag: np.ndarray) -> np.ndarray:
         """Return the actions that ask for thrust vectors (E, N, 3) [N] which change at a rate [N/s]."""
-        vec, goal, gains = self._vec, self._vec.task.goal, self._vec.controller.gains
+        vec, goal, gains = self._vec, self._vec.task.planned, self._vec.controller.gains
         mass, load = gains.mass[:, None], gains.load_share[:, None]
         # the controller feeds the cable's force, weight and its share of the load forward, and drag where it is told to
         rotors = thrust + drag

@@ -10,7 +10,7 @@ from typing import Any
 from multilift_marl.errors import ConfigError, reason, shorten
 from multilift_marl.schema.yaml_text import parse_yaml
 
-FILE_KEYS = ("task_options.file", "payload.mesh", "vehicle.preset", "train.init")
+FILE_KEYS = ("task_options.file", "task_options.waypoints", "payload.mesh", "vehicle.preset", "train.init")
 MAX_BYTES = 100_000_000  # of a file
 _MARK = "#sha256="
 _DIGITS = 16  # of the hash

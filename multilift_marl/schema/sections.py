@@ -197,21 +197,27 @@ class CableConfig(Section):
 class ControlConfig(Section):
     """The drones' geometric controller and its action interface."""
 
-    action: Literal["reference", "velocity", "acceleration", "acc_rates", "ctbr", "ctbm", "rotor"] = Field(
-        "reference", description="what an action means (docs/control.md)"
+    action: Literal["reference", "velocity", "acceleration", "acc_rates", "full_state", "ctbr", "ctbm", "rotor"] = (
+        Field("reference", description="what an action means (docs/control.md)")
     )
     heading: Literal["target", "outward"] = Field(
         "target", description="drones face where the target does, or away from the payload, each through its slot"
     )
     max_offset: Annotated[Float, Between(0, 100, "m")] = Field(
-        0.5, gt=0, description="[m] slot offset of a full action, along each axis"
+        0.5, gt=0, description="[m] slot offset of a full action of `reference`, `full_state`, along each axis"
     )
     max_yaw: Annotated[Float, Between(0, pi, "rad")] = Field(0.5, gt=0, description="[rad] yaw offset of a full action")
     max_velocity: Annotated[Float, Between(0, 50, "m/s")] = Field(
-        1.0, gt=0, description="[m/s] of a full action of `velocity`, along each axis"
+        1.0, gt=0, description="[m/s] of a full action of `velocity`, `full_state`, along each axis"
     )
     max_acceleration: Annotated[Float, Between(0, 1000, "m/s²")] = Field(
-        3.0, gt=0, description="[m/s²] of a full action of `acceleration`, `acc_rates`"
+        3.0, gt=0, description="[m/s²] of a full action of `acceleration`, `acc_rates`, `full_state`"
+    )
+    max_jerk: Annotated[Float, Between(0, 1e5, "m/s³")] = Field(
+        30.0, gt=0, description="[m/s³] of a full action of `full_state`, along each axis"
+    )
+    max_cable_force: Annotated[Float, Between(0, 100)] = Field(
+        0.5, gt=0, description="[-] over the nominal force, of a full action of `full_state`, along each axis"
     )
     max_tilt_rate: Annotated[Float, Between(0, 100, "rad/s")] = Field(
         4.0, gt=0, description="[rad/s] roll, pitch of a full action of `acc_rates`, `ctbr`"

@@ -14,8 +14,8 @@ from multilift_marl.schema.values import Float, Int, Section
 
 BASE_POLICIES = (
     "formation", "formation_integral", "formation_feedback", "formation_gusts", "formation_lead", "formation_narrow",
-    "formation_redistributed", "hold_velocity", "hold_acceleration", "hold_acc_rates", "hold_ctbr", "hold_ctbm",
-    "hold_rotor",
+    "formation_redistributed", "hold_velocity", "hold_acceleration", "hold_acc_rates", "hold_full_state",
+    "hold_ctbr", "hold_ctbm", "hold_rotor",
 )  # fmt: skip
 
 GAINS = Path(__file__).resolve().parents[1] / "policies" / "gains"

@@ -124,7 +124,16 @@ def _choice(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
 
 
+def _places(value: Any) -> Any:
+    """Refuse a list of anything but lists of three or four, with which pydantic's message would be of text."""
+    shaped = isinstance(value, list | tuple) and all(isinstance(each, list | tuple) for each in value)
+    if not isinstance(value, str | None) and not (shaped and all(len(each) in (3, 4) for each in value)):
+        raise ValueError("must be a CSV file or a list of places [x, y, z] or [x, y, z, yaw]")
+    return value
+
+
 Level = Annotated[Float, Field(ge=0), BeforeValidator(_level)]
+Places = Annotated[str | tuple[tuple[Float, ...], ...] | None, BeforeValidator(_places)]
 Delay = Annotated[Int, Field(ge=0, le=50)]
 Span = Annotated[tuple[Positive, Positive], BeforeValidator(_range), AfterValidator(_rising)]
 Shares = Annotated[tuple[Float, Float], BeforeValidator(_range), AfterValidator(_rising), Between(0, 1)]

@@ -38,15 +38,16 @@ from multilift_marl.planning.paths import (
     set_goal,
 )  # fmt: skip
 from multilift_marl.planning.spline import NO_FILE, spline_yaw
+from multilift_marl.planning.waypoints import load_waypoints
 from multilift_marl.schema.validate import validate
-from multilift_marl.schema.values import Between, Choice, Float, Section, Span, Vector
+from multilift_marl.schema.values import Between, Choice, Float, Places, Section, Span, Vector
 from multilift_marl.tasks.base import Kernels, Task
 
 AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
 _DRAWN = 400  # points of a path that is drawn
 
 
-Form = Literal["circle", "figure8", "lemniscate", "helix", "random", "file"]
+Form = Literal["circle", "figure8", "lemniscate", "helix", "random", "file", "waypoints"]
 
 
 class TrackOptions(Section):
@@ -55,7 +56,7 @@ class TrackOptions(Section):
     path: Annotated[tuple[Form, ...], Choice] = Field(
         ("figure8",),
         min_length=1,
-        description="its form: circle, figure8, lemniscate, helix, random, file, or some to draw from",
+        description="its form: circle, figure8, lemniscate, helix, random, file, waypoints, or some to draw from",
     )
     file: str | None = Field(None, description="of path=file: CSV, .npy or .npz with t [s], x, y, z [m], yaw [rad]")
     file_spacing: Float = Field(
@@ -67,7 +68,17 @@ class TrackOptions(Section):
     file_offset: Annotated[Vector, Between(-1e6, 1e6, "m")] = Field(
         (0.0, 0.0, 0.0), description="[m] added to the positions of a file"
     )
-    speed: Span = Field((1.0, 1.0), description="[m/s] peak speed v of figure8, lemniscate and random, or its range")
+    waypoints: Places = Field(
+        None,
+        description="of path=waypoints: a list of [x, y, z] or [x, y, z, yaw], in m and rad, or a CSV file of columns "
+        "x, y, z and perhaps yaw and t [s]",
+    )
+    waypoint_times: tuple[Float, ...] | None = Field(
+        None, description="[s] at which they are passed; None: those of the file, or as speed and acceleration allow"
+    )
+    speed: Span = Field(
+        (1.0, 1.0), description="[m/s] peak speed v of figure8, lemniscate, random and waypoints, or its range"
+    )
     acceleration: Span = Field((0.5, 0.5), description="[m/s²] their peak acceleration a, or its range")
     radius: Span = Field((5.0, 5.0), description="[m] of circle and helix, or its range")
     rate: Span = Field((0.2, 0.2), description="[rad/s] of circle and helix, or its range")
@@ -96,7 +107,7 @@ class TrackSettings(NamedTuple):
     """Constants of the task."""
 
     table: np.ndarray
-    """Spline of a file's path, see `path_file.load_path`."""
+    """Spline of the path of a file or of way-points, see `path_file.load_path`."""
     height: float
     """Of the path's centre [m]."""
     radius: float
@@ -301,35 +312,43 @@ class Track(Task):
         seconds = self.config.env.episode_seconds
         # Of an episode that is over by then all errors count, rather than none.
         self.rmse_after = option.rmse_from if option.rmse_from < seconds else 0.0
-        file = self._file()
-        table = NO_FILE
-        if file:
+        self._check_forms()
+        table, team = NO_FILE, (world.system, self.config.randomization)
+        if option.file:
             smoothing = option.file_spacing, option.file_ramp, option.file_offset
-            table = load_path(file, *smoothing, seconds, world.system, self.config.randomization)
+            table = load_path(option.file, *smoothing, seconds, *team)
+        elif option.waypoints:
+            limits = option.speed, option.acceleration
+            table = load_waypoints(option.waypoints, option.waypoint_times, *limits, seconds, *team)
         self.own = TrackArrays(Path.zeros(e), np.zeros(e), np.zeros((e, len(AHEAD), 3)))
         self.settings = TrackSettings(table, option.height, option.start_radius)
 
-    def _file(self) -> str:
-        """Return the reference to the file of the path, "" if none is; a ConfigError if the options disagree."""
-        forms, file = self.options.path, self.options.file
-        if "file" in forms and not file:
-            raise ConfigError("task_options.path=file needs the path of one; set task_options.file=<path>")
-        if file and "file" not in forms:
-            raise ConfigError(
-                f"task_options.file is given, but task_options.path={','.join(forms)} does not fly it; set "
-                "task_options.path=file, or task_options.file=null"
-            )
-        return file or ""
+    def _check_forms(self) -> None:
+        """Refuse files and way-points that the path does not fly, and a path without them, by a ConfigError."""
+        option = self.options
+        forms = ",".join(option.path)
+        for form, value, kind in (("file", option.file, "path"), ("waypoints", option.waypoints, "list or CSV file")):
+            if form in option.path and not value:
+                raise ConfigError(f"task_options.path={form} needs one; set task_options.{form}=<{kind}>")
+            if value and form not in option.path:
+                raise ConfigError(
+                    f"task_options.{form} is given, but task_options.path={forms} does not fly it; set "
+                    f"task_options.path={form}, or task_options.{form}=null"
+                )
+        if option.file and option.waypoints:
+            raise ConfigError(f"task_options.path={forms} has a file and way-points; leave one of them out")
+        if option.waypoint_times and not option.waypoints:
+            raise ConfigError("task_options.waypoint_times means nothing without task_options.waypoints; leave it out")
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw heading, form and figures of the path; the team hangs at its start. See `Task.start`.
 
-        The path of a file has its own heading and place.
+        The path of a file and that of way-points have their own heading and place.
         """
         option, path = self.options, self.own.path
         heading = rng.uniform(-pi, pi)
         form = option.path[rng.integers(len(option.path))] if len(option.path) > 1 else option.path[0]
-        kind = PATHS.index(form)
+        kind = FILE if form == "waypoints" else PATHS.index(form)
         path.kind[env], path.heading[env], path.climb[env] = kind, heading, option.climb
         v, a = _draw(rng, option.speed), _draw(rng, option.acceleration)
         if kind in (CIRCLE, HELIX):

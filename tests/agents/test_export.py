@@ -138,6 +138,11 @@ READ = {
     ("velocity", "yaw_rate"): lambda vec: vec.reference.yaw_rate[0, 0],
     ("acceleration", "up"): lambda vec: vec.reference.acceleration[0, 0, 2],
     ("acc_rates", "sideways_rate"): lambda vec: slot_body_rates(vec)[1],
+    ("full_state", "jerk_up"): lambda vec: vec.reference.jerk[0, 0, 2],
+    ("full_state", "force_up"): lambda vec: (
+        (vec.controller._setpoint.cable_force - vec.task.goal.cable_force)[0, 0, 2]
+        / np.linalg.norm(vec.task.goal.cable_force[0, 0])
+    ),
     ("ctbr", "thrust"): lambda vec: vec.controller._setpoint.thrust[0, 0],
     ("ctbr", "outward_rate"): lambda vec: slot_body_rates(vec)[0],
     ("ctbr", "yaw_rate"): lambda vec: vec.controller._setpoint.rates[0, 0, 2],

@@ -124,6 +124,38 @@ def test_acceleration_turns_at_its_yaw_rate_and_acc_rates_to_the_targets_yaw():
     np.testing.assert_allclose(np.reshape(yaw, (2, 4)), np.repeat(vec.task.goal.yaw[:, None], 4, axis=1), atol=0.01)
 
 
+def test_full_state_flies_a_motion_as_it_is_asked_for():
+    """A team that goes up and down by a sine, 10 cm at 4 rad/s, lags by its motors alone, by less than 1 cm."""
+    scales = np.array([0.2, 1.0, 3.0, 10.0])
+    keys = ("max_offset", "max_velocity", "max_acceleration", "max_jerk")
+    vec = flying("full_state", **{f"control.{key}": full for key, full in zip(keys, scales, strict=True)})
+    start, w, off = vec.world.state.drone_position.copy(), 4.0, []
+    for k in range(150):
+        t = k * vec.task.dt
+        motion = 1 - np.cos(w * t), w * np.sin(w * t), w**2 * np.cos(w * t), -(w**3) * np.sin(w * t)
+        action = np.zeros(16)
+        action[[2, 5, 8, 11]] = 0.1 * np.array(motion) / scales
+        step(vec, *action)
+        expected = 0.1 * (1 - np.cos(w * (t + vec.task.dt)))
+        off.append(np.abs(vec.world.state.drone_position[..., 2] - start[..., 2] - expected).max())
+    assert max(off[50:]) < 0.01
+
+
+def test_full_state_tilts_for_a_force_on_its_cable():
+    vec = flying("full_state", num_drones=2, **{"control.max_cable_force": 0.4})
+    nominal, mass = vec.task.goal.cable_force.copy(), vec.world.system.vehicle.mass
+    action = np.zeros(16)
+    action[12] = 0.5
+    for _ in range(10):
+        step(vec, *action)
+    more = nominal + 0.2 * np.linalg.norm(nominal, axis=-1, keepdims=True) * outward(vec)
+    np.testing.assert_allclose(vec.controller._setpoint.cable_force, more, atol=1e-12)
+    axes = [force + [0, 0, mass * GRAVITY] for force in (nominal, more)]
+    rest, asked = ((axis / np.linalg.norm(axis, axis=-1, keepdims=True) * outward(vec)).sum(-1) for axis in axes)
+    leans = (vec.world.state.drone_rotation[..., 2] * outward(vec)).sum(-1)
+    assert (leans > 0.5 * (rest + asked)).all() and (asked > rest + 0.03).all()
+
+
 @pytest.mark.parametrize("axis, full", [(0, 4.0), (1, 4.0), (2, 1.5)])
 def test_ctbr_turns_at_the_rates_asked_for_about_the_axes_of_the_slot(axis, full):
     vec = flying("ctbr", num_drones=3)

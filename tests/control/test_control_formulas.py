@@ -7,7 +7,7 @@ import pytest
 from conftest import make_system
 from plain_kernels import plain, record, turned
 
-from multilift_marl.control import actions, formation, geometric, setpoints
+from multilift_marl.control import action_interface, actions, formation, full_state, geometric, setpoints
 from multilift_marl.control.autopilot import LoadFeedforward
 from multilift_marl.control.formation import Goal, Reference, Smoothing
 from multilift_marl.control.gains import Gains
@@ -223,7 +223,7 @@ def team(hooked: bool = True, heading: float = 0.9):
         heading=np.array([0.2, -0.5]), hooks=HOOKS, hooked=hooked,
     )  # fmt: skip
     setpoint = setpoints.Setpoint.zeros(1, 2)
-    own = actions.ControlContext(
+    own = action_interface.ControlContext(
         state, goal, Reference.zeros(1, 2), setpoint, goal.cable_force, np.zeros((1, 2, 4)), gains
     )
     return own, allocation
@@ -268,10 +268,38 @@ def test_vectors_are_in_the_slot_frame_and_rates_in_the_slot_body_frame():
         rates = body_turn(own, n) @ [*(2.5 * ACTION[0, n, 3:5]), 0.0]
         np.testing.assert_allclose(own.setpoint.rates[0, n], rates, atol=1e-12)
         assert own.reference.command_yaw[0, n] == pytest.approx(own.goal.drone_yaw[0] + own.gains.heading[n])
-        there = plain(actions.from_slot_body)((0.3, 0.5, 0.7), 0.9, own.goal.slot_frame[0, n])
+        there = plain(action_interface.from_slot_body)((0.3, 0.5, 0.7), 0.9, own.goal.slot_frame[0, n])
         np.testing.assert_allclose(there, body_turn(own, n) @ [0.3, 0.5, 0.7], atol=1e-12)
-        back = plain(actions.to_slot_body)(there, 0.9, own.goal.slot_frame[0, n])
+        back = plain(action_interface.to_slot_body)(there, 0.9, own.goal.slot_frame[0, n])
         np.testing.assert_allclose(back, [0.3, 0.5, 0.7], atol=1e-12)
+
+
+def test_a_full_state_is_beside_the_slots_and_moves_on_by_its_own_motion():
+    """For three control steps without an action: Taylor's formula, in the slot frame, beside goals that move."""
+    own, _ = team()
+    goal, dt = own.goal, 0.004
+    rng = np.random.default_rng(1)
+    for name in ("velocity", "acceleration", "jerk"):
+        getattr(goal, name)[:] = rng.normal(size=(1, 3))
+        getattr(goal, f"slot_{name}")[:] = rng.normal(size=(1, 2, 3))
+    goal.drone_yaw_rate[:] = 0.4
+    action, scales = rng.uniform(-1, 1, (1, 2, 16)), rng.uniform(0.5, 3, 16)
+    plain(full_state.command_full_state)(0, 1, action, own.setpoint.full_state, scales)
+    for step in range(3):
+        plain(full_state.follow_full_state)(0, 1, own, dt)
+        t = step * dt
+        for n in range(2):
+            asked, turn = scales * action[0, n], slot_turn(own, n)
+            p, v, a, j, f = asked[:15].reshape(5, 3)
+            motion = (p + t * v + t**2 / 2 * a + t**3 / 6 * j, v + t * a + t**2 / 2 * j, a + t * j, j)
+            for k, name in enumerate(("position", "velocity", "acceleration", "jerk")):
+                slot = goal.slots[0, n] if k == 0 else getattr(goal, name)[0] + getattr(goal, f"slot_{name}")[0, n]
+                np.testing.assert_allclose(getattr(own.reference, name)[0, n], slot + turn @ motion[k], rtol=1e-12)
+            nominal = goal.cable_force[0, n]
+            found = own.setpoint.cable_force[0, n]
+            np.testing.assert_allclose(found, nominal + np.linalg.norm(nominal) * turn @ f, rtol=1e-12)
+            assert own.reference.yaw[0, n] == pytest.approx(goal.drone_yaw[0] + own.gains.heading[n] + asked[15])
+            assert own.reference.yaw_rate[0, n] == 0.4
 
 
 def between(action: float, low: float, middle: float, high: float) -> float:

@@ -52,6 +52,7 @@ def test_late_cameras_cost_a_centimetre():
 def test_it_flies_tilted_poses():
     result = fly("pose", {}, episodes=2, seconds=8.0)
     assert result["success_rate"].all() and (result["payload_position_error_m"] < 0.01).all()
+    assert (result["payload_attitude_error_deg"] < 0.5).all()
 
 
 def test_a_target_that_leaps_is_approached():
@@ -104,6 +105,7 @@ def test_its_flight_is_the_same_alone_and_again():
         ("recover", {}, "policy=mpc cannot fly task recover"),
         ("hover", {"env.num_drones": 1}, "two cables or more"),
         ("hover", {"payload.shape": "point"}, "two cables or more"),
+        ("hover", {"control.disturbance": "indi"}, "set control.disturbance=none"),
         ("hover", {"control.action": "reference"}, "acts by control.action=acc_rates"),
     ],
 )

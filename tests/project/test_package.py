@@ -18,6 +18,7 @@ import multilift_marl as ml
 from multilift_marl.cli.benchmark import main as benchmark
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.cli.export import main as export
+from multilift_marl.cli.plan import main as plan
 from multilift_marl.cli.train import main as train
 from multilift_marl.errors import pip_install
 from multilift_marl.evaluation import plots
@@ -63,6 +64,18 @@ def test_wheel_works_where_nothing_else_is(wheel, tmp_path):
     kernels = str(cache_folder("multilift_marl.math3d").parents[1])
     done = python(code, tmp_path, PYTHONPATH=str(tmp_path / "site"), NUMBA_CACHE_DIR=kernels)
     assert done.stdout.strip() == "(2, 4)", done.stderr
+
+
+def test_the_wheel_plans_paths(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    code = (
+        "import sys; from multilift_marl.plan import main; "
+        "sys.exit(main(['waypoints=[[0, 0, 1.5], [2, 1, 2, 0.5]]', 'out=path.csv']))"
+    )
+    kernels = str(cache_folder("multilift_marl.math3d").parents[1])
+    done = python(code, tmp_path, PYTHONPATH=str(tmp_path / "site"), NUMBA_CACHE_DIR=kernels)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "path.csv").read_text().startswith("t,x,y,z,yaw\n0,0,0,1.5,0\n")
 
 
 BASES = """
@@ -215,6 +228,7 @@ MAINS = {
     "evaluate.py": evaluate,
     "multilift_marl.export": export,
     "multilift_marl.benchmark": benchmark,
+    "multilift_marl.plan": plan,
 }
 
 

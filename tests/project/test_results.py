@@ -208,6 +208,8 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "env.communication_loss",
         "env.communication_range",
         "control.max_angular_acceleration",
+        "control.max_jerk",
+        "control.max_cable_force",
         "train.asinh",
         "train.gru",
         "train.sequence",
@@ -222,6 +224,8 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "wind.inflow",
         "task_options.file_ramp",
         "task_options.file_offset",
+        "task_options.waypoints",
+        "task_options.waypoint_times",
     }
     stored["train.residual"] = check_base_policy(stored["train.residual"])  # tuned gains had no names once
     own |= {key for key in stored if stored[key] == {} and any(name.startswith(f"{key}.") for name in later)}

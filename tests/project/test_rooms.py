@@ -20,7 +20,7 @@ LOWEST_FIRST = (
     "errors", "physical", "_platform", "_files", "_interrupt", "realtime", "_renamed", "kernels", "rng", "math3d",
     "schema", "plugins", "trust", "rig", "config", "sim", "control", "mdp", "sensing", "planning", "tasks", "rendering",
     "envs", "policies", "_ray", "evaluation", "agents", "command", "deploy", "viewer", "validation", "cli",
-    "benchmark", "export",
+    "benchmark", "export", "plan",
 )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.config.config import Config
-from multilift_marl.control.actions import Call
+from multilift_marl.control.action_interface import Call
 from multilift_marl.control.autopilot import LoadFeedforward
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.formation import Goal

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.config.config import Config
-from multilift_marl.control.actions import Call
+from multilift_marl.control.action_interface import Call
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.formation import Goal
 from multilift_marl.control.geometric import fly
