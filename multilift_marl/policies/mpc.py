@@ -69,10 +69,11 @@ class TeamMpc:
             raise ConfigError("policy=mpc reads rotor speeds, which are not measured of this team; take another policy")
         if vec.task.rig.is_point or n < 2:
             raise ConfigError("policy=mpc plans for payloads on two cables or more; take another policy for this rig")
-        if config.planner.estimate and config.control.disturbance != "none":
+        rejection = config.control.disturbance
+        if config.planner.estimate and rejection != "none":
             raise ConfigError(
-                f"policy=mpc estimates unknown forces, and control.disturbance={config.control.disturbance} would reject "
-                "them once more; set control.disturbance=none, or planner.estimate=false"
+                f"policy=mpc estimates unknown forces, which control.disturbance={rejection} would reject a second "
+                "time; set control.disturbance=none, or planner.estimate=false"
             )
         self._vec, settings = vec, config.planner
         self.planner = TeamPlanner(system, settings, vec.num_envs)
