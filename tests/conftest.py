@@ -1,8 +1,9 @@
 """What the tests share.
 
 A test that takes `task` runs for every task, one that takes `num_drones` for every N, and one that takes `cables`, the
-configuration of a cable model, for both models. For tasks other than `hover`, all but two drones on massless cables are
-marked `slow`; tests so marked are left out unless asked for by `-m slow`.
+configuration of a cable model, for both models. Of these, tasks that are not in `COMMON`, and for tasks other than
+`hover` all but two drones on massless cables, are marked `slow`; with the mark `few_tasks`, all but `hover`. Tests so
+marked are left out unless asked for by `-m slow`; each task has default tests of its own in `tests/tasks`.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ for _number, _handler in (
         signal.signal(_number, _handler)
 
 TASKS = ml.list_tasks()
+COMMON = ("hover", "track", "pose", "loss")  # a goal that rests, moves, is planned; a team that changes
 NUM_DRONES = (1, 2, 6)
 CABLES = {"massless": {"cable.model": "massless"}, "chain": {"cable.model": "chain", "cable.segments": 3}}  # few: fast
 GRAVITY = 9.81
@@ -88,7 +90,13 @@ def pytest_generate_tests(metafunc):
 def pytest_collection_modifyitems(items):
     for item in items:
         asked = item.callspec.params if hasattr(item, "callspec") else {}
-        if asked.get("task", "hover") == "hover" or not {"num_drones", "cables"} & asked.keys():
+        task = asked.get("task", "hover")
+        if task == "hover":
+            continue
+        own = {name for mark in item.iter_markers("parametrize") for name in _names(mark.args[0])}
+        if "task" not in own and (task not in COMMON or item.get_closest_marker("few_tasks")):
+            item.add_marker(pytest.mark.slow)
+        if not {"num_drones", "cables"} & asked.keys():
             continue
         if asked.get("num_drones", 2) != 2 or asked.get("cables", CABLES["massless"]) != CABLES["massless"]:
             item.add_marker(pytest.mark.slow)

@@ -48,6 +48,7 @@ def test_killed_while_saving_it_can_always_be_resumed(tmp_path):
     assert np.isfinite(resumed.step()["loss_critic"])
 
 
+@pytest.mark.slow
 def test_configuration_of_a_checkpoint_is_complete(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.save("last")

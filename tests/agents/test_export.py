@@ -54,7 +54,14 @@ def policy(task="hover", **overrides):
 
 @pytest.mark.parametrize(
     ("kind", "history", "asinh"),
-    [("local", 1, 0), ("local", 3, 0), ("local", 1, 20), ("set", 3, 20), ("set", 1, 0), ("attention", 1, 0)],
+    [
+        ("local", 1, 0),
+        ("set", 3, 20),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in (("local", 3, 0), ("local", 1, 20), ("set", 1, 0), ("attention", 1, 0))
+        ),
+    ],
 )
 def test_the_network_acts_as_the_policy_for_any_teams(tmp_path, kind, history, asinh):
     learned = policy(**{"train.actor": kind, "env.history": history, "train.asinh": asinh})
@@ -97,6 +104,7 @@ def test_files_say_nothing_of_the_machine_they_were_made_on(tmp_path):
             assert word.encode() not in path.read_bytes(), path.name
 
 
+@pytest.mark.few_tasks
 def test_the_contract_names_what_the_environment_tells(task):
     learned, vec = policy(task, **{"env.history": 2}), make(task, num_envs=1, **{"env.history": 2})
     contract = make_contract(learned)
@@ -177,7 +185,7 @@ def test_the_contract_says_what_a_one_stands_for():
     })  # fmt: skip
 
 
-@pytest.mark.parametrize("units", ["si", "cable"])
+@pytest.mark.parametrize("units", ["si", pytest.param("cable", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("interface", "name"), READ)
 def test_full_actions_are_what_the_contract_says(interface, name, units):
     other = {

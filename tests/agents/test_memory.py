@@ -126,7 +126,7 @@ def test_a_reset_empties_the_memory_of_its_environments(tmp_path):
     np.testing.assert_allclose(one.act(observation[0]), first[0], atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["local", "attention"])
+@pytest.mark.parametrize("kind", ["local", pytest.param("attention", marks=pytest.mark.slow)])
 def test_the_exported_policy_remembers_as_the_policy_does(tmp_path, kind):
     policy = make_policy(tmp_path, **{"train.actor": kind})
     contract = export_policy(policy, tmp_path / "export")
@@ -149,6 +149,7 @@ def test_the_exported_policy_remembers_as_the_policy_does(tmp_path, kind):
     assert [each.shape for each in session.get_outputs()] == [["batch", "drones", 4], ["batch", "drones", 12]]
 
 
+@pytest.mark.slow
 def test_a_batch_shorter_than_a_sequence_is_one(tmp_path):
     steps = []
     for sequence in (100, 10, 5):

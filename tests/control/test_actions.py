@@ -275,9 +275,8 @@ def test_an_unknown_interface_is_refused():
     assert "control.action" in refusal(ml.make_vec, "hover", num_envs=1, **{"control.action": "motors"})
 
 
-@pytest.mark.parametrize(
-    "action", ["acc_rates", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ctbr", "ctbm"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("action", ["acc_rates", "ctbr", "ctbm"])
 def test_a_team_trains_with_the_interface(tmp_path, action):
     trainer = make_trainer(tmp_path, **{"control.action": action, "train.frames": 256})
     before = trainer.learner.actor.team.net[0].weight.detach().clone()

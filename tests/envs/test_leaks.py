@@ -6,11 +6,13 @@ import gc
 import tracemalloc
 
 import numpy as np
+import pytest
 from conftest import make
 
 EPISODES = 4 * 60
 
 
+@pytest.mark.few_tasks
 def test_episodes_keep_no_memory(task):
     vec = make(task, num_envs=4, num_threads=1)
     every = np.ones(4, bool)

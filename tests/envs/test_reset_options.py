@@ -60,6 +60,7 @@ def test_the_physics_has_the_fixed_values():
     assert (vec.world.hidden_loads.wind == [1.0, 0.0, 0.0]).all()
 
 
+@pytest.mark.few_tasks
 def test_an_episode_with_its_own_draw_fixed_is_the_same_episode(task, cables):
     first, second = make(task, **ALL, **cables), make(task, **ALL, **cables)
     observation, info = first.reset(seed=3)

@@ -289,6 +289,7 @@ def test_command_films_from_the_camera_asked_for(run, tmp_path, monkeypatch):
     assert asked == [{"camera": "side", "trail": 2.0}, {"camera": "chase", "trail": 0.5}]
 
 
+@pytest.mark.slow
 def test_without_graphics_evaluation_goes_on(run, tmp_path, monkeypatch, capsys):
     from multilift_marl import rendering
     from multilift_marl.errors import RenderingError

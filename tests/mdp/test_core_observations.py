@@ -44,6 +44,7 @@ def test_no_number_of_an_observation_is_constant(ensemble):
     assert [name for name, width in zip(vec.observation_names, spread, strict=True) if width < 1e-3] == []
 
 
+@pytest.mark.slow
 def test_no_number_of_an_observation_repeats_another(ensemble):
     observation, _, vec = ensemble
     correlation = np.abs(np.corrcoef(observation.T)) - np.eye(vec.observation_size)
@@ -51,6 +52,7 @@ def test_no_number_of_an_observation_repeats_another(ensemble):
     assert twins == []
 
 
+@pytest.mark.few_tasks
 def test_the_state_tells_what_is_hidden_from_the_drones(task, cables):
     vec = make(task, num_envs=64, **{"randomization.payload_mass": 0.2, "randomization.payload_force": 1.5}, **cables)
     observation, _ = vec.reset(seed=0)

@@ -178,7 +178,11 @@ def equal(some, others, rows=slice(None)):
     )
 
 
-@pytest.mark.parametrize("values", [{}, DISTURBED, {"env.units": "cable"}], ids=["ideal", "disturbed", "cable"])
+@pytest.mark.parametrize(
+    "values",
+    [{}, *(pytest.param(each, marks=pytest.mark.slow) for each in (DISTURBED, {"env.units": "cable"}))],
+    ids=["ideal", "disturbed", "cable"],
+)
 def test_functions_and_kernels_are_the_same_task(registries, values):
     numpy_task()
     kernels = (is_late_kernel, near_kernel, to_target_kernel, seconds_kernel, payload_velocity_kernel)

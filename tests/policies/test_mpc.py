@@ -21,7 +21,9 @@ def fly(config, overrides, episodes=2, seconds=6.0):
     return run_episodes(loaded, lambda vec: make_scripted("mpc", vec), episodes, 77)
 
 
-@pytest.mark.parametrize("overrides", [{}, {"env.num_drones": 3}, {"env.num_drones": 6}])
+@pytest.mark.parametrize(
+    "overrides", [{}, *(pytest.param({"env.num_drones": n}, marks=pytest.mark.slow) for n in (3, 6))]
+)
 def test_it_keeps_to_a_figure_eight_within_millimetres(overrides):
     result = fly("track", FAST | overrides)
     assert (result["payload_rmse_m"] < 0.0025).all()
@@ -35,6 +37,7 @@ def test_chains_and_a_hidden_mass_cost_little():
     assert (fly("track", FAST | late)["payload_rmse_m"] < 0.006).all()
 
 
+@pytest.mark.slow
 def test_it_holds_what_it_does_not_know():
     """Hidden mass ± 20 % and a force up to 1.5 N, from starts up to half a metre away."""
     result = fly("hover", {}, episodes=4, seconds=8.0)
@@ -99,10 +102,10 @@ def test_its_flight_is_the_same_alone_and_again():
 @pytest.mark.parametrize(
     ("config", "overrides", "said"),
     [
-        ("takeoff", {}, "policy=mpc cannot fly task takeoff"),
+        pytest.param("takeoff", {}, "policy=mpc cannot fly task takeoff", marks=pytest.mark.slow),
         ("gate", {}, "policy=mpc cannot fly task gate"),
-        ("loss", {}, "policy=mpc cannot fly task loss"),
-        ("recover", {}, "policy=mpc cannot fly task recover"),
+        pytest.param("loss", {}, "policy=mpc cannot fly task loss", marks=pytest.mark.slow),
+        pytest.param("recover", {}, "policy=mpc cannot fly task recover", marks=pytest.mark.slow),
         ("hover", {"env.num_drones": 1}, "two cables or more"),
         ("hover", {"payload.shape": "point"}, "two cables or more"),
         ("hover", {"control.disturbance": "indi"}, "set control.disturbance=none"),

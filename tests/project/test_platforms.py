@@ -60,9 +60,8 @@ print("works", len(globals().get("locked", ())))
 """
 
 
-@pytest.mark.parametrize(
-    "fake", ["win32", *(pytest.param(name, marks=pytest.mark.slow) for name in FAKES if name != "win32")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("fake", FAKES)
 def test_package_works_on(fake, tmp_path):
     code = USE.format(fake=FAKES[fake], platform=fake.split()[0])
     done = subprocess.run(

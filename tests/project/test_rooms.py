@@ -89,7 +89,9 @@ def test_a_module_within_a_renamed_folder_is_found_and_one_that_never_was_is_not
         importlib.import_module("multilift_marl.px4.nothing")
 
 
-@pytest.mark.parametrize("command", ["px4", "ros", "view", "viewer"])
+@pytest.mark.parametrize(
+    "command", ["view", *(pytest.param(name, marks=pytest.mark.slow) for name in ("px4", "ros", "viewer"))]
+)
 def test_commands_have_short_names(command):
     done = subprocess.run([sys.executable, "-m", f"multilift_marl.{command}", "--help"], capture_output=True, text=True)
     assert done.returncode == 0 and f"python -m multilift_marl.{command.removesuffix('er')}" in done.stdout

@@ -99,7 +99,7 @@ def angle(matrix):
     return np.arccos(np.clip((np.trace(matrix, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
 
 
-@pytest.mark.parametrize("known", [pytest.param(4, marks=pytest.mark.slow), 3, 2, 1])
+@pytest.mark.parametrize("known", [*(pytest.param(each, marks=pytest.mark.slow) for each in (4, 3, 2)), 1])
 def test_the_fit_is_the_least_squares_that_it_claims(known):
     """No pose nearby fits better to anchors of 2 cm and an attitude of 0.1 rad about the planned one."""
     vec = make(num_envs=1, **{"env.sensing": "onboard", "env.communication": "all"})
@@ -170,7 +170,7 @@ def test_drones_have_talked_before_an_episode():
     [{"delay": 25}, {"delay": 10}, {"loss": 0.9}, {"loss": 1.0}, {"delay": 5, "loss": 0.7}, {"range": 0.0}],
     ids=lambda links: "-".join(f"{key}{value:g}" for key, value in links.items()),
 )
-@pytest.mark.parametrize("kind", ["neighbours", "all"])
+@pytest.mark.parametrize("kind", [pytest.param("neighbours", marks=pytest.mark.slow), "all"])
 def test_late_and_lost_messages_do_no_harm(kind, links):
     """Up to the worst that is allowed: no estimate leaves the payload, and the team holds it."""
     settings = {f"env.communication_{key}": value for key, value in links.items()}
