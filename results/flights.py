@@ -149,9 +149,12 @@ FLIGHTS: dict[str, Flight] = {
 SCRIPTED = {"control.action": "reference"}
 """Actions of the baselines, whatever those of the learned policies that they are compared with."""
 MPC = {
-    "control.action": "acc_rates",
+    "control.action": "full_state",
+    "control.max_offset": 2.0,
+    "control.max_velocity": 5.0,
     "control.max_acceleration": 25.0,
-    "control.max_tilt_rate": 15.0,
+    "control.max_jerk": 300.0,
+    "control.max_cable_force": 5.0,
     "control.disturbance": "none",
 }
 """Actions of the central planner, which knows all states and the path ahead."""

@@ -37,7 +37,9 @@ class ForceEstimate(NamedTuple):
     before: np.ndarray
     """(E, 12 + 7 N) the last states."""
     fresh: np.ndarray
-    """(E,) bool, teams without a last state."""
+    """(E,) bool, teams of which nothing is known."""
+    stale: np.ndarray
+    """(E,) bool, teams whose last state is older than a step, or missing."""
 
 
 class Priors(NamedTuple):
@@ -94,7 +96,7 @@ class ForceEstimator:
             np.zeros(count),
         )  # fmt: skip
         self.estimate = ForceEstimate(
-            np.zeros((e, count)), np.zeros((e, count, count)), np.zeros((e, size)), np.ones(e, bool)
+            np.zeros((e, count)), np.zeros((e, count, count)), np.zeros((e, size)), np.ones(e, bool), np.ones(e, bool)
         )
 
     @property
@@ -107,9 +109,12 @@ class ForceEstimator:
         """(E, 3 N) on the drones, world frame [N], live."""
         return self.estimate.unknowns[:, PAYLOAD:]
 
-    def update(self, states: np.ndarray, dt: float) -> None:
-        """Estimate by states (E, 12 + 7 N), measured `dt` [s] after the last, whose thrust vectors hold `forces`."""
-        update_forces(states, dt, self._model, self.priors, self.estimate, self._work)
+    def update(self, states: np.ndarray, dt: float, known: np.ndarray) -> None:
+        """Estimate by states (E, 12 + 7 N), measured `dt` [s] after the last, whose thrust vectors hold `forces`.
+
+        Estimates of teams whose states are not `known` (E,) stay as they are.
+        """
+        update_forces(states, dt, known, self._model, self.priors, self.estimate, self._work)
 
 
 class EstimatorWork(NamedTuple):
@@ -125,21 +130,22 @@ class EstimatorWork(NamedTuple):
 
 
 @kernel
-def update_forces(states, dt, model, priors, estimate, work):
+def update_forces(states, dt, known, model, priors, estimate, work):
     """See `ForceEstimator.update`."""
     for e in range(states.shape[0]):
         x, before, p = states[e], estimate.before[e], estimate.covariance[e]
         if estimate.fresh[e]:
-            estimate.fresh[e] = False
+            estimate.fresh[e], estimate.stale[e] = False, True
             estimate.unknowns[e] = 0.0
             p[:] = 0.0
             for i in range(p.shape[0]):
                 p[i, i] = priors.first[i]
-        else:
+        if not estimate.stale[e] and known[e]:
             _find_effects(x, before, dt, estimate.unknowns[e], model, priors, work)
             for i in range(p.shape[0]):
                 p[i, i] += dt * priors.drift[i]
             _correct(estimate.unknowns[e], p, priors, work)
+        estimate.stale[e] = not known[e]
         for i in range(x.shape[0]):
             before[i] = x[i]
 

@@ -135,7 +135,7 @@ class TeamMpc:
             states[unknown] = self._last.states(self._dt)[unknown]
             payload_rotation[unknown], drag[unknown] = np.eye(3), 0.0
         loads, forces = self._unknown(self._fresh)
-        states[:, -3 * shape[1] :] += forces
+        states[:, -3 * shape[1] :] += np.where(unknown[:, None], 0.0, forces)  # planned ones hold them
         if self._observer is not None:
             self._observer.fresh[self._fresh] = True
             states = self._observer.update(states, self._dt, loads).copy()
@@ -155,7 +155,7 @@ class TeamMpc:
         self._sent[:, self._fresh] = states[self._fresh, -3 * shape[1] :]
         self._fresh &= unknown
         if self._estimator is not None:
-            self._estimator.update(states, self._dt)
+            self._estimator.update(states, self._dt, ~unknown)
         present = states.copy()
         planner.predict(states, self._sent, self._dt, loads)
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
@@ -173,6 +173,7 @@ class TeamMpc:
         lost = self._last.without > self._patience
         if lost.any():
             action[lost] = self._without_plan.act(observation)[lost]
+            self._fresh |= lost  # its next plan begins where the team is then
         return action
 
     def _unknown(self, fresh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -211,7 +211,7 @@ def estimate(system, load, forces, seconds=6.0):
     for k in range(round(seconds / dt)):
         shaken = held + 1.5 * np.sin(0.2 * k + np.arange(NU))
         x[2 * Q :] = shaken + estimator.forces[0]
-        estimator.update(x[None].copy(), dt)
+        estimator.update(x[None].copy(), dt, np.ones(1, bool))
         x[2 * Q :] = shaken + forces
         for _ in range(10):
             step_state(x, np.zeros(NU), dt / 10, model, load, scratch, after)

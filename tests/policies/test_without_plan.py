@@ -58,6 +58,16 @@ def test_for_a_while_it_flies_by_the_last_plan(spoil):
     assert (result["failure_cause"] == 0).all()
 
 
+@pytest.mark.slow
+def test_so_it_does_by_full_states():
+    wide = {"max_offset": 2.0, "max_velocity": 5.0, "max_acceleration": 25.0, "max_jerk": 300.0, "max_cable_force": 5.0}
+    settings = FAST | {f"control.{key}": value for key, value in wide.items()} | {"control.action": "full_state"}
+    for last in (4.3, 5.5):  # by the last plan; then by the baseline
+        result = fly("track", failing(4.0, last, "states"), **settings)
+        assert (result["failure_cause"] == 0).all()
+        assert result["planner_failed"] == pytest.approx((last - 4.0) / 6.0, abs=0.01)
+
+
 def test_after_that_a_linear_baseline_flies():
     result = fly("hover", failing(2.0, 4.0, "plans"), seconds=8.0)
     assert result["planner_failed"] == pytest.approx(2 / 8, abs=0.01)
