@@ -14,6 +14,7 @@ from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.approach import Approach, begin_approaches, write_approaches
+from multilift_marl.planning.hard_planner import HardPlanner
 from multilift_marl.planning.load_estimator import LoadEstimator
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
@@ -58,7 +59,7 @@ class TeamMpc:
         if vec.task.rig.is_point or n < 2:
             raise ConfigError("policy=mpc plans for payloads on two cables or more; take another policy for this rig")
         self._vec, settings = vec, config.planner
-        self.planner = TeamPlanner(system, settings, vec.num_envs)
+        self.planner = (HardPlanner if settings.limits == "hard" else TeamPlanner)(system, settings, vec.num_envs)
         self._dt = vec.task.dt
         noise = settings.estimate_noise or (0.2 if config.env.sensing == "ideal" else 1.0)
         self._estimator = LoadEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None
