@@ -26,6 +26,8 @@ class CurvatureWork(NamedTuple):
     """(12 + 7 N, 12 + 7 N) by the state at the start of a step; the input adds half of a step to its thrust vectors."""
     local: np.ndarray
     cross: np.ndarray
+    """(6, 5) by the payload's accelerations, and by attitude and c: no other number counts with them."""
+    pull_slope: np.ndarray
     by_acceleration: np.ndarray
     euler: np.ndarray
     turned: np.ndarray
@@ -36,7 +38,7 @@ class CurvatureWork(NamedTuple):
     def of(cls, n: int) -> CurvatureWork:
         """Return arrays for N drones."""
         size, q = state_size(n), 6 + 2 * n
-        shapes = (size, size), (LOCAL, LOCAL), (6, LOCAL), (6, size), (15,), (3, 3), (6, 1), (q,)
+        shapes = (size, size), (LOCAL, LOCAL), (6, 5), (LOCAL,), (6, q), (15,), (3, 3), (6, 1), (q,)
         return cls(*(np.zeros(shape) for shape in shapes))
 
 
@@ -68,16 +70,18 @@ def set_curvature(k, x, costate, pull, problem, w, c):
         for i in range(LOCAL):
             for j in range(LOCAL):
                 hessian[m.column[n, i], m.column[n, j]] += c.local[i, j]
-            for j in range(6):
-                c.by_acceleration[j, m.column[n, i]] += c.cross[j, i]
+        for j in range(6):
+            for i in range(3):
+                c.by_acceleration[j, 3 + i] += c.cross[j, i]
+            for i in range(2):
+                c.by_acceleration[j, 6 + 2 * n + i] += c.cross[j, 3 + i]
     for i in range(3, size):
-        for b in range(6):
-            slope, mixed = m.slope[b, i], c.by_acceleration[b, i]
-            for j in range(3, i + 1):
-                hessian[i, j] += slope * c.by_acceleration[b, j] + mixed * m.slope[b, j]
-    for i in range(3, size):
-        for j in range(3, i):
-            hessian[j, i] = hessian[i, j]
+        for j in range(3, q):
+            part = 0.0
+            for b in range(6):
+                part += m.slope[b, i] * c.by_acceleration[b, j]
+            hessian[i, j] += part
+            hessian[j, i] += part
 
     # by the state at its start, whose attitude turns at rates that depend on it, in the middle and at the end
     rates, a = (x[q + 3], x[q + 4], x[q + 5]), m.acceleration
@@ -198,7 +202,8 @@ def _curve_drone(n, q, pull, model, m, c):
     for i in range(LOCAL):
         for j in range(LOCAL):
             c.local[i, j] /= length
-        for j in range(6):
+    for j in range(6):
+        for i in range(5):
             c.cross[j, i] /= length
 
 
@@ -254,40 +259,30 @@ def _add_swing(n, s, lever, turned, model, m, c):
             local[6 + i, k] += part
             local[k, 6 + i] += part
         for j in range(6):
-            c.cross[j, 6 + i] -= s * m.by_arm[n, 6 + i, j]
+            c.cross[j, 3 + i] -= s * m.by_arm[n, 6 + i, j]
 
 
 @kernel
 def _add_product(n, lever, turned, model, m, c):
     """Add the product of the slopes of s, by attitude and c alone, and of B."""
-    mass, length, d = model.drone_mass[n], model.length[n], row(m.direction, n)
+    mass, length, d, swing = model.drone_mass[n], model.length[n], row(m.direction, n), m.swing[n]
+    p, square = d[0] * swing[0] + d[1] * swing[1], d[2] * d[2]
+    for j in range(LOCAL):
+        c.pull_slope[j] = dot(d, row(m.by_across[n], j))
+    for i in range(2):
+        bent = p * m.direction[n, i] / square
+        c.pull_slope[6 + i] += dot(row(m.by_c[n], i), row(m.across, n))
+        c.pull_slope[6 + i] += 2.0 * length * p * (swing[i] + bent) / square
+        c.pull_slope[8 + i] += 2.0 * length * (swing[i] + bent)
     for k in range(5):
-        if k < 3:
-            at, slope = k, mass * length * _between(d, m.turning[k], turned)
-        else:
-            at, slope = 3 + k, dot(row(m.by_c[n], k - 3), lever)
+        at = k if k < 3 else 3 + k
+        slope = mass * length * _between(d, m.turning[k], turned) if k < 3 else dot(row(m.by_c[n], k - 3), lever)
         for j in range(LOCAL):
-            part = slope * _slope_of_pull(j, n, length, m)
+            part = slope * c.pull_slope[j]
             c.local[at, j] += part
             c.local[j, at] += part
         for j in range(6):
-            c.cross[j, at] -= m.arm[n, j] * slope
-
-
-@kernel
-def _slope_of_pull(j, n, length, m):
-    """Return the derivative of B by number j of drone n."""
-    d, swing = m.direction[n], m.swing[n]
-    slope = dot(row(m.direction, n), row(m.by_across[n], j))
-    if 6 <= j and j < 10:
-        i = (j - 6) % 2
-        p, square = d[0] * swing[0] + d[1] * swing[1], d[2] * d[2]
-        if j < 8:
-            slope += dot(row(m.by_c[n], i), row(m.across, n))
-            slope += 2.0 * length * p * (swing[i] + p * d[i] / square) / square
-        else:
-            slope += 2.0 * length * (swing[i] + p * d[i] / square)
-    return slope
+            c.cross[j, k] -= m.arm[n, j] * slope
 
 
 @kernel
