@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.kernels.jit import kernel
+from multilift_marl.mdp.failures import make_limits as failure_limits
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.augmented_lagrangian import NOT_FINITE, Report, solve_team
 from multilift_marl.planning.hard_limits import Limits, limit_names
@@ -26,6 +27,7 @@ from multilift_marl.schema.planner import PlannerConfig
 
 TOLERANCE = 1e-6  # largest KKT residual of a plan that has converged
 MOST_ITERATIONS = 40
+CABLE_TOLERANCE = 0.05  # [m] of their distance
 
 
 class HardPlans(NamedTuple):
@@ -57,7 +59,8 @@ def make_limits(settings: PlannerConfig, system: System, model: TeamModel, objec
         least=settings.least_thrust * rest,
         upright=float(np.cos(np.radians(settings.largest_tilt))),
         separation=objective.separation,
-        tolerance=objective.weights**-0.5,
+        cables=settings.cables * failure_limits(system).cables,
+        tolerance=np.append(objective.weights**-0.5, CABLE_TOLERANCE),
     )
 
 

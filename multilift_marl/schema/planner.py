@@ -49,6 +49,9 @@ class PlannerConfig(Section):
     separation: Annotated[Float, Between(0, 10)] = Field(
         1.1, description="[-] least distance of drones, over that which counts as a collision"
     )
+    cables: Annotated[Float, Between(0, 10)] = Field(
+        1.1, description="[-] least distance of cables, over that which counts as crossing, with hard limits"
+    )
     estimate: bool = Field(
         True, description="whether mass beside the nominal one, force and moment on the payload are estimated"
     )

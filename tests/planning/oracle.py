@@ -116,7 +116,7 @@ class Oracle:
         """Return the limits of a state in their tolerances."""
         n = len(model.anchors)
         q, turn = 6 + 2 * n, self._turn(x[3:6])
-        places, values = [], []
+        feet, places, values = [], [], []
         for i in range(n):
             c, f = x[6 + 2 * i : 8 + 2 * i], x[2 * q + 3 * i : 2 * q + 3 * i + 3]
             thrust = ca.norm_2(f)
@@ -124,8 +124,20 @@ class Oracle:
             values += [(limits.largest[i] - thrust) / unit, (thrust - limits.least[i]) / unit]
             values.append((f[2] - limits.upright * thrust) / unit)
             d = ca.vertcat(c, ca.sqrt(ca.fmax(1 - ca.sumsqr(c), 0.01)))
-            places.append(turn @ model.anchors[i] + model.length[i] * d)
+            feet.append(turn @ model.anchors[i])
+            places.append(feet[i] + model.length[i] * d)
             for o in range(i):
                 away = ca.norm_2(places[i] - places[o])
                 values.append((away - limits.separation[i, o]) / limits.tolerance[2])
+                apart = self._apart(feet[i], places[i] - feet[i], feet[o], places[o] - feet[o])
+                values.append((apart - limits.cables[i, o]) / limits.tolerance[3])
         return ca.vertcat(*values)
+
+    @staticmethod
+    def _apart(p: Any, a: Any, r: Any, b: Any) -> Any:
+        """Return the distance of two segments that are not parallel, from p along a and from r along b."""
+        aa, bb, ab, pa, pb = ca.dot(a, a), ca.dot(b, b), ca.dot(a, b), ca.dot(p - r, a), ca.dot(p - r, b)
+        s = ca.fmin(ca.fmax((ab * pb - pa * bb) / (aa * bb - ab**2 + 1e-12), 0), 1)
+        t = ca.fmin(ca.fmax((ab * s + pb) / bb, 0), 1)
+        s = ca.fmin(ca.fmax((ab * t - pa) / aa, 0), 1)
+        return ca.norm_2(p + s * a - r - t * b)

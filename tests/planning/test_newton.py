@@ -69,7 +69,8 @@ def test_a_step_is_newtons_on_the_cost_with_limits_of_every_kind(expert, exact):
         np.full(N, 1.3 * tension),
         0.98,
         np.full((N, N), 2.0),
-        np.ones(3),
+        np.full((N, N), 1.0),
+        np.ones(4),
     )
     count = len(limit_names(N))
     w, m, rho = NewtonWork.of(STEPS, N, count), Multipliers.of(STEPS, count), 0.3
