@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from multilift_marl.physical import GRAVITY
-from multilift_marl.planning.expert import TeamExpert
+from multilift_marl.planning.expert import Solution, TeamExpert
 
 
 class Oracle:
@@ -51,24 +51,29 @@ class Oracle:
         self._bounds = {"lbg": np.concatenate(lowest), "ubg": np.concatenate(bounds)}
         self._first = np.concatenate(first)
         problem = {"x": ca.vertcat(*unknowns), "f": cost, "g": ca.vertcat(*constraints), "p": start}
-        options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 500}}
-        self._solver = ca.nlpsol("oracle", "ipopt", problem, options)
-        self._shape = steps, 3 * n, q + n, size
+        cold = {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 500}
+        warm = cold | {"mu_init": 1e-7, "bound_push": 1e-8, "bound_frac": 1e-8}
+        self._cold, self._warm = (
+            ca.nlpsol("oracle", "ipopt", problem, {"print_time": False, "ipopt": options}) for options in (cold, warm)
+        )
+        self._expert, self._shape, self._step_length = expert, (steps, 3 * n, q + n, size), h
 
-    def solve(
-        self, start: np.ndarray, states: np.ndarray | None = None, inputs: np.ndarray | None = None
-    ) -> tuple[float, np.ndarray, bool]:
-        """Return cost and inputs (K, 3 N) of the plan from a state, and whether IPOPT converged.
+    def solve(self, start: np.ndarray) -> tuple[float, bool]:
+        """Return the cost of the plan from a state, and whether IPOPT converged; it begins at the target."""
+        found = self._cold(x0=self._first, p=start, **self._bounds)
+        return float(found["f"]), bool(self._cold.stats()["success"])
 
-        It begins at the target, or at states (K + 1, 12 + 7 N) and inputs (K, 3 N).
-        """
-        steps, nu, laws, size = self._shape
+    def stay(self, plans: Solution, e: int) -> tuple[float, bool]:
+        """Do as `solve` from the start of plan e, beginning with this plan."""
+        steps, nu, _, size = self._shape
+        states, n, limits = plans.states[e], nu // 3, self._expert.limits
+        speeds = states[:, 6 + 2 * n : 12 + 4 * n]
         first = self._first.reshape(steps, -1).copy()
-        if states is not None and inputs is not None:
-            first[:, :nu], first[:, -size:] = inputs, states[1:]
-        found = self._solver(x0=first.ravel(), p=start, **self._bounds)
-        unknowns = np.asarray(found["x"]).reshape(steps, nu + laws + size)
-        return float(found["f"]), unknowns[:, :nu], bool(self._solver.stats()["success"])
+        first[:, :nu], first[:, -size:] = plans.inputs[e], states[1:]
+        first[:, nu : nu + 6 + 2 * n] = np.diff(speeds, axis=0) / self._step_length
+        first[:, nu + 6 + 2 * n : -size] = limits.tension + limits.tolerance[0] * plans.margins[e, :, :n]
+        found = self._warm(x0=first.ravel(), p=states[0], **self._bounds)
+        return float(found["f"]), bool(self._warm.stats()["success"])
 
     @staticmethod
     def _turn(e: Any) -> Any:
