@@ -10,6 +10,7 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.planning.augmented_lagrangian import STATUS
 from multilift_marl.planning.expert import COSTS, TeamExpert
 from multilift_marl.planning.goals import pose_goal
+from multilift_marl.planning.hard_planner import HardPlanner
 from multilift_marl.planning.team_model import ModelWork, step_state
 from multilift_marl.policies.baselines import make_scripted
 
@@ -77,6 +78,16 @@ def test_warm_starts_take_fewer_iterations_to_the_same_plan(expert, plans):
     assert warm.converged.all() and warm.iterations.sum() < 0.7 * cold.iterations.sum()
     same = np.isclose(warm.costs.sum(axis=1), cold.costs.sum(axis=1), rtol=1e-6)
     assert same.mean() > 0.9  # a team may have another local minimum
+
+
+def test_the_planner_of_flights_finds_the_experts_plans(expert, plans):
+    config = ml.load_config("hover", {"env.num_drones": N})
+    planner = HardPlanner(config.system, config.planner, 12)
+    goal, offsets = pose_goal(expert.times, HOME), np.zeros((12, len(expert.times), 12))
+    motion = (np.repeat(part, 12, axis=0) for part in goal)
+    found = planner.plan(plans.states[:, 0].copy(), *motion, 0.02, offsets)
+    assert np.array_equal(found.inputs, plans.inputs) and not found.failed.any()
+    assert np.array_equal(planner.hard.report.iterations, plans.iterations)
 
 
 def test_what_is_infeasible_ends_with_that_status_and_finite_plans():
