@@ -60,6 +60,7 @@ def solve_team(e, start, states, inputs, problem, limits, m, settings, w, report
     """
     tolerance, iterations = settings
     residual = report.residual[e]
+    residual[0], residual[1], residual[2] = np.inf, np.inf, np.inf
     cost = _begin(start, states, inputs, problem, limits, w)
     _take_trial(states, inputs, m, w)
     rho, damped, excess = PENALTY, 0.0, np.inf

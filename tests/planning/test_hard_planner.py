@@ -90,6 +90,19 @@ def test_the_planner_of_flights_finds_the_experts_plans(expert, plans):
     assert np.array_equal(planner.hard.report.iterations, plans.iterations)
 
 
+def test_a_plan_that_is_not_finite_says_so_and_begins_anew(plans):
+    config = ml.load_config("hover", {"env.num_drones": N})
+    planner, states = HardPlanner(config.system, config.planner, 2), plans.states[:2, 0].copy()
+    goal = pose_goal(planner.times, np.tile(HOME, (2, 1)))
+    states[1, 0] = np.nan
+    broken = planner.plan(states, *goal, 0.02, np.zeros((2, len(planner.times), 12)))
+    assert broken.failed.tolist() == [False, True] and np.isfinite(broken.inputs).all()
+    assert STATUS[planner.hard.report.status[1]] == "not finite" and np.isinf(planner.hard.report.residual[1]).all()
+    states[1] = plans.states[1, 0]
+    again = planner.plan(states, *goal, 0.02, np.zeros((2, len(planner.times), 12)))
+    assert not again.failed.any() and (planner.hard.report.status == 0).all()
+
+
 def test_what_is_infeasible_ends_with_that_status_and_finite_plans():
     far = {"planner.separation": 10.0, "planner.iterations": 60}  # farther apart than cables reach
     expert = TeamExpert(ml.load_config("hover", {"env.num_drones": N} | far))
