@@ -18,7 +18,7 @@ from multilift_marl.planning.riccati import find_gains
 
 STATUS = ("converged", "infeasible", "stopped", "stalled", "not finite")
 CONVERGED, INFEASIBLE, STOPPED, STALLED, NOT_FINITE = range(len(STATUS))
-EXCEEDED = 1e-3  # tolerances beyond a limit, from which a plan that did not converge is called infeasible
+EXCEEDED = 1e-3  # tolerances beyond a limit, from which a plan that has not converged counts as infeasible
 PENALTY, LARGEST_PENALTY = 0.25, 8.0  # ρ, for limits and costs in tolerances
 NEAR = 0.2  # by which a whole step was to lower the cost at most, for multipliers to be updated
 EARLY = 5  # iterations at first, in which a cost that is not convex is taken without its second derivatives at once
@@ -61,7 +61,7 @@ def solve_team(e, start, states, inputs, problem, limits, m, settings, w, report
     tolerance, iterations = settings
     residual = report.residual[e]
     residual[0], residual[1], residual[2] = np.inf, np.inf, np.inf
-    cost = _begin(start, states, inputs, problem, limits, w)
+    cost = _begin(start, states, inputs, problem, limits, m, w)
     _take_trial(states, inputs, m, w)
     rho, damped, excess = PENALTY, 0.0, np.inf
     report.status[e] = STOPPED if np.isfinite(cost) else NOT_FINITE
@@ -99,18 +99,28 @@ def solve_team(e, start, states, inputs, problem, limits, m, settings, w, report
 
 
 @kernel
-def _begin(start, states, inputs, problem, limits, w):
+def _begin(start, states, inputs, problem, limits, m, w):
     """Write a trajectory that follows the model to the trial, and return its cost.
 
-    It is led by an iteration of `riccati.py` about the guess; if that is not finite, thrusts stay as they are.
+    It is led by an iteration of `riccati.py` about the guess, or has the thrusts stay as they are, whichever is better.
     """
+    cost = _hold(start, states, inputs, problem, limits, w)
+    held = cost + penalty(w.values, m.dual, PENALTY)
     find_gains(states, inputs, problem, 0.0, w.iteration)
     cost = follow(start, states, inputs, 1.0, problem, limits, w)
-    if not np.isfinite(cost):
-        w.iteration.gain[:] = 0.0
-        inputs[:] = 0.0
-        cost = follow(start, states, inputs, 0.0, problem, limits, w)
+    if not cost + penalty(w.values, m.dual, PENALTY) < held:  # or not finite
+        cost = _hold(start, states, inputs, problem, limits, w)
     return cost
+
+
+@kernel
+def _hold(start, states, inputs, problem, limits, w):
+    """Write the trajectory of steady thrusts to the trial, and return its cost."""
+    w.iteration.gain[:] = 0.0
+    for k in range(inputs.shape[0]):
+        for i in range(inputs.shape[1]):
+            w.iteration.change[k, i] = -inputs[k, i]
+    return follow(start, states, inputs, 1.0, problem, limits, w)
 
 
 @kernel
