@@ -1,9 +1,13 @@
-"""Processor time of a Gauss-Newton iteration of the planner, one team on one thread.
+"""Processor time of the planner, one team on one thread, and how plans within hard limits converge.
 
-    python bench/planner.py [repeats=200] [drones=3,4,6,8] [any configuration key]
+    python bench/planner.py [repeats=200] [drones=3,4,6,8] [starts=100] [any configuration key]
 
-A team is 0.1 m from its target at rest. Stated are medians, and the least and the largest time [ms], of an iteration:
-the trajectory linearised, the Riccati recursion, and its step; and of a whole plan with its flat states.
+First, a team is 0.1 m from its target at rest. Stated are medians, and the least and the largest time [ms], of a
+Gauss-Newton iteration: the trajectory linearised, the Riccati recursion, and its step; and of a whole plan with its
+flat states. Then plans within hard limits, from the random states of `TeamExpert.random_states`: how many converge
+within 40 iterations; iterations and times, median and ninth decile; the same a policy step later, from states that are
+disturbed by 5 mm, 2 cm/s, 0.01 and 0.05 1/s at most; and times of a quadratic program of the same size by PIQP, if it
+is installed (`pip install piqp`).
 """
 
 from __future__ import annotations
@@ -13,15 +17,20 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from planner_qp import time_piqp
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config, parse_overrides
+from multilift_marl.planning.expert import TeamExpert
 from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state
+from multilift_marl.planning.goals import pose_goal
 from multilift_marl.planning.riccati import IterationWork, Problem, find_gains, take_step
-from multilift_marl.planning.team_model import state_size
+from multilift_marl.planning.team_model import ModelWork, state_size, step_state
 from multilift_marl.planning.team_planner import TeamPlanner
 
-DEFAULTS = {"repeats": 200, "drones": "3,4,6,8"}
+DEFAULTS = {"repeats": 200, "drones": "3,4,6,8", "starts": 100}
+LATER = 0.02  # [s], a policy step
+DISTURBED = 0.005, 0.02, 0.01, 0.05  # [m], [m/s], of c [-], of ċ [1/s]
 
 
 def timed(call: Callable[[], object], repeats: int) -> np.ndarray:
@@ -59,17 +68,60 @@ def measure(config: Config, repeats: int) -> tuple[np.ndarray, np.ndarray]:
     return timed(iterate, repeats), timed(lambda: planner.plan(start[None], *motion, 0.02, offsets), repeats)
 
 
+def converge(config: Config, count: int) -> list[str]:
+    """Return the cells of a row about plans within hard limits."""
+    expert, home = TeamExpert(config), np.array([0.0, 0.0, 1.0])
+    goal = pose_goal(expert.times, home)
+    starts = expert.random_states(count)
+    off = expert.random_states(count, seed=1, ranges=DISTURBED) - expert.rest_states(home)
+    expert.solve(starts[:1], goal)
+    cold, warm, cold_ms, warm_ms = [], [], [], []
+    m = ModelWork.of(len(expert.model.anchors))
+    for start, disturbance in zip(starts, off, strict=True):
+        began = time.thread_time()
+        plan = expert.solve(start, goal)
+        cold_ms.append(1e3 * (time.thread_time() - began))
+        later = np.zeros_like(start)
+        step_state(start, plan.inputs[0, 0], LATER, expert.model, np.zeros(7), m, later)
+        began = time.thread_time()
+        again = expert.solve(later + disturbance, goal, last=plan, elapsed=LATER)
+        warm_ms.append(1e3 * (time.thread_time() - began))
+        cold.append(plan)
+        warm.append(again)
+    within = [sum(int(plan.converged[0]) for plan in plans) for plans in (cold, warm)]
+    iterations = [np.array([plan.iterations[0] for plan in plans]) for plans in (cold, warm)]
+    cells = []
+    for number, each, ms in zip(within, iterations, (cold_ms, warm_ms), strict=True):
+        cells += [f"{number} of {count}", deciles(each, 0), deciles(np.array(ms), 1)]
+    try:
+        cells.append(deciles(time_piqp(expert, starts[: min(count, 20)])[1:], 1))
+    except ModuleNotFoundError:
+        cells.append("-")
+    return cells
+
+
+def deciles(values: np.ndarray, digits: int) -> str:
+    """Return median and ninth decile."""
+    return f"{np.median(values):.{digits}f} / {np.percentile(values, 90):.{digits}f}"
+
+
 def main(arguments: list[str]) -> None:
-    """Print the table."""
+    """Print the tables."""
     values = parse_overrides(arguments, ["drones"])
-    repeats, drones = (values.pop(key, default) for key, default in DEFAULTS.items())
+    repeats, drones, starts = (values.pop(key, default) for key, default in DEFAULTS.items())
+    configs = {n: load_config("hover", values | {"env.num_drones": int(n)}) for n in str(drones).split(",")}
     print("| drones | iteration [ms] | plan [ms] |\n|---|---|---|")
-    for n in str(drones).split(","):
+    for n, config in configs.items():
         cells = (
-            f"{np.median(times):.2f} ({times.min():.2f} - {times.max():.2f})"
-            for times in measure(load_config("hover", values | {"env.num_drones": int(n)}), int(repeats))
+            f"{np.median(times):.2f} ({times.min():.2f} - {times.max():.2f})" for times in measure(config, int(repeats))
         )
         print(f"| {n} | {' | '.join(cells)} |", flush=True)
+    if not int(starts):
+        return
+    titles = "drones", *(f"{kind}{of}" for kind in ("", "warm ") for of in ("converged", "iterations", "ms")), "PIQP ms"
+    print("", f"| {' | '.join(titles)} |", f"|{'---|' * len(titles)}", sep="\n")
+    for n, config in configs.items():
+        print(f"| {n} | {' | '.join(converge(config, int(starts)))} |", flush=True)
 
 
 if __name__ == "__main__":

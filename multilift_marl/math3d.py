@@ -261,8 +261,20 @@ def thrust_frame(force, yaw):
 
 @kernel
 def segment_distance(p1, q1, p2, q2):
-    """Return the distance between the segments p1 q1 and p2 q2 (Ericson, Real-Time Collision Detection, 5.1.9)."""
-    d1, d2, r = sub(q1, p1), sub(q2, p2), sub(p1, p2)
+    """Return the distance between the segments p1 q1 and p2 q2."""
+    d1, d2 = sub(q1, p1), sub(q2, p2)
+    s, t = nearest_points(sub(p1, p2), d1, d2)
+    return norm(sub(add(p1, scale(s, d1)), add(p2, scale(t, d2))))
+
+
+@kernel
+def nearest_points(r, d1, d2):
+    """Return the shares of two segments at which they are nearest (Ericson, Real-Time Collision Detection, 5.1.9).
+
+    Args:
+        r: from the start of the second to that of the first.
+        d1, d2: the segments.
+    """
     a, e, f = dot(d1, d1), dot(d2, d2), dot(d2, r)
     b, c = dot(d1, d2), dot(d1, r)
     denominator = a * e - b * b
@@ -273,7 +285,7 @@ def segment_distance(p1, q1, p2, q2):
         t, s = 0.0, clip(-c / a, 0.0, 1.0)
     elif t > 1.0:
         t, s = 1.0, clip((b - c) / a, 0.0, 1.0)
-    return norm(sub(add(p1, scale(s, d1)), add(p2, scale(t, d2))))
+    return s, t
 
 
 @kernel

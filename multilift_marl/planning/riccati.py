@@ -108,7 +108,7 @@ class IterationWork(NamedTuple):
 
 
 @kernel
-def _set_euler(x, rates, euler):
+def set_euler(x, rates, euler):
     """Write `euler_rates` of a state, and the derivatives of T ω by its attitude at body rates `rates`."""
     t = euler_rates(x[3], x[4])
     for i in range(6):
@@ -133,14 +133,14 @@ def linearise(k, states, inputs, problem, w):
         after[i] -= states[k + 1, i]
     slopes(m.middle, model, m)
     euler, a = w.euler[k], m.acceleration
-    _set_euler(x, (x[q + 3], x[q + 4], x[q + 5]), euler)
+    set_euler(x, (x[q + 3], x[q + 4], x[q + 5]), euler)
     for i in range(q):
         _to_start(w.slope[k, i], m.slope[i], q, size, 0.5 * h, euler)
     for n in range(count):
         _to_start(w.tension_slope[k, n], m.tension_slope[n], q, size, 0.5 * h, euler)
         w.tension[k, n] = m.tension[n]
     mean = (x[q + 3] + 0.5 * h * a[3], x[q + 4] + 0.5 * h * a[4], x[q + 5] + 0.5 * h * a[5])
-    _set_euler(x, mean, euler)
+    set_euler(x, mean, euler)
 
 
 @kernel
@@ -173,7 +173,7 @@ def recur(k, states, inputs, problem, damping, w):
     q, nu = 6 + 2 * count, 3 * count
     size, f = 2 * q + nu, 2 * q
     value, moved, quadratic = w.value, w.moved, w.quadratic
-    _multiply_by_dynamics(k, q, size, h, w)
+    multiply_by_dynamics(k, q, size, h, w)
 
     # V_x at the gap, and its part by the inputs, before the step's own cost is added
     force, linear = w.force, w.linear
@@ -182,7 +182,7 @@ def recur(k, states, inputs, problem, damping, w):
         for j in range(size):
             total += value[i, j] * w.gap[k, j]
         force[i] = total
-    _pull_back(k, force, linear, q, size, h, w)
+    pull_back(k, force, linear, q, size, h, w)
     right, curvature = w.right, w.input
     for i in range(nu):
         right[i, size] = 0.5 * h * (linear[f + i] + force[f + i])
@@ -226,7 +226,7 @@ def recur(k, states, inputs, problem, damping, w):
 
 
 @kernel
-def _multiply_by_dynamics(k, q, size, h, w):
+def multiply_by_dynamics(k, q, size, h, w):
     """Write V_xx A to `moved`, and the lower triangle of Aᵀ V_xx A, with its last rows whole, to `quadratic`."""
     value, moved, quadratic, by_rates, effect = w.value, w.moved, w.quadratic, w.by_rates, w.effect
     euler, slope, half = w.euler[k], w.slope[k], 0.5 * h * h
@@ -280,7 +280,7 @@ def _multiply_by_dynamics(k, q, size, h, w):
 
 
 @kernel
-def _pull_back(k, force, linear, q, size, h, w):
+def pull_back(k, force, linear, q, size, h, w):
     """Write Aᵀ `force` to `linear`."""
     euler, slope, half = w.euler[k], w.slope[k], 0.5 * h * h
     f3, f4, f5 = force[3], force[4], force[5]

@@ -51,7 +51,7 @@ def add_thrusts(x, q, h, objective, quadratic, linear):
 
 
 @kernel
-def _place_drones(x, q, model, w):
+def place_drones(x, q, model, w):
     """Write where the drones are beside the payload, and the derivatives by attitude (3) and by c (2 of 8)."""
     m = w.model
     set_rotation(x, m.rotation, m.turning)
@@ -78,7 +78,7 @@ def add_separations(x, q, problem, w):
     """Add the cost of drones that come too close to each other."""
     h, model, objective = problem.step, problem.model, problem.objective
     count = model.anchors.shape[0]
-    _place_drones(x, q, model, w)
+    place_drones(x, q, model, w)
     lever = w.lever
     for n in range(count):
         for o in range(n):

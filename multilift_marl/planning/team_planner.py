@@ -88,10 +88,7 @@ class TeamPlanner:
             np.ones(e, bool), np.zeros(e, bool),
         )  # fmt: skip
         self._flat = make_flat_team(self.model, system)
-        self._work = PlannerWork(
-            IterationWork.of(steps, n), FlatWork.of(n), np.zeros((steps + 1, size)), np.zeros((steps, 3 * n)),
-            np.zeros((steps + 1, size)),
-        )  # fmt: skip
+        self._work = PlannerWork.of(steps, n)
         self._unloaded = np.zeros((e, 7))
 
     def plan(
@@ -111,7 +108,7 @@ class TeamPlanner:
         """
         loads = self._unloaded if loads is None else loads
         motion = positions, rotations, offsets
-        settings = elapsed, self.settings.step, self.settings.iterations
+        settings = elapsed, self.settings.step, self.settings.iterations or 1
         plan_teams(states, motion, loads, settings, (self._flat, self.objective), self.plans, self._work)
         return self.plans
 
@@ -129,46 +126,67 @@ class PlannerWork(NamedTuple):
     asked: np.ndarray
     before: np.ndarray
 
+    @classmethod
+    def of(cls, steps: int, n: int) -> PlannerWork:
+        """Return arrays for K steps of N drones."""
+        shape = steps + 1, state_size(n)
+        return cls(
+            IterationWork.of(steps, n), FlatWork.of(n), np.zeros(shape), np.zeros((steps, 3 * n)), np.zeros(shape)
+        )
+
 
 @kernel
 def plan_teams(starts, motion, loads, settings, team, plans, work):
     """See `TeamPlanner.plan`; `settings` are time since the last plan [s], length of a step [s], iterations."""
-    positions, rotations, offsets = motion
     elapsed, h, iterations = settings
     flat, objective = team
     for e in range(starts.shape[0]):
         states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
-        steps, size, nu = inputs.shape[0], states.shape[1], inputs.shape[1]
-        f = size - nu
-        for k in range(steps + 1):
-            set_flat_state(positions[e, k], rotations[e, k], starts[e, 5], loads[e], flat, work.flat, targets[k])
-        q = 6 + 2 * (nu // 3)
-        for k in range(steps + 1):
-            for i in range(6):
-                targets[k, i] += offsets[e, k, i]
-                targets[k, q + i] += offsets[e, k, 6 + i]
-        for k in range(steps):
-            for i in range(nu):
-                asked[k, i] = (targets[k + 1, f + i] - targets[k, f + i]) / h
-        if not plans.fresh[e]:
-            _move_on(states, plans.targets[e], targets, elapsed / h, work.before)
-            for k in range(steps):
-                for i in range(nu):
-                    inputs[k, i] = (states[k + 1, f + i] - states[k, f + i]) / h
-        if plans.fresh[e]:
-            _take_targets(states, inputs, targets, asked)
+        prepare_team(e, starts, motion, loads, elapsed, h, flat, plans, work)
         problem = Problem(targets, asked, h, flat.model, loads[e], objective)
         _iterate(starts[e], states, inputs, problem, iterations, work)
         plans.failed[e] = not _is_finite(states, inputs)
         if plans.failed[e]:  # again from the flat states; at last these themselves
-            _take_targets(states, inputs, targets, asked)
+            take_targets(states, inputs, targets, asked)
             _iterate(starts[e], states, inputs, problem, 1, work)
             if not _is_finite(states, inputs):
-                _take_targets(states, inputs, targets, asked)
-        plans.fresh[e] = False
-        for k in range(steps + 1):
-            for i in range(size):
-                plans.targets[e, k, i] = targets[k, i]
+                take_targets(states, inputs, targets, asked)
+        keep_targets(e, targets, plans)
+
+
+@kernel
+def prepare_team(e, starts, motion, loads, elapsed, h, flat, plans, work):
+    """Write targets and inputs asked for to `work`, and a guess to the plan of team e: the last one, moved on."""
+    positions, rotations, offsets = motion
+    states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
+    steps, size, nu = inputs.shape[0], states.shape[1], inputs.shape[1]
+    f = size - nu
+    for k in range(steps + 1):
+        set_flat_state(positions[e, k], rotations[e, k], starts[e, 5], loads[e], flat, work.flat, targets[k])
+    q = 6 + 2 * (nu // 3)
+    for k in range(steps + 1):
+        for i in range(6):
+            targets[k, i] += offsets[e, k, i]
+            targets[k, q + i] += offsets[e, k, 6 + i]
+    for k in range(steps):
+        for i in range(nu):
+            asked[k, i] = (targets[k + 1, f + i] - targets[k, f + i]) / h
+    if plans.fresh[e]:
+        take_targets(states, inputs, targets, asked)
+        return
+    _move_on(states, plans.targets[e], targets, elapsed / h, work.before)
+    for k in range(steps):
+        for i in range(nu):
+            inputs[k, i] = (states[k + 1, f + i] - states[k, f + i]) / h
+
+
+@kernel
+def keep_targets(e, targets, plans):
+    """Let the plan of team e be one that the next begins with."""
+    plans.fresh[e] = False
+    for k in range(targets.shape[0]):
+        for i in range(targets.shape[1]):
+            plans.targets[e, k, i] = targets[k, i]
 
 
 @kernel
@@ -179,7 +197,7 @@ def _iterate(start, states, inputs, problem, iterations, work):
 
 
 @kernel
-def _take_targets(states, inputs, targets, asked):
+def take_targets(states, inputs, targets, asked):
     """Let a plan be its targets."""
     for k in range(states.shape[0]):
         for i in range(states.shape[1]):

@@ -17,6 +17,7 @@ from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.approach import Approach, begin_approaches, write_approaches
 from multilift_marl.planning.force_estimator import ForceEstimator
+from multilift_marl.planning.hard_planner import HardPlanner
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.policies.full_state_command import FullStateCommand
@@ -76,7 +77,7 @@ class TeamMpc:
                 "time; set control.disturbance=none, or planner.estimate=false"
             )
         self._vec, settings = vec, config.planner
-        self.planner = TeamPlanner(system, settings, vec.num_envs)
+        self.planner = (HardPlanner if settings.limits == "hard" else TeamPlanner)(system, settings, vec.num_envs)
         self._dt = vec.task.dt
         noise = settings.estimate_noise or (0.2 if config.env.sensing == "ideal" else 1.0)
         self._estimator = ForceEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None

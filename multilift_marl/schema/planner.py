@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -14,7 +14,12 @@ class PlannerConfig(Section):
 
     steps: Int = Field(20, ge=5, le=200, description="of the horizon")
     step: Annotated[Float, Between(0.005, 0.5, "s")] = Field(0.05, description="[s] length of each")
-    iterations: Int = Field(1, ge=1, le=100, description="Gauss-Newton iterations in each policy step")
+    limits: Literal["soft", "hard"] = Field(
+        "soft", description="soft: exceeding one costs; hard: plans converge within them, see docs/planning.md"
+    )
+    iterations: Int | None = Field(
+        None, ge=1, le=1000, description="in each policy step, with hard limits at most; None: 1, with hard limits 40"
+    )
     position: Annotated[Float, Between(1e-4, 100, "m")] = Field(0.02, description="[m] tolerance of the payload")
     attitude: Annotated[Float, Between(0.01, 1000, "deg")] = Field(8.6, description="[deg] of the payload")
     cable: Annotated[Float, Between(0.01, 1000, "deg")] = Field(8.6, description="[deg] of each cable's direction")
@@ -35,8 +40,17 @@ class PlannerConfig(Section):
     )
     tension: Annotated[Float, Between(1e-4, 10)] = Field(0.03, description="[-] tolerance of what is missing, likewise")
     largest_thrust: Annotated[Float, Between(0.1, 2)] = Field(0.95, description="[-] over what the rotors can give")
+    least_thrust: Annotated[Float, Between(0, 1)] = Field(
+        0.1, description="[-] over the thrust at rest, with hard limits"
+    )
+    largest_tilt: Annotated[Float, Between(1, 89, "deg")] = Field(
+        70.0, description="[deg] of each thrust vector from the vertical, with hard limits"
+    )
     separation: Annotated[Float, Between(0, 10)] = Field(
         1.1, description="[-] least distance of drones, over that which counts as a collision"
+    )
+    cables: Annotated[Float, Between(0, 10)] = Field(
+        1.1, description="[-] least distance of cables, over that which counts as crossing, with hard limits"
     )
     estimate: bool = Field(
         True, description="whether forces on payload and drones, a moment and mass of the payload are estimated"
