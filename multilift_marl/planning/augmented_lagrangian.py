@@ -108,7 +108,8 @@ def _begin(start, states, inputs, problem, limits, m, w):
     held = cost + penalty(w.values, m.dual, PENALTY)
     find_gains(states, inputs, problem, 0.0, w.iteration)
     cost = follow(start, states, inputs, 1.0, problem, limits, w)
-    if not cost + penalty(w.values, m.dual, PENALTY) < held:  # or not finite
+    led = cost + penalty(w.values, m.dual, PENALTY)
+    if not np.isfinite(led) or held < led:
         cost = _hold(start, states, inputs, problem, limits, w)
     return cost
 
