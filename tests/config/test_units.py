@@ -113,6 +113,7 @@ def test_a_full_action_is_as_large_as_the_cables():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task", ["loss", *(pytest.param(name, marks=pytest.mark.slow) for name in ("track", "gate", "takeoff", "pose"))]
 )

@@ -169,6 +169,7 @@ def test_the_feedback_script_lets_the_payload_go_where_it_is_meant_to(task, alon
     assert all(np.abs(script.act(observed(vec, 0.0, **{name: 0.2}))).max() > 0.03 for name in along)
 
 
+@pytest.mark.slow
 def test_the_feedback_script_holds_a_payload_in_turbulence_that_the_integral_does_not():
     config = load_config("hover_wind")
     success = {

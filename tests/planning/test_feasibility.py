@@ -107,6 +107,7 @@ def test_payloads_without_an_attitude_are_not_assessed():
     assert find_violation(fast, make_system(3, **{"payload.shape": "point"}), NOTHING) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "flies"), [(1.6, False), (1.8, True)])
 def test_the_limits_are_where_flights_begin_to_fail(seconds, flies, monkeypatch):
     """Down by 2.5 m: what is refused policy=mpc cannot fly, and what is not it flies within a centimetre."""

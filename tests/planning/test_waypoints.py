@@ -204,6 +204,7 @@ def test_a_file_that_leads_the_team_beyond_its_limits_is_warned_of(tmp_path, cap
         assert said == limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("policy", "most"), [("formation_lead", 0.15), ("mpc", 0.003)])
 def test_teams_fly_through_them(policy, most):
     by_rates = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
