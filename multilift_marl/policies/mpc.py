@@ -79,7 +79,7 @@ class TeamMpc:
         self._vec, settings = vec, config.planner
         self.planner = (HardPlanner if settings.limits == "hard" else TeamPlanner)(system, settings, vec.num_envs)
         self._dt = vec.task.dt
-        noise = settings.estimate_noise or (0.2 if config.env.sensing == "ideal" else 1.0)
+        noise = settings.estimate_noise or (0.5 if config.env.sensing == "ideal" else 1.0)
         self._estimator = ForceEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None
         self._observer = None
         if config.env.sensing != "ideal":
