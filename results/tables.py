@@ -45,7 +45,7 @@ def rows(names: str) -> str:
     task = "" if names.split()[0] in FLIGHTS and " " in names else names
     chosen = flights_of(task) if task else names.split()
     published = any(FLIGHTS[name].published for name in chosen)
-    planned = any((HERE / name / "mpc.json").is_file() for name in chosen)
+    planned = bool(task) and any((HERE / name / "mpc.json").is_file() for name in chosen)
     lines = []
     for name in chosen:
         flight, baseline = FLIGHTS[name], best_baseline(name)
