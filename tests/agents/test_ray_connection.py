@@ -64,9 +64,15 @@ def test_a_head_node_that_is_lost_is_told_after_a_few_seconds(monkeypatch):
         head.check()
 
 
-def test_a_token_is_given_where_there_is_one_and_nobody_says_otherwise(tmp_path, monkeypatch):
+def forget_tokens(monkeypatch):
+    """Remove what tells Ray of tokens until the test ends, and then what the test has made of it."""
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # `delenv` alone remembers nothing of a name that is not there
+        monkeypatch.delenv(name)
+
+
+def test_a_token_is_given_where_there_is_one_and_nobody_says_otherwise(tmp_path, monkeypatch):
+    forget_tokens(monkeypatch)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setitem(sys.modules, "ray._raylet", None)
     assert _ray.use_token() and "RAY_AUTH_MODE" not in os.environ
@@ -119,8 +125,7 @@ def test_a_token_that_would_not_be_given_is_told(tmp_path, monkeypatch):
 
     if ray.is_initialized():
         ray.shutdown()
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN_PATH"):
-        monkeypatch.delenv(name, raising=False)
+    forget_tokens(monkeypatch)
     monkeypatch.setenv("RAY_AUTH_TOKEN", "a")
     monkeypatch.setattr(_ray, "_check_address", lambda address, key: None)
     with pytest.raises(
