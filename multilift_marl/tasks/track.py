@@ -146,7 +146,6 @@ def aim(e, t, v):
         return
     place_formation(e, goal, rig)
     if path.kind[e] == CIRCLE or path.kind[e] == HELIX:  # drones face along the path
-        # The tangent of a circle is a quarter of a turn ahead of its radius.
         set_heading(e, path.heading[e] + path.rate[e] * own_time(t) + 0.5 * pi, goal, rig)
         # ω dτ/dt, by a central difference of the path's own time: 0 at the start, ω after the ramp.
         goal.drone_yaw_rate[e] = path.rate[e] * (own_time(t + 1e-3) - own_time(t - 1e-3)) / 2e-3
@@ -310,7 +309,6 @@ class Track(Task):
         """See `Task.prepare`."""
         option, world, e = self.options, self.world, self.world.num_envs
         seconds = self.config.env.episode_seconds
-        # Of an episode that is over by then all errors count, rather than none.
         self.rmse_after = option.rmse_from if option.rmse_from < seconds else 0.0
         self._check_forms()
         table, team = NO_FILE, (world.system, self.config.randomization)
@@ -360,7 +358,6 @@ class Track(Task):
         elif kind == RANDOM:
             path.curve[env] = draw_curve(rng, np.array(option.room))
             fastest, hardest = largest_rates(path.curve[env])
-            # At r way-points a second, speeds are r times and accelerations r² times those at one.
             path.rate[env] = min(v / fastest, sqrt(a / hardest))
         start_on_path(env, rng, self.view_for(start_on_path), self.equilibrium)
         self.own.worst[env] = 0.0
