@@ -292,7 +292,8 @@ def nearest_points(r, d1, d2):
 def ease(t, begin, seconds):
     """Return the fraction of a smooth path covered at time t [s], and its first three derivatives in time.
 
-    The polynomial of degree seven whose first three derivatives are zero at both ends.
+    The polynomial of degree seven whose first three derivatives are zero at both ends: of all moves from rest to rest
+    that with the least squared snap, as of paths through way-points (`planning/minimum_snap.py`).
     """
     s = min(max((t - begin) / seconds, 0.0), 1.0)
     # d/ds of the fraction is 140 u³; the rest follows by the chain rule.

@@ -44,108 +44,108 @@ class Report(NamedTuple):
 
 
 @kernel
-def solve_team(e, start, states, inputs, problem, limits, m, settings, w, report):
-    """Solve for the plan of team e.
+def solve_team(start, path, task, m, settings, w, residual):
+    """Solve for the plan of a team; return its status, an index into STATUS, and the number of iterations.
 
     Args:
-        e: the team, in `report`.
         start: (12 + 7 N,) present state.
-        states, inputs: (K + 1, 12 + 7 N) and (K, 3 N), a guess, overwritten: the result follows the model exactly.
-        problem: see `riccati.recur`.
-        limits: Limits.
+        path: Trajectory, a guess, overwritten: the result follows the model exactly.
+        task: LimitedProblem.
         m: Multipliers, a guess of `dual`, overwritten.
         settings: largest KKT residual, and largest number of iterations.
         w: NewtonWork.
-        report: Report, written.
+        residual: (3,) see `Report`, written.
     """
-    tolerance, iterations = settings
-    residual = report.residual[e]
+    tolerance, most = settings
     residual[0], residual[1], residual[2] = np.inf, np.inf, np.inf
-    cost = _begin(start, states, inputs, problem, limits, m, w)
-    _take_trial(states, inputs, m, w)
+    cost = _begin(start, path, task, m, w)
+    _take_trial(path, m, w)
     rho, damped, excess = PENALTY, 0.0, np.inf
-    report.status[e] = STOPPED if np.isfinite(cost) else NOT_FINITE
-    report.iterations[e] = 0
-    while report.status[e] == STOPPED:
+    status, iterations = STOPPED if np.isfinite(cost) else NOT_FINITE, 0
+    while status == STOPPED:
         merit = cost + set_push(rho, m)
-        exact, damping, steepest, slope = _find_convex_step(
-            report.iterations[e] < EARLY, damped, states, inputs, problem, limits, m, w
-        )
+        exact, damping, steepest, slope = _find_convex_step(iterations < EARLY, damped, path, task, m, w)
         if damping > 0.0:
             damped = damping
         residual[0] = steepest
         residual[1], residual[2] = _exceed(m)
         if max(residual[0], residual[1], residual[2]) <= tolerance:
-            report.status[e] = CONVERGED
+            status = CONVERGED
             break
-        if report.iterations[e] == iterations:
+        if iterations == most:
             break
-        report.iterations[e] += 1
-        length, cost = _search(start, states, inputs, merit, slope, rho, problem, limits, m, w)
+        iterations += 1
+        length, cost = _search(start, path, (merit, slope, rho), task, m, w)
         if length < SHORTEST and exact:  # second derivatives lead astray
-            _, _, slope = find_step(states, inputs, problem, limits, m, False, DAMPING, w)
-            length, cost = _search(start, states, inputs, merit, slope, rho, problem, limits, m, w)
+            _, _, slope = find_step(path, task, m, False, DAMPING, w)
+            length, cost = _search(start, path, (merit, slope, rho), task, m, w)
         if length < SHORTEST:
-            report.status[e] = STALLED
+            status = STALLED
             break
-        _take_trial(states, inputs, m, w)
+        _take_trial(path, m, w)
         if length == 1.0 and -slope < NEAR:
             _update(rho, m)
             last, excess = excess, _exceed(m)[0]
             if 0.5 * last < excess < 0.01:
                 rho = min(4.0 * rho, LARGEST_PENALTY)
-    if report.status[e] in (STOPPED, STALLED) and residual[1] > EXCEEDED:
-        report.status[e] = INFEASIBLE
+    if (status == STOPPED or status == STALLED) and residual[1] > EXCEEDED:
+        status = INFEASIBLE
+    return status, iterations
 
 
 @kernel
-def _begin(start, states, inputs, problem, limits, m, w):
+def _begin(start, path, task, m, w):
     """Write a trajectory that follows the model to the trial, and return its cost.
 
     It is led by an iteration of `riccati.py` about the guess, or has the thrusts stay as they are, whichever is better.
     """
-    cost = _hold(start, states, inputs, problem, limits, w)
+    cost = _hold(start, path, task, w)
     held = cost + penalty(w.values, m.dual, PENALTY)
-    find_gains(states, inputs, problem, 0.0, w.iteration)
-    cost = follow(start, states, inputs, 1.0, problem, limits, w)
+    find_gains(path.states, path.inputs, task.problem, 0.0, w.iteration)
+    cost = follow(start, path, 1.0, task, w)
     led = cost + penalty(w.values, m.dual, PENALTY)
     if not np.isfinite(led) or held < led:
-        cost = _hold(start, states, inputs, problem, limits, w)
+        cost = _hold(start, path, task, w)
     return cost
 
 
 @kernel
-def _hold(start, states, inputs, problem, limits, w):
+def _hold(start, path, task, w):
     """Write the trajectory of steady thrusts to the trial, and return its cost."""
+    inputs = path.inputs
     w.iteration.gain[:] = 0.0
     for k in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
             w.iteration.change[k, i] = -inputs[k, i]
-    return follow(start, states, inputs, 1.0, problem, limits, w)
+    return follow(start, path, 1.0, task, w)
 
 
 @kernel
-def _find_convex_step(early, damped, states, inputs, problem, limits, m, w):
+def _find_convex_step(early, damped, path, task, m, w):
     """Return whether second derivatives count, the damping, and what `find_step` returns."""
-    convex, steepest, slope = find_step(states, inputs, problem, limits, m, True, 0.0, w)
+    convex, steepest, slope = find_step(path, task, m, True, 0.0, w)
     if convex:
         return True, 0.0, steepest, slope
     damping = max(DAMPING, 0.3 * damped)
     for _ in range(0 if early else DAMPING_TRIALS):
-        convex, steepest, slope = find_step(states, inputs, problem, limits, m, True, damping, w)
+        convex, steepest, slope = find_step(path, task, m, True, damping, w)
         if convex:
             return True, damping, steepest, slope
         damping *= DAMPING_FACTOR
-    convex, steepest, slope = find_step(states, inputs, problem, limits, m, False, 0.0, w)
+    convex, steepest, slope = find_step(path, task, m, False, 0.0, w)
     return False, 0.0, steepest, slope
 
 
 @kernel
-def _search(start, states, inputs, merit, slope, rho, problem, limits, m, w):
-    """Shorten a step until it lowers the merit (Armijo); return its length and the cost."""
+def _search(start, path, line, task, m, w):
+    """Shorten a step until it lowers the merit (Armijo); return its length and the cost.
+
+    `line` holds the merit, its slope along the step, and the penalty ρ.
+    """
+    merit, slope, rho = line
     length = 1.0
     while length >= SHORTEST:
-        cost = follow(start, states, inputs, length, problem, limits, w)
+        cost = follow(start, path, length, task, w)
         if cost + penalty(w.values, m.dual, rho) <= merit + 1e-4 * length * slope + 1e-12 * abs(merit):
             return length, cost
         length *= 0.5
@@ -153,7 +153,8 @@ def _search(start, states, inputs, merit, slope, rho, problem, limits, m, w):
 
 
 @kernel
-def _take_trial(states, inputs, m, w):
+def _take_trial(path, m, w):
+    states, inputs = path
     for k in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
             inputs[k, i] = w.inputs[k, i]

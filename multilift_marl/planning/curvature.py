@@ -59,7 +59,7 @@ def set_curvature(k, x, costate, pull, problem, w, c):
     q = 6 + 2 * count
     size = 2 * q + 3 * count
     hessian = c.hessian
-    _weigh(x, costate, pull, h, q, model, m, c)
+    _weigh(x, costate, pull, problem, m, c)
 
     # by the state in the middle of the step: what each drone's numbers bend, and what they bend with accelerations
     hessian[:] = 0.0
@@ -101,8 +101,10 @@ def set_curvature(k, x, costate, pull, problem, w, c):
 
 
 @kernel
-def _weigh(x, costate, pull, h, q, model, m, c):
+def _weigh(x, costate, pull, problem, m, c):
     """Write what the accelerations count for, y, and by the adjoint of the payload's laws what those do, μ."""
+    h, model = problem.step, problem.model
+    q = 6 + 2 * model.anchors.shape[0]
     y, mu = c.weight, c.adjoint
     t = euler_rates(x[3], x[4])
     for i in range(q):

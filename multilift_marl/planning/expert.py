@@ -179,13 +179,13 @@ class TeamExpert:
                 )
             plans.states[:], plans.targets[:] = last.states, last.targets
             hard.multipliers.push[:] = last.multipliers
-        motion = positions, rotations, np.zeros((count, steps + 1, 12))
+        given = states, loads, (positions, rotations, np.zeros((count, steps + 1, 12)))
         settings = elapsed, self._settings.step, self._settings.iterations or MOST_ITERATIONS, self._tolerance
-        team = self._flat, self.objective
+        team = self._flat, self.objective, self.limits
 
         def solve(lo: int, hi: int) -> None:
             work = HardWork.of(steps, n)
-            solve_teams(lo, hi, states, motion, loads, settings, team, self.limits, plans, hard, work)
+            solve_teams((lo, hi), given, settings, team, plans, hard, work)
 
         bounds = np.linspace(0, count, min(threads, count) + 1).astype(int)
         if len(bounds) == 2:

@@ -2,7 +2,8 @@
 
 Pose and its derivatives ask for a force and a moment; cable forces that exert them, the nearest to those of the resting
 formation, point along the cables, so every drone's place follows, and with its acceleration its thrust (differential
-flatness, Sreenath and Kumar, RSS 2013). Derivatives are differences of five poses that are `STEP` apart.
+flatness, Sreenath and Kumar, RSS 2013). Derivatives are differences of five poses, of second order in the time between
+them.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.team_model import TeamModel
 from multilift_marl.rig.system import System
 
-STEP = 0.02  # [s]
+STEP = 0.02  # [s] between the poses of a state
 SAMPLES = 5  # poses of a state
 MIN_LIFT = 0.1  # of a cable's force at rest, that its vertical component is at least
 
@@ -49,18 +50,20 @@ class FlatTeam(NamedTuple):
     force: np.ndarray
     """(N, 3) of each cable on the resting payload, its heading frame [N]."""
     distribution: WrenchDistribution
+    step: float
+    """[s] between the poses of a state."""
 
 
-def make_flat_team(model: TeamModel, system: System) -> FlatTeam:
-    """Return the numbers of a team."""
-    return FlatTeam(model, system.formation_force.copy(), make_wrench_distribution(system.anchors))
+def make_flat_team(model: TeamModel, system: System, step: float = STEP) -> FlatTeam:
+    """Return the numbers of a team, whose poses are `step` [s] apart."""
+    return FlatTeam(model, system.formation_force.copy(), make_wrench_distribution(system.anchors), step)
 
 
 class FlatWork(NamedTuple):
     """Arrays that `set_flat_state` works in."""
 
     force: np.ndarray
-    """(3, N, 3) of the cables on the payload, `STEP` before, at, and after the state [N]."""
+    """(3, N, 3) of the cables on the payload, a step before, at, and after the state [N]."""
     place: np.ndarray
     """(3, N, 3) of the drones [m]."""
 
@@ -75,7 +78,7 @@ def set_flat_state(position, rotation, yaw, load, team, w, x):
     """Write the state (12 + 7 N,) of a team whose payload moves so.
 
     Args:
-        position: (5, 3) of the payload, `STEP` apart [m].
+        position: (5, 3) of the payload, `team.step` apart [m].
         rotation: (5, 3, 3) its attitude there.
         yaw: which the state's yaw is near to [rad]: it may exceed π.
         load: (7,) other force, moment and mass of the payload, see `team_model.accelerations`.
@@ -83,7 +86,7 @@ def set_flat_state(position, rotation, yaw, load, team, w, x):
         w: FlatWork.
         x: written.
     """
-    count = team.force.shape[0]
+    count, step = team.force.shape[0], team.step
     q = 6 + 2 * count
     # At the three poses in the middle: forces and places there are differentiated in turn.
     for i in range(3):
@@ -92,19 +95,19 @@ def set_flat_state(position, rotation, yaw, load, team, w, x):
     put(x[0:3], row(position, 2))
     roll, pitch, turned = euler_angles(middle)
     x[3], x[4], x[5] = roll, pitch, yaw + wrap(turned - yaw)
-    put(x[q : q + 3], scale(0.5 / STEP, sub(row(position, 3), row(position, 1))))
+    put(x[q : q + 3], scale(0.5 / step, sub(row(position, 3), row(position, 1))))
     # The mean angular velocity over two steps, from the world into the payload's frame.
-    put(x[q + 3 : q + 6], tmul(middle, scale(0.5 / STEP, _turned(rotation, 1, 3))))
+    put(x[q + 3 : q + 6], tmul(middle, scale(0.5 / step, _turned(rotation, 1, 3))))
     for n in range(count):
         before, here, after = unit(vec(w.force, 0, n)), unit(vec(w.force, 1, n)), unit(vec(w.force, 2, n))
         f, m = vec(w.force, 1, n), team.model.drone_mass[n]
         for i in range(2):
             x[6 + 2 * n + i] = here[i]
-            x[q + 6 + 2 * n + i] = (after[i] - before[i]) * (0.5 / STEP)
+            x[q + 6 + 2 * n + i] = (after[i] - before[i]) * (0.5 / step)
         # Newton's law of the drone, whose thrust holds the cable, its weight and its inertia: F = f + m (p̈ + g e_z).
         middle_place = vec(w.place, 1, n)
         moved = sub(add(vec(w.place, 0, n), vec(w.place, 2, n)), scale(2.0, middle_place))
-        thrust = add(f, scale(m, add(scale(1.0 / STEP**2, moved), (0.0, 0.0, GRAVITY))))
+        thrust = add(f, scale(m, add(scale(1.0 / step**2, moved), (0.0, 0.0, GRAVITY))))
         put(x[2 * q + 3 * n : 2 * q + 3 * n + 3], thrust)
 
 
@@ -132,15 +135,15 @@ def _turned(rotation, i, j):
 @kernel
 def _place_team(i, position, rotation, load, team, w):
     """Write cable forces and places of the drones at pose i + 1 of five."""
-    model = team.model
+    model, step = team.model, team.step
     here, attitude = row(position, i + 1), _matrix(rotation, i + 1)
-    velocity = scale(0.5 / STEP, sub(row(position, i + 2), row(position, i)))
+    velocity = scale(0.5 / step, sub(row(position, i + 2), row(position, i)))
     change = sub(add(row(position, i), row(position, i + 2)), scale(2.0, here))
-    rates = scale(0.5 / STEP, _turned(rotation, i, i + 2))
+    rates = scale(0.5 / step, _turned(rotation, i, i + 2))
     # Angular acceleration: the difference of the mean rates of the step before and of the one after.
-    spin = scale(1.0 / STEP**2, sub(_turned(rotation, i + 1, i + 2), _turned(rotation, i, i + 1)))
+    spin = scale(1.0 / step**2, sub(_turned(rotation, i + 1, i + 2), _turned(rotation, i, i + 1)))
     # What the cables have to exert: inertia, weight and drag, less the other force that is known of.
-    force = scale(model.payload_mass + load[6], add(scale(1.0 / STEP**2, change), (0.0, 0.0, GRAVITY)))
+    force = scale(model.payload_mass + load[6], add(scale(1.0 / step**2, change), (0.0, 0.0, GRAVITY)))
     force = sub(add(force, scale(model.drag * norm(velocity), velocity)), (load[0], load[1], load[2]))
     body_rates, body_spin = tmul(attitude, rates), tmul(attitude, spin)
     # Euler's equation in the payload's frame, J ω̇ + ω × J ω; the result goes back to the world frame.

@@ -15,6 +15,7 @@ import numpy as np
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, dot, nearest_points, norm, row, scale, sub
 from multilift_marl.planning.curvature import curve_rotation
+from multilift_marl.planning.riccati import Problem
 from multilift_marl.planning.soft_limits import place_drones
 
 
@@ -37,6 +38,13 @@ class Limits(NamedTuple):
     """(4,) of tensions [N], thrusts [N], distances of drones and of cables [m]."""
 
 
+class LimitedProblem(NamedTuple):
+    """What a trajectory is to be, and what it may not be."""
+
+    problem: Problem
+    limits: Limits
+
+
 def limit_names(num_drones: int) -> list[str]:
     """Return the names of the limits of a step."""
     kinds = [f"{kind}_{n}" for kind in ("tension", "largest_thrust", "least_thrust", "tilt") for n in range(num_drones)]
@@ -45,8 +53,9 @@ def limit_names(num_drones: int) -> list[str]:
 
 
 @kernel
-def evaluate_limits(x, limits, problem, w, values):
+def evaluate_limits(x, task, w, values):
     """Write the values (4 N + N (N − 1),) of the limits of state x, those of tensions left out."""
+    problem, limits = task
     count = limits.tension.shape[0]
     f = 12 + 4 * count
     unit = 1.0 / limits.tolerance[1]
@@ -68,7 +77,7 @@ def evaluate_limits(x, limits, problem, w, values):
 
 
 @kernel
-def add_limits(x, push, stiffness, exact, limits, problem, w, costate):
+def add_limits(x, push, stiffness, exact, task, w, costate):
     """Add the limits of a state to `w.value`, `w.linear` and `costate`.
 
     Args:
@@ -76,10 +85,11 @@ def add_limits(x, push, stiffness, exact, limits, problem, w, costate):
         push: (4 N + N (N − 1),) multiplier z of each limit, whose gradient adds −z ∇g.
         stiffness: likewise, which adds stiffness ∇g ∇gᵀ.
         exact: whether −z ∇²g counts too where it may take curvature away.
-        limits: Limits.
-        problem, w: see `riccati.recur`.
+        task: LimitedProblem.
+        w: IterationWork.
         costate: (12 + 7 N,).
     """
+    problem, limits = task
     count = limits.tension.shape[0]
     unit = 1.0 / limits.tolerance[1]
     for n in range(count):
@@ -107,19 +117,21 @@ def add_limits(x, push, stiffness, exact, limits, problem, w, costate):
     for n in range(count):
         for o in range(n):
             if stiffness[at] > 0.0:
-                _add_pair(n, o, 1.0, 1.0, push[at], stiffness[at], limits.tolerance[2], exact, x, problem, w, costate)
+                unit = 1.0 / limits.tolerance[2]
+                weights = unit * push[at], unit * unit * stiffness[at]
+                _add_pair((n, o, 1.0, 1.0), weights, exact, x, problem.model, w, costate)
             if stiffness[at + pairs] > 0.0:
                 s, t = _nearest(n, o, x, problem.model, w)
-                z, stiff = push[at + pairs], stiffness[at + pairs]
-                _add_pair(n, o, s, t, z, stiff, limits.tolerance[3], exact, x, problem, w, costate)
+                unit = 1.0 / limits.tolerance[3]
+                weights = unit * push[at + pairs], unit * unit * stiffness[at + pairs]
+                _add_pair((n, o, s, t), weights, exact, x, problem.model, w, costate)
             at += 1
 
 
 @kernel
-def _add_pair(n, o, s, t, push, stiffness, tolerance, exact, x, problem, w, costate):
-    """Add the distance of points at shares s and t of cables n and o, see `add_limits`."""
-    model, m = problem.model, w.model
-    z, stiff = push / tolerance, stiffness / tolerance**2
+def _add_pair(pair, weights, exact, x, model, w, costate):
+    """Add the distance of points at shares s and t of cables n and o, see `add_limits`; weights are by metres."""
+    (n, o, s, t), (z, stiff), m = pair, weights, w.model
     away = _away(n, o, s, t, x, model, w)
     distance = norm(away) + 1e-12
     e = scale(1.0 / distance, away)

@@ -10,8 +10,8 @@ from multilift_marl.kernels.jit import kernel
 from multilift_marl.mdp.failures import make_limits as failure_limits
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.augmented_lagrangian import NOT_FINITE, Report, solve_team
-from multilift_marl.planning.hard_limits import Limits, limit_names
-from multilift_marl.planning.newton import Multipliers, NewtonWork
+from multilift_marl.planning.hard_limits import LimitedProblem, Limits, limit_names
+from multilift_marl.planning.newton import Multipliers, NewtonWork, Trajectory
 from multilift_marl.planning.riccati import Objective, Problem
 from multilift_marl.planning.team_model import TeamModel
 from multilift_marl.planning.team_planner import (
@@ -92,43 +92,41 @@ class HardPlanner(TeamPlanner):
     ) -> Plans:  # fmt: skip
         """Do as `TeamPlanner.plan`; how plans ended is in `hard.report`."""
         loads = self._unloaded if loads is None else loads
-        motion = positions, rotations, offsets
+        given = states, loads, (positions, rotations, offsets)
         settings = elapsed, self.settings.step, self.settings.iterations or MOST_ITERATIONS, TOLERANCE
-        team = self._flat, self.objective
-        solve_teams(
-            0, len(states), states, motion, loads, settings, team, self.limits, self.plans, self.hard, self._newton
-        )
+        team = self._flat, self.objective, self.limits
+        solve_teams((0, len(states)), given, settings, team, self.plans, self.hard, self._newton)
         return self.plans
 
 
 @kernel
-def solve_teams(lo, hi, starts, motion, loads, settings, team, limits, plans, hard, w):
-    """Solve for the plans of teams lo to hi, each from its last plan or, if it is fresh, from its flat states.
+def solve_teams(bounds, given, settings, team, plans, hard, w):
+    """Solve for plans, each from its last plan or, if it is fresh, from its flat states.
 
     Args:
-        lo, hi: of the teams.
-        starts: (E, 12 + 7 N) present states.
-        motion: see `TeamPlanner.plan`: positions, rotations, offsets.
-        loads: (E, 7).
+        bounds: the first of the teams, and the first after them.
+        given: see `team_planner.plan_teams`.
         settings: time since the last plan [s], length of a step [s], most iterations, largest KKT residual.
-        team: FlatTeam, Objective.
-        limits: Limits.
+        team: FlatTeam, Objective, Limits.
         plans: Plans, overwritten.
         hard: HardPlans, overwritten.
         w: HardWork.
     """
     elapsed, h, iterations, tolerance = settings
-    flat, objective = team
+    flat, objective, limits = team
+    starts, loads, _ = given
     all_multipliers, report = hard
-    for e in range(lo, hi):
+    for e in range(bounds[0], bounds[1]):
         states, inputs, targets, asked = plans.states[e], plans.inputs[e], w.planner.targets, w.planner.asked
-        prepare_team(e, starts, motion, loads, elapsed, h, flat, plans, w.planner)
+        prepare_team(e, given, (elapsed, h), flat, plans, w.planner)
         m = Multipliers(
             all_multipliers.values[e], all_multipliers.dual[e], all_multipliers.push[e], all_multipliers.stiffness[e]
         )
         _move_on(m.push, 0.0 if plans.fresh[e] else 1.0, elapsed / h, m.dual)
-        problem = Problem(targets, asked, h, flat.model, loads[e], objective)
-        solve_team(e, starts[e], states, inputs, problem, limits, m, (tolerance, iterations), w.newton, report)
+        task = LimitedProblem(Problem(targets, asked, h, flat.model, loads[e], objective), limits)
+        path, wanted = Trajectory(states, inputs), (tolerance, iterations)
+        status, count = solve_team(starts[e], path, task, m, wanted, w.newton, report.residual[e])
+        report.status[e], report.iterations[e] = status, count
         plans.failed[e] = report.status[e] == NOT_FINITE
         if plans.failed[e]:
             take_targets(states, inputs, targets, asked)

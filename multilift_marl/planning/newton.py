@@ -19,6 +19,15 @@ from multilift_marl.planning.riccati import IterationWork, linearise, multiply_b
 from multilift_marl.planning.team_model import solve_factorised, state_size, step_state
 
 
+class Trajectory(NamedTuple):
+    """States, and the inputs that lead from one to the next."""
+
+    states: np.ndarray
+    """(K + 1, 12 + 7 N), see `team_model.py`."""
+    inputs: np.ndarray
+    """(K, 3 N) change of the thrust vectors [N/s]."""
+
+
 class Multipliers(NamedTuple):
     """The limits of a trajectory and what they do to it."""
 
@@ -61,13 +70,12 @@ class NewtonWork(NamedTuple):
 
 
 @kernel
-def find_step(states, inputs, problem, limits, m, exact, damping, w):
+def find_step(path, task, m, exact, damping, w):
     """Write gains and changes of the inputs.
 
     Args:
-        states, inputs: of a trajectory that follows the model.
-        problem: see `riccati.recur`.
-        limits: Limits.
+        path: Trajectory that follows the model.
+        task: LimitedProblem.
         m: Multipliers.
         exact: whether second derivatives of dynamics and limits count (Newton), or not (Gauss-Newton).
         damping: of the curvature of the inputs, over that of their cost [-].
@@ -77,6 +85,7 @@ def find_step(states, inputs, problem, limits, m, exact, damping, w):
         Whether the quadratic model is convex; the largest derivative of the whole cost by an input, in tolerances
         of the input; and that cost's derivative along the step.
     """
+    (states, inputs), problem = path, task.problem
     steps, size = inputs.shape[0], states.shape[1]
     it, objective = w.iteration, problem.objective
     it.value[:] = 0.0
@@ -86,10 +95,10 @@ def find_step(states, inputs, problem, limits, m, exact, damping, w):
         w.costate[i] = it.linear[i]
     steepest, slope = 0.0, 0.0
     for k in range(steps - 1, -1, -1):
-        add_limits(states[k + 1], m.push[k], m.stiffness[k], exact, limits, problem, it, w.costate)
+        add_limits(states[k + 1], m.push[k], m.stiffness[k], exact, task, it, w.costate)
         linearise(k, states, inputs, problem, it)
-        _set_middle(k, states[k], m, exact, limits, problem, w)
-        convex, steep, along = _recur(k, states, inputs, problem, damping, w)
+        _set_middle(k, states[k], m, exact, task, w)
+        convex, steep, along = _recur(k, path, problem, damping, w)
         if not convex:
             return False, steepest, slope
         steepest = max(steepest, steep)
@@ -98,11 +107,12 @@ def find_step(states, inputs, problem, limits, m, exact, damping, w):
 
 
 @kernel
-def _set_middle(k, x, m, exact, limits, problem, w):
+def _set_middle(k, x, m, exact, task, w):
     """Write what tensions, and with `exact` the dynamics too, add by the state in the middle of step k.
 
     Second derivatives go to the lower triangle of `curvature.hessian`, slopes to `iteration.force`.
     """
+    problem, limits = task
     it, hessian, slope = w.iteration, w.curvature.hessian, w.iteration.force
     unit = 1.0 / limits.tolerance[0]
     for n in range(limits.tension.shape[0]):
@@ -124,8 +134,9 @@ def _set_middle(k, x, m, exact, limits, problem, w):
 
 
 @kernel
-def _recur(k, states, inputs, problem, damping, w):
+def _recur(k, path, problem, damping, w):
     """Move value function and costate from the end of step k to its start; see `find_step` for what is returned."""
+    states, inputs = path
     h, objective, it = problem.step, problem.objective, w.iteration
     count = problem.model.anchors.shape[0]
     q, nu = 6 + 2 * count, 3 * count
@@ -207,16 +218,17 @@ def _factorise(matrix, size):
 
 
 @kernel
-def follow(start, states, inputs, length, problem, limits, w):
+def follow(start, path, length, task, w):
     """Write the trajectory that the inputs, changed by `length` of a step and its gains, lead to; return its cost.
 
     Args:
         start: (12 + 7 N,).
-        states, inputs: that changes count from.
+        path: Trajectory that changes count from.
         length: [-].
-        problem, limits: see `find_step`.
+        task: LimitedProblem.
         w: NewtonWork, whose `states`, `inputs` and `values` are written.
     """
+    (states, inputs), (problem, limits) = path, task
     objective, it, h, steps = problem.objective, w.iteration, problem.step, inputs.shape[0]
     size, nu, count = states.shape[1], inputs.shape[1], limits.tension.shape[0]
     cost = 0.0
@@ -236,7 +248,7 @@ def follow(start, states, inputs, length, problem, limits, w):
         step_state(x, u, h, problem.model, problem.load, it.model, w.states[k + 1])
         for n in range(count):
             w.values[k, n] = (it.model.tension[n] - limits.tension[n]) / limits.tolerance[0]
-        evaluate_limits(w.states[k + 1], limits, problem, it, w.values[k])
+        evaluate_limits(w.states[k + 1], task, it, w.values[k])
     for i in range(size):
         cost += 0.5 * objective.end[i] * (w.states[steps, i] - problem.targets[steps, i]) ** 2
     return cost

@@ -107,9 +107,9 @@ class TeamPlanner:
             loads: (E, 7) on the payload, see `team_model.accelerations`; None for none.
         """
         loads = self._unloaded if loads is None else loads
-        motion = positions, rotations, offsets
+        given = states, loads, (positions, rotations, offsets)
         settings = elapsed, self.settings.step, self.settings.iterations or 1
-        plan_teams(states, motion, loads, settings, (self._flat, self.objective), self.plans, self._work)
+        plan_teams(given, settings, (self._flat, self.objective), self.plans, self._work)
         return self.plans
 
     def predict(self, states: np.ndarray, thrusts: np.ndarray, dt: float, loads: np.ndarray | None = None) -> None:
@@ -136,13 +136,22 @@ class PlannerWork(NamedTuple):
 
 
 @kernel
-def plan_teams(starts, motion, loads, settings, team, plans, work):
-    """See `TeamPlanner.plan`; `settings` are time since the last plan [s], length of a step [s], iterations."""
+def plan_teams(given, settings, team, plans, work):
+    """See `TeamPlanner.plan`.
+
+    Args:
+        given: states, loads, and positions, rotations and offsets of the motion.
+        settings: time since the last plan [s], length of a step [s], iterations.
+        team: FlatTeam, Objective.
+        plans: Plans, overwritten.
+        work: PlannerWork.
+    """
     elapsed, h, iterations = settings
     flat, objective = team
+    starts, loads, _ = given
     for e in range(starts.shape[0]):
         states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
-        prepare_team(e, starts, motion, loads, elapsed, h, flat, plans, work)
+        prepare_team(e, given, (elapsed, h), flat, plans, work)
         problem = Problem(targets, asked, h, flat.model, loads[e], objective)
         _iterate(starts[e], states, inputs, problem, iterations, work)
         plans.failed[e] = not _is_finite(states, inputs)
@@ -155,9 +164,10 @@ def plan_teams(starts, motion, loads, settings, team, plans, work):
 
 
 @kernel
-def prepare_team(e, starts, motion, loads, elapsed, h, flat, plans, work):
+def prepare_team(e, given, times, flat, plans, work):
     """Write targets and inputs asked for to `work`, and a guess to the plan of team e: the last one, moved on."""
-    positions, rotations, offsets = motion
+    starts, loads, (positions, rotations, offsets) = given
+    elapsed, h = times
     states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
     steps, size, nu = inputs.shape[0], states.shape[1], inputs.shape[1]
     f = size - nu

@@ -7,6 +7,7 @@ from math import factorial
 import numpy as np
 import pytest
 
+from multilift_marl.math3d import ease
 from multilift_marl.planning import minimum_snap
 from multilift_marl.planning.minimum_snap import allocate_times, fit_minimum_snap
 
@@ -120,3 +121,12 @@ def test_allocated_times_are_nearly_the_shortest():
         speed, hard = (np.linalg.norm(spline(t, derivative), axis=1).max() for derivative in (1, 2))
         lengths.append(changed[-1] * max(speed / 2, np.sqrt(hard / 2)))
     assert times[-1] < 1.1 * min(lengths) and times[-1] < np.median(lengths)
+
+
+def test_a_move_from_rest_to_rest_is_that_through_its_two_ends():
+    """`math3d.ease` moves goals of tasks, poses and drones of PX4: the law of way-points for two of them."""
+    times, t = np.array([0.5, 2.0]), np.linspace(0.5, 2.0, 31)
+    spline = fit_minimum_snap(times, np.array([[0.0], [1.0]]))
+    moved = np.array([ease(each, 0.5, 1.5) for each in t])
+    for derivative in range(4):
+        np.testing.assert_allclose(moved[:, derivative], spline(t, derivative)[:, 0], atol=1e-9)

@@ -9,8 +9,8 @@ import multilift_marl as ml
 from multilift_marl.planning.augmented_lagrangian import penalty, set_push
 from multilift_marl.planning.curvature import CurvatureWork, set_curvature
 from multilift_marl.planning.expert import TeamExpert
-from multilift_marl.planning.hard_limits import Limits, limit_names
-from multilift_marl.planning.newton import Multipliers, NewtonWork, find_step, follow
+from multilift_marl.planning.hard_limits import LimitedProblem, Limits, limit_names
+from multilift_marl.planning.newton import Multipliers, NewtonWork, Trajectory, find_step, follow
 from multilift_marl.planning.riccati import IterationWork, Problem, linearise, pull_back
 from multilift_marl.planning.team_model import ModelWork, step_state
 
@@ -75,11 +75,12 @@ def test_a_step_is_newtons_on_the_cost_with_limits_of_every_kind(expert, exact):
     count = len(limit_names(N))
     w, m, rho = NewtonWork.of(STEPS, N, count), Multipliers.of(STEPS, count), 0.3
     m.dual[:] = rng.uniform(0.5, 1.0, m.dual.shape)
-    states = np.zeros((STEPS + 1, SIZE))
+    states, task = np.zeros((STEPS + 1, SIZE)), LimitedProblem(problem, limits)
+    path = Trajectory(states, inputs)
 
     def cost(change):
         w.iteration.gain[:] = 0.0
-        return follow(start, states, inputs + change, 0.0, problem, limits, w) + penalty(w.values, m.dual, rho)
+        return follow(start, Trajectory(states, inputs + change), 0.0, task, w) + penalty(w.values, m.dual, rho)
 
     def differences(function, h):
         shape = inputs.shape
@@ -93,12 +94,12 @@ def test_a_step_is_newtons_on_the_cost_with_limits_of_every_kind(expert, exact):
     states[:], m.values[:] = w.states, w.values
     set_push(rho, m)
     assert (m.push > 0).any(axis=0).all() and (m.values < 0).any(axis=0)[:N].all()
-    convex, steepest, along = find_step(states, inputs, problem, limits, m, exact, 0.0, w)
+    convex, steepest, along = find_step(path, task, m, exact, 0.0, w)
     assert convex
     tolerance = np.tile(objective.rate**-0.5, STEPS)
     assert steepest == pytest.approx(abs(slope * tolerance).max(), rel=1e-5)
     small = 1e-5
-    follow(start, states, inputs, small, problem, limits, w)
+    follow(start, path, small, task, w)
     step = (w.inputs - inputs).ravel() / small
     assert along == pytest.approx(slope @ step, rel=1e-3)
     missing = abs(hessian @ step + slope).max() / abs(slope).max()
