@@ -21,7 +21,7 @@ from multilift_marl.planning.team_model import ModelWork, TeamModel, acceleratio
 MASS = 0.3, 0.02  # of the payload's: standard deviation of the mass at first, and by which it wanders in a second
 FORCE = 0.05, 0.35  # of its weight, likewise
 MOMENT = 0.02, 0.35  # of its weight times the mean distance of its anchors
-DRONE = 0.05, 0.35  # of a drone's weight and share of the load
+DRONE = 0.1, 0.5  # of a drone's weight and share of the load; with twice the drift late sensors make it swing
 LARGEST = 0.6  # of these, that estimates are at most
 PAYLOAD = 7  # unknowns of the payload, see `team_model.accelerations`
 _STEP = 1e-3  # of differences, over the unknown's scale

@@ -140,6 +140,9 @@ class TeamMpc:
         if self._observer is not None:
             self._observer.fresh[self._fresh] = True
             states = self._observer.update(states, self._dt, loads).copy()
+        if self._estimator is not None:
+            self._estimator.update(states, self._dt, ~unknown)
+        unknown |= self._forget_unsound(states, loads, forces)
         now = vec.task.time[:, None]
         last = np.maximum(now - self._dt, 0.0)
         preview = vec.task.preview_targets
@@ -155,8 +158,6 @@ class TeamMpc:
         planner.plans.fresh[self._fresh] = True
         self._sent[:, self._fresh] = states[self._fresh, -3 * shape[1] :]
         self._fresh &= unknown
-        if self._estimator is not None:
-            self._estimator.update(states, self._dt, ~unknown)
         present = states.copy()
         planner.predict(states, self._sent, self._dt, loads)
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
@@ -184,6 +185,17 @@ class TeamMpc:
         self._estimator.estimate.fresh[fresh] = True
         self._estimator.estimate.unknowns[fresh] = 0.0
         return self._estimator.loads, self._estimator.forces
+
+    def _forget_unsound(self, states: np.ndarray, loads: np.ndarray, forces: np.ndarray) -> np.ndarray:
+        """Let estimates that are not finite begin anew, write planned states instead, and return whose they were (E,)."""
+        lost = ~np.isfinite(np.hstack([states, loads, forces])).all(axis=1)
+        if lost.any():
+            states[lost] = self._last.states(self._dt)[lost]
+            loads[lost], forces[lost] = 0.0, 0.0
+            for part in (self._estimator and self._estimator.estimate, self._observer):
+                if part is not None:
+                    part.fresh[lost] = True
+        return lost
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the states (E, 12 + 7 N) of the reduced model, the payload's attitudes, and drag (E, N, 3) [N]."""

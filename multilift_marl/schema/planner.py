@@ -21,7 +21,7 @@ class PlannerConfig(Section):
         None, ge=1, le=1000, description="in each policy step, with hard limits at most; None: 1, with hard limits 40"
     )
     position: Annotated[Float, Between(1e-4, 100, "m")] = Field(0.02, description="[m] tolerance of the payload")
-    attitude: Annotated[Float, Between(0.01, 1000, "deg")] = Field(8.6, description="[deg] of the payload")
+    attitude: Annotated[Float, Between(0.01, 1000, "deg")] = Field(5.0, description="[deg] of the payload")
     cable: Annotated[Float, Between(0.01, 1000, "deg")] = Field(8.6, description="[deg] of each cable's direction")
     velocity: Annotated[Float, Between(1e-3, 1000, "m/s")] = Field(0.3, description="[m/s] of the payload")
     body_rates: Annotated[Float, Between(1e-3, 1000, "rad/s")] = Field(1.0, description="[rad/s] of the payload")
