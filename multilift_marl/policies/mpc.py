@@ -187,14 +187,15 @@ class TeamMpc:
         return self._estimator.loads, self._estimator.forces
 
     def _forget_unsound(self, states: np.ndarray, loads: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        """Let estimates that are not finite begin anew, write planned states instead, and return whose they were (E,)."""
+        """Let estimates that are not finite begin anew from planned states; return whose they were (E,)."""
         lost = ~np.isfinite(np.hstack([states, loads, forces])).all(axis=1)
         if lost.any():
             states[lost] = self._last.states(self._dt)[lost]
             loads[lost], forces[lost] = 0.0, 0.0
-            for part in (self._estimator and self._estimator.estimate, self._observer):
-                if part is not None:
-                    part.fresh[lost] = True
+            if self._estimator is not None:
+                self._estimator.estimate.fresh[lost] = True
+            if self._observer is not None:
+                self._observer.fresh[lost] = True
         return lost
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
