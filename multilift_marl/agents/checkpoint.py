@@ -136,9 +136,9 @@ def find_run(name: str | Path, runs: Path = Path("runs"), others: Iterable[str] 
             if found:
                 return max(found, key=_age)
         else:
-            for folder in (Path(name), runs / name):
-                if str(name) and folder.is_dir():
-                    return folder
+            here = [folder for folder in (Path(name), runs / name) if str(name) and folder.is_dir()]
+            if here:  # the run, if another folder has its name
+                return next((folder for folder in here if (folder / "checkpoints").is_dir()), here[0])
     except FileNotFoundError:
         pass
     except (OSError, ValueError) as error:

@@ -325,8 +325,8 @@ def find_checkpoint(name: str | Path, checkpoint: str = "best") -> tuple[Path, P
     except ModuleNotFoundError as error:
         message = f"ml.load_policy needs {error.name}: {pip_install('train')}"
         raise ModuleNotFoundError(message, name=error.name) from error
-    # What is in the current folder goes before a shipped policy of that name.
-    if text in shipped_policies() and not os.path.exists(text):
+    # A file or a run in the current folder goes before a shipped policy of that name, another folder does not.
+    if text in shipped_policies() and not (os.path.isfile(text) or os.path.isdir(os.path.join(text, "checkpoints"))):
         if checkpoint != "best":
             raise ConfigError(f"checkpoint={checkpoint} means nothing to the shipped policy '{text}'; leave it out")
         return _SHIPPED / f"{text}.pt", Path("runs") / f"shipped-{text}"

@@ -18,7 +18,7 @@ from conftest import make_trainer, same
 from multilift_marl._platform import STOPPING, lock_file
 from multilift_marl.agents import checkpoint, policy, stopping
 from multilift_marl.agents.checkpoint import find_run, load_checkpoint, save_checkpoint
-from multilift_marl.agents.policy import load_policy, strip_checkpoint
+from multilift_marl.agents.policy import find_checkpoint, load_policy, strip_checkpoint
 from multilift_marl.agents.trainer import resume_run
 from multilift_marl.cli.train import main as train
 from multilift_marl.config.load import build_config
@@ -297,3 +297,13 @@ def test_a_full_disk_costs_nothing(tmp_path, monkeypatch, capsys, lasts):
         assert load_checkpoint(trainer.folder / "checkpoints" / "last.pt")["iteration"] == 3
     assert capsys.readouterr().out.count("No space left on device") == 1
     assert not list(trainer.folder.glob("checkpoints/*.tmp"))
+
+
+def test_a_folder_that_is_no_run_hides_neither_a_shipped_policy_nor_a_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("hover", "mine", "runs/mine/checkpoints"):
+        (tmp_path / folder).mkdir(parents=True)
+    assert find_checkpoint("hover")[0].name == "hover.pt" and find_checkpoint("hover")[0].is_file()
+    assert find_run("mine") == Path("runs/mine")
+    (tmp_path / "hover" / "checkpoints").mkdir()
+    assert find_checkpoint("hover")[1] == Path("hover")  # a run does

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -23,7 +24,7 @@ from fake_px4 import FIRST, WORKER, are_free
 
 from multilift_marl.deploy.px4 import __main__ as command
 from multilift_marl.deploy.px4.flight import Flight, check_config
-from multilift_marl.deploy.px4.launch import find_px4
+from multilift_marl.deploy.px4.launch import PX4_PORT, Autopilots, find_px4
 from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
 
 DT = 0.004
@@ -119,6 +120,26 @@ def test_a_command_that_is_ended_leaves_nothing_behind(number, twice, tmp_path):
     if number != signal.SIGKILL and not twice:
         assert status == 130 and process.stderr.read().strip().endswith("stopped")
         assert not list(tmp_path.glob("px4-*"))
+
+
+def test_a_port_that_px4_would_not_get_is_named_before_it_starts(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", PX4_PORT + FIRST))
+        with pytest.raises(FlightError, match=f"port {PX4_PORT + FIRST} of PX4 {FIRST} is taken .*instance=<number>"):
+            Autopilots(tmp_path, [{}], FIRST)
+    assert are_free()
+
+
+def test_a_flight_that_does_not_start_leaves_no_empty_folder(tmp_path, monkeypatch, capsys):
+    build = tmp_path / "px4"
+    for name in ("bin/px4", "etc/init.d-posix/rcS"):
+        (build / name).parent.mkdir(parents=True, exist_ok=True)
+        (build / name).write_text("#!/bin/sh\necho no simulator; exit 3\n")
+        (build / name).chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    command.main([f"px4={build}", "config=hover", "timeout=5", "env.num_drones=2", "instance=8", "out=flight"])
+    assert "PX4" in capsys.readouterr().err
+    assert not (tmp_path / "flight").exists()
 
 
 def test_more_drones_than_px4_has_instances_are_refused(tmp_path, capsys):

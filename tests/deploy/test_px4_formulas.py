@@ -13,9 +13,13 @@ pytest.importorskip("pymavlink")  # of the px4 extra
 if sys.platform == "win32":
     pytest.skip("PX4 flies on Linux and macOS alone", allow_module_level=True)
 
-from multilift_marl.deploy.px4.flight import Flight, Goal
+import multilift_marl as ml
+from multilift_marl.deploy.px4 import __main__ as command
+from multilift_marl.deploy.px4.flight import Flight, FlightResult, Goal, Phase, _goal, check_config, plan_way
 from multilift_marl.deploy.px4.launch import rig_parameters
 from multilift_marl.deploy.px4.team import AutopilotTeam
+from multilift_marl.errors import FlightError
+from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.sim.earth import Site, project_local
 
 HZ = 50.0
@@ -37,41 +41,165 @@ class Recorder:
         self.sent.append((drone, motion.copy(), cable_force.copy(), yaw))
 
 
-def go(begin: Goal, end: Goal) -> tuple[np.ndarray, ...]:
-    """Return motions (T, 2, 3, 3), cable forces (T, 2, 3) and headings (T, 2) of the way from one goal to another."""
-    flight, world = Flight.__new__(Flight), record(thrust=None, step=lambda *_: None, system=record(control_interval=4))
-    flight.config, flight.team = record(sim=record(control_hz=HZ)), Recorder()
-    flight._go(world, begin, end)
+def rest_at(end: Goal, begin: Goal) -> tuple[np.ndarray, ...]:
+    """Return motions (T, 2, 3, 3), cable forces (T, 2, 3) and headings (T, 2) of a team whose payload is there."""
+    flight = Flight.__new__(Flight)
+    flight.config, flight.team, flight.phases = record(sim=record(control_hz=HZ)), Recorder(), []
+    rotation = np.tile(np.eye(3), (1, 2, 1, 1))
+    state = record(drone_position=np.eye(3)[None, :2], drone_rotation=rotation, cable_tension=np.ones((1, 2)))
+    system, stats = record(control_interval=4), record(tension_peak=np.ones(1))
+    world = record(thrust=None, step=lambda *_: None, system=system, state=state, stats=stats)
+    assert flight._go(world, begin, end, "way") is world
     assert [each[0] for each in flight.team.sent[:4]] == [0, 1, 0, 1]
+    (phase,) = flight.phases
+    assert phase[:2] == ("way", pytest.approx(len(flight.team.sent) / 2 / HZ)) and phase.separation == 2**0.5
     return tuple(np.array([each[k] for each in flight.team.sent]).reshape(-1, 2, *shape)
                  for k, shape in ((1, (3, 3)), (2, (3,)), (3, ())))  # fmt: skip
 
 
-@pytest.mark.parametrize("yaw, seconds", [(0.4, 4.0 / 0.8), (0.4 + 3.0, 3.0 / 0.5), (0.4 - 3.0, 6.0), (0.4 + 4.0, 5.0)])
-def test_the_way_to_a_task_is_a_line_at_rest_at_both_ends(yaw, seconds):
+@pytest.mark.parametrize("turn, seconds", [(0.0, 0.0), (3.0, 6.0), (-3.0, 6.0), (4.0, (2 * np.pi - 4.0) / 0.5)])
+def test_at_the_end_of_a_way_drones_rest_and_turn_to_where_they_are_to_face(turn, seconds):
     rng = np.random.default_rng(0)
-    begin = Goal(rng.normal(size=(2, 3)), rng.normal(size=(2, 3)), 0.4, 1.0)
-    way = np.array([[1.0, -2.0, 0.5], [2.4, 3.2, 0.0]])
-    end = Goal(begin.slots + way, rng.normal(size=(2, 3)), yaw, 2.0)
-    motion, force, headings = go(begin, end)
+    pose = (1.0, 2.0, 3.0, 0.7)
+    begin = Goal(rng.normal(size=(2, 3)), rng.normal(size=(2, 3)), 0.4, pose)
+    end = Goal(rng.normal(size=(2, 3)), rng.normal(size=(2, 3)), 0.4 + turn, pose)
+    motion, force, headings = rest_at(end, begin)
     assert len(motion) == round((seconds + 2.0) * HZ)
-    place, velocity, acceleration = motion[:, :, 0], motion[:, :, 1], motion[:, :, 2]
-    np.testing.assert_allclose(place[0], begin.slots)
-    np.testing.assert_allclose(place[-1], end.slots)
-    np.testing.assert_allclose(np.gradient(place, 1 / HZ, axis=0)[1:-1], velocity[1:-1], atol=2e-3)
-    np.testing.assert_allclose(np.gradient(velocity, 1 / HZ, axis=0)[1:-1], acceleration[1:-1], atol=4e-3)
-    share = (place[:, 0, 1] - begin.slots[0, 1]) / way[0, 1]
-    np.testing.assert_allclose(place - begin.slots, share[:, None, None] * way, atol=1e-12)
-    middle = round(seconds * HZ / 2)
-    assert share[middle] == pytest.approx(0.5, abs=1e-9)
-    np.testing.assert_allclose(force, begin.cable_force + share[:, None, None] * (end.cable_force - begin.cable_force))
-    turn = (yaw - 0.4 + np.pi) % (2 * np.pi) - np.pi
-    np.testing.assert_allclose(headings, 0.4 + share[:, None] * turn + Recorder.heading, atol=1e-12)
+    np.testing.assert_array_equal(motion[:, :, 0], np.tile(end.slots, (len(motion), 1, 1)))
+    assert not motion[:, :, 1:].any()
+    np.testing.assert_array_equal(force, np.tile(end.cable_force, (len(force), 1, 1)))
+    shorter = (turn + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(headings[0], 0.4 + Recorder.heading, atol=1e-12)
+    np.testing.assert_allclose(headings[-1], 0.4 + shorter + Recorder.heading, atol=1e-12)
+    assert abs(np.diff(headings, axis=0)).max() * HZ < 0.5 * 35 / 16 + 1e-3
 
 
-def test_a_short_way_takes_a_second():
-    still = Goal(np.zeros((2, 3)), np.zeros((2, 3)), 0.0, 1.0)
-    assert len(go(still, still)[0]) == round(3.0 * HZ)
+@pytest.mark.parametrize("turn", [2.0, -2.0, 4.0])
+def test_a_way_is_a_straight_line_on_which_the_team_turns_the_shorter_way_round(turn):
+    config = ml.load_config("hover")
+    begin = Goal(np.zeros((4, 3)), np.zeros((4, 3)), 0.0, (1.0, 2.0, 1.5, 0.4))
+    end = begin._replace(pose=(-1.0, 3.0, 2.5, 0.4 + turn))
+    seconds, options = plan_way(config, begin, end)
+    (first, last), (start, arrival) = options["waypoints"], options["waypoint_times"]
+    assert first == begin.pose and last[:3] == end.pose[:3] and start == 0.0
+    assert last[3] - first[3] == pytest.approx((turn + np.pi) % (2 * np.pi) - np.pi)
+    assert seconds == arrival + 2.0
+    # as fast as the limits of payload and outermost slot allow: from rest to rest the peaks are 35/16 and 7.51
+    length = np.sqrt(6.0)
+    outer = abs(last[3] - first[3]) * np.linalg.norm(config.system.slots[:, :2], axis=1).max()
+    peaks = [max(length, outer) * 35 / 16 / arrival / 1.0, max(length, outer) * 7.51 / arrival**2 / 0.7]
+    assert max(peaks) == pytest.approx(1.0, abs=0.01)
+    assert plan_way(config, begin, begin) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "task, seed, drones",
+    [
+        ("track_circle", 4242, 4),
+        ("track_circle", 4242, 6),
+        ("track_circle", 1013, 4),
+        ("pose", 1001, 4),
+        ("track", 1002, 4),
+    ],
+)
+def test_on_the_way_to_a_task_no_drone_comes_near_another(task, seed, drones):
+    """The formation turns as a body: its drones stay as far from each other as they are at rest."""
+    config = check_config(ml.load_config(task, {"env.num_drones": drones}))
+    vec = ml.make_vec(config)
+    vec.reset(seed=seed)
+    end = _goal(vec)
+    begin = end._replace(pose=(0.0, 0.0, end.pose[2], 0.0))
+    seconds, options = plan_way(config, begin, end)
+    flight = Flight.__new__(Flight)
+    flight.config = config
+    way = ml.make_vec(flight._part("track", seconds, options), **{"env.episode_seconds": seconds})
+    observation, _ = way.reset(seed=seed)
+    policy, least = make_scripted("formation_integral", way), np.inf
+    truncated = np.zeros(1, bool)
+    while not truncated[0]:
+        observation, _, terminated, truncated, _ = way.step(policy.act(observation))
+        assert not terminated[0]
+        places = way.world.state.drone_position[0]
+        apart = np.linalg.norm(places[:, None] - places, axis=-1) + 9 * np.eye(drones)
+        least = min(least, (apart / np.where(np.eye(drones), 1.0, config.system.min_separation)).min())
+    assert least > 1.0
+    rest = np.linalg.norm(end.slots[:, None] - end.slots, axis=-1) + 9 * np.eye(drones)
+    assert least > 0.8 * (rest / np.where(np.eye(drones), 1.0, config.system.min_separation)).min()
+    np.testing.assert_allclose(_goal(way).slots, end.slots, atol=2e-3)
+    np.testing.assert_allclose(way.world.state.payload_position[0], end.pose[:3], atol=0.05)
+
+
+class Rehearsal(Flight):
+    """A flight without autopilots: parts follow each other, and one of them may fail."""
+
+    def __init__(self, cause: int, failing: str):
+        self.config, self.failing, self.phases, self.did = record(task="hover"), failing, [], []
+        self._task = self._landing = record(world=record(), failure_causes=("none", "ground"))
+        self.team = record(offboard=[], settle=lambda world: self.did.append("disarmed"))
+        self.cause, self._say, self._begun = cause, lambda text: None, {}
+
+    def part(self, name):
+        self.did.append(name)
+        self._begin(name)
+        if name == self.failing:
+            raise FlightError(f"{name} failed after 1.0 s: tilt")
+
+    _make = _arm = _take_over = _part = lambda self, *_: record(world=None)
+
+    def _run(self, vec, observation, what):
+        self.part(what)
+
+    def _go(self, world, begin, end, what):
+        self.part(what)
+        return world
+
+    def _measure_task(self, *_):
+        self.part("hover")
+        return FlightResult({"failure_cause": np.array([self.cause])}, None, 0.0, 0.0)
+
+
+WHOLE = ["take-off", "the way to the task", "hover", "the way back", "landing"]
+
+
+@pytest.mark.parametrize(
+    ("cause", "failing", "did", "ended"),
+    [
+        (0, "", [*WHOLE, "disarmed"], ""),
+        (1, "", [*WHOLE[:3], "disarmed"], "task hover failed: ground"),
+        (0, "the way back", WHOLE[:4], "the way back failed after 1.0 s: tilt"),
+        (0, "landing", WHOLE, "landing failed after 1.0 s: tilt"),
+    ],
+)
+def test_a_flight_that_fails_after_its_task_keeps_what_was_measured(monkeypatch, cause, failing, did, ended):
+    monkeypatch.setattr("multilift_marl.deploy.px4.flight._goal", lambda vec: record(pose=(0.0, 0.0, 1.0, 0.0)))
+    flight = Rehearsal(cause, failing)
+    result = flight.fly(lambda vec: None)
+    assert flight.did == did and result.ended == ended
+    assert [phase.name for phase in result.phases] == [name for name in did if name != "disarmed"]
+    for early in WHOLE[:2]:  # nothing has been measured yet
+        with pytest.raises(FlightError, match=early):
+            Rehearsal(0, early).fly(lambda vec: None)
+
+
+def test_a_phase_holds_the_extremes_of_its_states():
+    tilts = np.radians([[10.0, 20.0], [30.0, 5.0], [0.0, 0.0]])
+    rotation = np.zeros((3, 1, 2, 3, 3))
+    rotation[:, 0, :, 2, 2] = np.cos(tilts)
+    places = [
+        [[0.0, 0.0, 1.0], [3.0, 4.0, 1.0]],
+        [[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]],
+        [[0.0, 0.0, 1.0], [0.0, 2.0, 1.0]],
+    ]
+    phase = Phase("way", 0.0, np.inf, 0.0, 0.0)
+    for place, turned, tension, peak in zip(places, rotation, (3.0, 7.0, 4.0), (0.0, 9.0, 0.0), strict=True):
+        state = record(
+            drone_position=np.array([place]), drone_rotation=turned, cable_tension=np.array([[tension, 1.0]])
+        )
+        phase = phase.joined(state, peak, 0.1)
+    assert phase == ("way", pytest.approx(0.3), pytest.approx(1.0), 9.0, pytest.approx(30.0))
+    table = command.describe_phases([phase]).splitlines()
+    assert len(table) == 2 and table[1].split() == ["way", "0.3", "1.00", "9.0", "30.0"]
 
 
 def test_estimates_are_off_by_the_distance_from_where_the_drone_was_then():

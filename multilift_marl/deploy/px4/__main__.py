@@ -7,7 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -24,7 +24,7 @@ from multilift_marl.evaluation.metrics import format_table, make_report, write_r
 from multilift_marl.schema.values import Between, Float, Int
 
 if TYPE_CHECKING:
-    from multilift_marl.deploy.px4.flight import Flight, FlightResult
+    from multilift_marl.deploy.px4.flight import Flight, FlightResult, Phase
 
 _USAGE = """Fly one episode of a task by PX4 autopilots, in lockstep with the simulation: from slack cables on the
 ground to the task, back, and down again; then the same task by the controller of this package.
@@ -65,9 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fly(values: dict[str, Any]) -> int:
-    from multilift_marl.deploy.px4.flight import Flight, check_config
+    from multilift_marl.deploy.px4.flight import check_config
     from multilift_marl.deploy.px4.launch import find_px4
-    from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
 
     options, overrides = split_options(Options, values)
     policy = find_policy(options.policy)
@@ -94,6 +93,19 @@ def _fly(values: dict[str, Any]) -> int:
     name = f"px4-{title({'config': options.config or config.task})}-{Path(options.policy).stem}"
     out = make_folder(Path(options.out) if options.out else Path("runs") / name / time.strftime("%Y%m%d-%H%M%S"))
 
+    try:
+        return _fly_and_report(config, policy, options, build, out)
+    except BaseException:
+        with suppress(OSError):
+            out.rmdir()  # if nothing has been written
+        raise
+
+
+def _fly_and_report(config: Config, policy: NamedPolicy, options: Options, build: Path, out: Path) -> int:
+    """Fly by PX4 and by our controller; write and print the results; return 1 if the flight ended before its end."""
+    from multilift_marl.deploy.px4.flight import Flight
+    from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
+
     begin = time.perf_counter()
     settings = Settings(
         build=build, first=options.instance, timeout=options.timeout, speed=options.speed, seed=options.seed,
@@ -112,6 +124,7 @@ def _fly(values: dict[str, Any]) -> int:
     report["px4"] = {
         "drone_error_m": result.drone_error, "estimate_error_m": result.estimate_error,
         "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
+        "phases": [phase._asdict() for phase in result.phases], "ended": result.ended,
     }  # fmt: skip
     if options.speed:
         report["px4"]["lateness_s"] = dict(zip(("50 %", "99 %", "99.9 %"), team.clock.lateness().tolist(), strict=True))
@@ -122,13 +135,24 @@ def _fly(values: dict[str, Any]) -> int:
         f"{100 * ours.drone_error:.1f} cm (RMS); PX4's estimates of their places: "
         f"{100 * result.estimate_error:.1f} cm; {factor:.1f} times real time"
     )
+    print(describe_phases(result.phases))
     if options.speed:
         late = " / ".join(f"{1e3 * seconds:.2f}" for seconds in team.clock.lateness())
         print(f"steps began late by {late} ms (50 / 99 / 99.9 %)")
     write_report(out / "metrics.json", report)
     _draw(out, {"PX4": result.trace, OURS: ours.trace})
     print(f"wrote {out / 'metrics.json'} and plots beside it")
-    return 0
+    if result.ended:
+        print(f"the flight ended early: {result.ended}", file=sys.stderr)
+    return 1 if result.ended else 0
+
+
+def describe_phases(phases: Sequence[Phase]) -> str:
+    """Return the extremes of all parts of a flight as a table."""
+    lines = [f"{'phase':<20} {'s':>6} {'separation m':>13} {'tension N':>10} {'tilt deg':>9}"]
+    for name, seconds, separation, tension, tilt in phases:
+        lines.append(f"{name:<20} {seconds:>6.1f} {separation:>13.2f} {tension:>10.1f} {tilt:>9.1f}")
+    return "\n".join(lines)
 
 
 def _record(flight: Flight, policy: NamedPolicy, options: Options) -> FlightResult:

@@ -1,7 +1,7 @@
 """A flight of autopilots: start, take-off with slack cables, the way to the task, the task, the way back, landing.
 
-Take-off and landing are the tasks of these names, the drones' set-points those of the action interface. In between the
-formation flies along a smooth line. Every part has a world of its own, which begins in the state that the last one
+Take-off and landing are the tasks of these names, the ways between are task `track` with two way-points, the drones'
+set-points those of the action interface. Every part has a world of its own, which begins in the state that the last one
 left; the autopilots notice nothing of that.
 """
 
@@ -19,14 +19,19 @@ from multilift_marl.deploy.px4.team import ACTIONS, AutopilotController, Autopil
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, FlightError
 from multilift_marl.evaluation.rollout import Trace, Tracer, measure_episodes
-from multilift_marl.math3d import ease
+from multilift_marl.math3d import ease, heading
+from multilift_marl.planning.waypoints import plan_waypoints
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
+from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
-SCRIPT = "formation_integral"  # of take-off and landing
-SPEED = 0.8  # [m/s] on the way to and from the task, on average
+SCRIPT = "formation_integral"  # of all parts but the task
+SPEED, ACCELERATION = 1.0, 0.7  # [m/s], [m/s²] at most on the way to and from the task, of payload and outermost slot
 _HOLD = 2.0  # [s] at the end of the way
+_TURNING = 0.5  # [rad/s] of drones about themselves there, on average
+_NEAR = 0.01  # [m], [rad] within which there is no way to go
+_TAKEOFF, _LANDING = 10.0, 12.0  # [s]
 _OWN = ("task", "task_options", "reward")  # what take-off and landing have of their own
 Maker = Callable[[MultiliftVec], Policy]
 Say = Callable[[str], None]
@@ -43,19 +48,49 @@ class FlightResult(NamedTuple):
     """[m] RMS of the drones' distance from their references."""
     estimate_error: float
     """[m] RMS of the autopilots' estimates of their places; NaN with our controller."""
+    phases: tuple[Phase, ...] = ()
+    """From take-off to landing."""
+    ended: str = ""
+    """How the flight ended before it was over; empty if it did not."""
+
+
+class Phase(NamedTuple):
+    """Extremes of a part of the flight."""
+
+    name: str
+    seconds: float
+    separation: float
+    """[m] least distance of two drones."""
+    tension: float
+    """[N] largest of a cable."""
+    tilt: float
+    """[deg] largest of a drone."""
+
+    def joined(self, state: SystemState, peak: float, seconds: float) -> Phase:
+        """Return the phase with a further state, reached after `seconds` with a peak tension [N]."""
+        places, up = state.drone_position[0], state.drone_rotation[0, :, 2, 2]
+        apart = np.linalg.norm(places[:, None] - places, axis=-1)[~np.eye(len(places), dtype=bool)]
+        tilt = float(np.degrees(np.arccos(np.clip(up.min(), -1.0, 1.0))))
+        return Phase(
+            self.name,
+            self.seconds + seconds,
+            min(self.separation, float(apart.min(initial=np.inf))),
+            max(self.tension, peak, float(state.cable_tension[0].max())),
+            max(self.tilt, tilt),
+        )
 
 
 class Goal(NamedTuple):
-    """Where a formation is to be, N drones."""
+    """Where a team is to be, N drones."""
 
     slots: np.ndarray
     """(N, 3) [m]."""
     cable_force: np.ndarray
     """(N, 3) [N]."""
     yaw: float
-    """Of the team [rad]."""
-    height: float
-    """Of the payload [m]."""
+    """To which the drones face, beside their own headings [rad]."""
+    pose: tuple[float, float, float, float]
+    """Place [m] and heading [rad] of the payload."""
 
 
 class Flight:
@@ -69,6 +104,7 @@ class Flight:
 
     Attributes:
         start: state in which the task began; empty for `takeoff`, which begins as ever.
+        phases: of the flight so far.
 
     Raises:
         ConfigError: what autopilots cannot fly.
@@ -78,9 +114,10 @@ class Flight:
         self.config, self.team, self.seed, self._say = check_config(config), team, seed, say
         self._task = self._make(config)
         self._task.reset(seed=seed)
-        self._landing = self._make(self._part("land", {"pad_xy": 0.0, "pad_yaw": 0.0}))
+        self._landing = self._make(self._part("land", _LANDING, {"pad_xy": 0.0, "pad_yaw": 0.0}))
         self._landing.reset(seed=seed)
         self.start: dict[str, np.ndarray] = {}
+        self.phases: list[Phase] = []
         self._begun: dict[str, np.ndarray] = {}
 
     @property
@@ -98,30 +135,37 @@ class Flight:
         Raises:
             FlightError: an autopilot that does not do its part, or a failure before the task.
         """
+        self.phases = []
         if self.config.task == "takeoff":
             observation = self._arm(self._task)
-            result = self._measure_task(make_policy, observation, on_step)
         else:
             first = _goal(self._task)
-            rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": first.height}
-            takeoff = self._make(self._part("takeoff", rise))
+            rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": first.pose[2]}
+            takeoff = self._make(self._part("takeoff", _TAKEOFF, rise))
             self._run(takeoff, self._arm(takeoff), "take-off")
             self._say("to the task")
-            self._go(takeoff.world, _goal(takeoff), first)
-            observation = self._take_over(self._task, takeoff.world)
+            world = self._go(takeoff.world, _goal(takeoff), first, "the way to the task")
+            observation = self._take_over(self._task, world, self.config.task)
             self.start = self._begun
-            result = self._measure_task(make_policy, observation, on_step)
-        world = self._task.world
-        if self.config.task != "land" and result.metrics["failure_cause"][0] == 0:
+        result = self._measure_task(make_policy, observation, on_step)
+        ended, world = "", self._task.world
+        if (cause := int(result.metrics["failure_cause"][0])) != 0:
+            ended = f"task {self.config.task} failed: {self._task.failure_causes[cause]}"
+        elif self.config.task != "land":
             self._say("back, and landing")
-            self._go(self._task.world, _goal(self._task), _goal(self._landing))
-            self._run(self._landing, self._take_over(self._landing, self._task.world), "landing")
-            world = self._landing.world
+            try:  # the task has been measured, whatever happens now
+                end = _goal(self._landing)
+                world = self._go(world, _goal(self._task), end, "the way back")
+                observation = self._take_over(self._landing, world, "landing")
+                world = self._landing.world
+                self._run(self._landing, observation, "landing")
+            except FlightError as error:
+                return result._replace(phases=tuple(self.phases), ended=str(error))
         for autopilot in self.team.offboard:
             # By force: PX4 itself may not have noticed yet that it has landed.
             autopilot.arm(False, force=True)
         self.team.settle(world)  # so that they do, and close their logs
-        return result
+        return result._replace(phases=tuple(self.phases), ended=ended)
 
     def _arm(self, vec: MultiliftVec) -> np.ndarray:
         """Begin a take-off, arm the autopilots there, and return its first observation."""
@@ -136,7 +180,16 @@ class Flight:
 
     def _measure_task(self, make_policy: Maker, observation: np.ndarray, on_step: OnStep | None) -> FlightResult:
         self._say(f"{self.config.task}, {self._task.max_steps * self._task.task.dt:g} s")
-        return _measure(self._task, make_policy(self._task), observation, self.team, on_step)
+        self._begin(self.config.task)
+
+        def note(vec: MultiliftVec) -> None:
+            self._note(vec.world, vec.task.dt)
+            if on_step is not None:
+                on_step(vec)
+
+        if on_step is not None:
+            on_step(self._task)
+        return _measure(self._task, make_policy(self._task), observation, self.team, note)
 
     def fly_ours(self, make_policy: Maker) -> FlightResult:
         """Fly the same task from the same state with the geometric controller in place of autopilots."""
@@ -144,12 +197,11 @@ class Flight:
         observation, _ = vec.reset(seed=self.seed, options={"state": self.start, "randomization": self._drawn()})
         return _measure(vec, make_policy(vec), observation)
 
-    def _part(self, task: str, options: dict[str, Any]) -> Config:
-        """Return the configuration of take-off or landing by the same rig."""
+    def _part(self, task: str, seconds: float, options: dict[str, Any]) -> Config:
+        """Return the configuration of another task by the same rig."""
         values = {key: value for key, value in self.config.model_dump().items() if key not in _OWN}
-        lasting = {"takeoff": 10.0, "land": 12.0}[task]
         overrides = {f"task_options.{key}": value for key, value in options.items()}
-        overrides |= {"task": task, "env.episode_seconds": lasting, "control.action": "reference"}
+        overrides |= {"task": task, "env.episode_seconds": seconds, "control.action": "reference"}
         return build_config(values, overrides)
 
     def _make(self, config: Config) -> MultiliftVec:
@@ -165,47 +217,84 @@ class Flight:
 
     def _run(self, vec: MultiliftVec, observation: np.ndarray, what: str) -> None:
         policy = make_scripted(SCRIPT, vec)
+        self._begin(what)
         for _ in range(vec.max_steps):
             observation, _, terminated, _, info = vec.step(policy.act(observation))
+            self._note(vec.world, vec.task.dt)
             if terminated[0]:
                 cause = vec.failure_causes[info["failure_cause"][0]]
                 raise FlightError(f"{what} failed after {vec.steps[0] * vec.task.dt:.1f} s: {cause}")
 
-    def _go(self, world: World, begin: Goal, end: Goal) -> None:
-        """Move the formation along a line, at rest at both ends."""
-        # Wrapped to [-π, π): the team turns the shorter way round.
-        way, turn = end.slots - begin.slots, np.remainder(end.yaw - begin.yaw + np.pi, 2 * np.pi) - np.pi
-        # As long as the farthest drone takes at SPEED and the turn at 0.5 rad/s, a second at least.
-        seconds = max(float(np.linalg.norm(way, axis=1).max()) / SPEED, abs(turn) / 0.5, 1.0)
-        ticks = round((seconds + _HOLD) * self.config.sim.control_hz)
-        for tick in range(ticks):
-            share, rate, change, _ = ease(tick / self.config.sim.control_hz, 0.0, seconds)
-            force = begin.cable_force + share * (end.cable_force - begin.cable_force)
-            motion = np.stack([begin.slots + share * way, rate * way, change * way], axis=1)
-            self.team.tick(world, partial(self._send, motion, force, begin.yaw + share * turn))
+    def _go(self, world: World, begin: Goal, end: Goal, what: str) -> World:
+        """Fly to where the team rests at `end`, its formation turned as a body, and return the world that is left."""
+        if (way := plan_way(self.config, begin, end)) is not None:
+            seconds, options = way
+            vec = self._make(self._part("track", seconds, options))
+            self._run(vec, self._take_over(vec, world, what), what)
+            world, begin = vec.world, _goal(vec)
+        else:
+            self._begin(what)
+        turn = _wrapped(end.yaw - begin.yaw)
+        seconds, dt = abs(turn) / _TURNING, 1.0 / self.config.sim.control_hz
+        still = np.zeros_like(end.slots)
+        motion = np.stack([end.slots, still, still], axis=1)
+        for tick in range(round((seconds + _HOLD) / dt)):
+            share = ease(tick * dt, 0.0, max(seconds, dt))[0]
+            self.team.tick(world, partial(self._send, motion, end.cable_force, begin.yaw + share * turn))
             world.step(world.thrust, world.system.control_interval)
+            self._note(world, dt)
+        return world
 
     def _send(self, motion: np.ndarray, cable_force: np.ndarray, yaw: float, drone: int) -> None:
         self.team.send(drone, motion[drone], cable_force[drone], yaw + self.team.heading[drone])
 
-    def _take_over(self, vec: MultiliftVec, world: World) -> np.ndarray:
+    def _take_over(self, vec: MultiliftVec, world: World, what: str) -> np.ndarray:
         """Begin an episode in the state of another world, and return its first observation."""
         self._begun = {name: array.copy() for name, array in world.state._asdict().items() if name not in _FOLLOWING}
         options = {"state": self._begun, "randomization": self._drawn()}
         try:
             observation, _ = vec.reset(seed=self.seed, options=options)
         except ValueError as error:  # a failure from the start, or cables that would be torn
-            raise FlightError(f"{vec.config.task} cannot begin where the team is: {error}") from None
+            last = self.phases[-1].name
+            raise FlightError(f"after {last}, {what} cannot begin where the team is: {error}") from None
         self.team.board(vec.world)
         return observation
+
+    def _begin(self, name: str) -> None:
+        self.phases.append(Phase(name, 0.0, np.inf, 0.0, 0.0))
+
+    def _note(self, world: World, seconds: float) -> None:
+        self.phases[-1] = self.phases[-1].joined(world.state, float(world.stats.tension_peak[0]), seconds)
 
 
 _FOLLOWING = ("cable_tension", "cable_broken")  # from the places
 
 
 def _goal(vec: MultiliftVec) -> Goal:
-    goal = vec.task.goal
-    return Goal(goal.slots[0].copy(), goal.cable_force[0].copy(), float(goal.drone_yaw[0]), float(goal.position[0, 2]))
+    goal = vec.task.planned  # where controllers are to hold the team: in `pose` that is not its target yet
+    x, y, z = goal.position[0].tolist()
+    pose = x, y, z, float(heading(tuple(goal.rotation[0].ravel())))
+    return Goal(goal.slots[0].copy(), goal.cable_force[0].copy(), float(goal.drone_yaw[0]), pose)
+
+
+def plan_way(config: Config, begin: Goal, end: Goal) -> tuple[float, dict[str, Any]] | None:
+    """Return how long the way between two goals takes with a rest at its end [s], and its `task_options` of `track`.
+
+    The payload goes on a straight line and turns the shorter way round, and the formation with it. None if it is there.
+    """
+    before, after = np.array(begin.pose), np.array(end.pose)
+    after[3] = before[3] + _wrapped(after[3] - before[3])
+    if np.abs(after - before).max() < _NEAR:
+        return None
+    places = tuple(before.tolist()), tuple(after.tolist())
+    path = plan_waypoints(places, None, (SPEED, SPEED), (ACCELERATION, ACCELERATION), config.system)
+    options = {"path": "waypoints", "waypoints": places, "waypoint_times": path.times.tolist()}
+    return float(path.times[-1]) + _HOLD, options
+
+
+def _wrapped(angle: float) -> float:
+    """Return an angle in [-π, π)."""
+    return float(np.remainder(angle + np.pi, 2 * np.pi) - np.pi)
 
 
 def _measure(
@@ -222,8 +311,6 @@ def _measure(
         if team is not None:
             estimates.append((team.error() ** 2).mean())
 
-    if on_step is not None:
-        on_step(vec)
     metrics = measure_episodes(vec, policy, observation, record)
     estimate = float(np.sqrt(np.mean(estimates))) if estimates else float("nan")
     return FlightResult(metrics, tracer.trace(), float(np.sqrt(np.mean(drones))), estimate)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -21,6 +22,7 @@ from multilift_marl.rig.system import System
 
 BUILD = "build/px4_sitl_default"
 _PR_SET_PDEATHSIG = 1  # of Linux's prctl
+PX4_PORT = 14580  # of the first PX4, where it hears set-points by UDP; the next ones have the next
 _GRACE = 5.0  # [s] for PX4s to end by themselves
 _RATE_CROSSOVER = 18.5  # [rad/s] of the rate loop: PX4's gain of 0.15 by its iris' 123 rad/s² at a set-point of 1
 _RATE_INTEGRAL, _RATE_DERIVATIVE = 24.6, 0.37  # of the iris alike
@@ -89,6 +91,18 @@ def _end_with_parent() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
+def _check_port(index: int) -> None:
+    """Refuse a port that PX4 would not get: it starts without, and hears nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", PX4_PORT + index))
+        except OSError as error:
+            raise FlightError(
+                f"port {PX4_PORT + index} of PX4 {index} is taken ({error.strerror}); end what listens there, or give "
+                "another instance=<number>"
+            ) from None
+
+
 class Autopilots:
     """Running PX4s; a context that ends them.
 
@@ -116,6 +130,7 @@ class Autopilots:
             raise
 
     def _start(self, build: Path, index: int, parameters: Mapping[str, float], log: bool) -> None:
+        _check_port(index)
         folder = self.folder / str(index)
         folder.mkdir()
         values = {**USUAL, **({"SDLOG_MODE": 0} if log else {}), **parameters}

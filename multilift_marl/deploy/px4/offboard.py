@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from multilift_marl.deploy.px4.launch import PX4_PORT
 from multilift_marl.deploy.px4.link import HOST
 from multilift_marl.deploy.px4.mavlink import MAVLink, Splitter, mavlink
 from multilift_marl.errors import FlightError, shorten
 
-OWN_PORT, PX4_PORT = 14540, 14580
+OWN_PORT = 14540
 OFFBOARD, LAND = (6, 0), (4, 6)  # main and sub mode of PX4
 POSITION_MASK = mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 ACCELERATION_MASK = 0x3F | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
