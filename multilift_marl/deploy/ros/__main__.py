@@ -80,7 +80,10 @@ def _run(values: dict[str, Any]) -> int:
     limit_torch_threads()
     node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
     where = "all networks" if options.allow_network else "this machine alone"
-    ending = f"in domain {options.domain}, for {where} (Ctrl-C ends it)"
+    setting = "ROS_LOCALHOST_ONLY" if options.ros == "humble" else "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    here = {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}[setting]
+    peers = f"{setting} unset" if options.allow_network else f"{setting}={here}"
+    ending = f"in domain {options.domain}, for {where}; ROS 2 nodes need {peers} (Ctrl-C ends it)"
     if options.role == "policy":
         _fly(options, config, policy, node, ending)
     else:
