@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import sys
+import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from multilift_marl.sim.earth import Site, project_local
 
 pytest.importorskip("pymavlink")  # of the px4 extra
 pytest.importorskip("rosbags")  # of the ros extra
+pytest.importorskip("cyclonedds")
 if sys.platform == "win32":
     pytest.skip("PX4 flies on Linux and macOS alone", allow_module_level=True)
 from fake_px4 import FIRST, FakePX4, are_free
@@ -30,9 +34,13 @@ from multilift_marl.deploy.px4.flight import Flight, check_config
 from multilift_marl.deploy.px4.launch import rig_parameters
 from multilift_marl.deploy.px4.link import PORT
 from multilift_marl.deploy.px4.team import AutopilotController, AutopilotTeam, Settings
+from multilift_marl.deploy.ros.dds import Node
+from multilift_marl.deploy.ros.live import LivePublisher, SetPoints, subscribe_places
+from multilift_marl.deploy.ros.messages import NAMES, ODOMETRY, Topic, pose_stamped, setpoint_topics
 from multilift_marl.sensing.sensors import Sensor, SensorSuite
 
 DT = 0.004
+DOMAIN = 170 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 FAST = Sensor(250.0)
 EXACT = SensorSuite(FAST, FAST, Sensor(50.0), Sensor(50.0), Sensor(50.0), Sensor(50.0))
 
@@ -156,6 +164,54 @@ def test_a_team_flies_from_the_ground_through_a_task_and_back(tmp_path):
     ours = flight.fly_ours(lambda vec: make_scripted("formation_integral", vec))
     np.testing.assert_allclose(ours.trace.payload_position[0], result.trace.payload_position[0], atol=0.02)
     assert ours.metrics["payload_position_error_m"][0] < 0.05
+
+
+@pytest.mark.slow
+def test_others_fly_autopilots_by_topics_that_they_hear_live():
+    """A node that sends each drone to its slot as soon as it has heard of it; steps wait for that."""
+    nothing_hidden = {"randomization.payload_force": 0.0, "randomization.payload_mass": 0.0}
+    config = config_of("hover", **nothing_hidden, **{"env.episode_seconds": 3.0})
+    here, there, over = Node(domain=DOMAIN), Node(domain=DOMAIN), threading.Event()
+    drones = range(2)
+    stamps, slots = [], []
+
+    def steer() -> None:
+        takes = [there.subscription(Topic(f"/drone_{n}/odom", ODOMETRY)) for n in drones]
+        sends = [there.publisher(setpoint_topics(NAMES["multilift"], n)[0]) for n in drones]
+        clock = there.subscription(Topic("/clock", "rosgraph_msgs/msg/Clock"))
+        while not over.is_set():
+            there.wait(0.05)
+            stamps.extend(each.clock.sec + 1e-9 * each.clock.nanosec for each in clock())
+            for n in drones:
+                if takes[n]() and slots:
+                    sends[n](pose_stamped(there.store, 0, slots[0][n], np.eye(3)))
+
+    def bind(vec):
+        slots.append(vec.task.goal.slots[0].copy())
+        return SetPoints(vec, subscribe_places(here, "multilift", 2), here.wait, 1.0)
+
+    thread = threading.Thread(target=steer)
+    thread.start()
+    try:
+        with Airfield(config.system) as field:
+            publisher, said = LivePublisher(here, "multilift"), []
+            watch = partial(_send, publisher, field.team)
+            flight = Flight(config, field.team, 1000, said.append, watch)
+            result = flight.fly(bind)
+            lasted = field.team.time
+    finally:
+        over.set()
+        thread.join()
+    assert result.ended == "" and [phase.name for phase in result.phases][2] == "hover"
+    assert result.metrics["payload_position_error_m"][0] < 0.1
+    # the whole flight was heard, by the time of the autopilots
+    assert (np.diff(stamps) >= 0).all() and len(stamps) > 500 and stamps[-1] > lasted - 2.0
+    least = min(phase.separation for phase in result.phases)
+    assert 0.35 < least < 2.0 and all(phase.tilt < 45 for phase in result.phases)
+
+
+def _send(publisher, team, vec) -> None:
+    publisher.send(vec, round(team.time * 1e9))
 
 
 @pytest.mark.slow

@@ -47,6 +47,10 @@ DT = 0.004
         (["px4=/nowhere", "config=loss"], "PX4 cannot fly config=loss"),
         (["px4=/nowhere", "instance=12"], "instance"),
         (["px4=/nowhere", "policy=formations"], "unknown policy 'formations'"),
+        (["px4=/nowhere", "policy=none"], "set live=true"),
+        (["px4=/nowhere", "policy=none", "live=true", "names=report"], "by topics of names=multilift"),
+        (["px4=/nowhere", "policy=none", "live=true", "control.action=ctbr"], "control.action=reference, not ctbr"),
+        (["px4=/nowhere", "policy=none", "live=true"], "px4=/nowhere holds no PX4"),
     ],
 )
 def test_what_cannot_be_flown_is_said_in_one_sentence(arguments, words, capsys, monkeypatch, tmp_path):

@@ -45,14 +45,19 @@ def rest_at(end: Goal, begin: Goal) -> tuple[np.ndarray, ...]:
     """Return motions (T, 2, 3, 3), cable forces (T, 2, 3) and headings (T, 2) of a team whose payload is there."""
     flight = Flight.__new__(Flight)
     flight.config, flight.team, flight.phases = record(sim=record(control_hz=HZ)), Recorder(), []
+    watched: list = []
+    flight._watch = watched.append
     rotation = np.tile(np.eye(3), (1, 2, 1, 1))
     state = record(drone_position=np.eye(3)[None, :2], drone_rotation=rotation, cable_tension=np.ones((1, 2)))
     system, stats = record(control_interval=4), record(tension_peak=np.ones(1))
     world = record(thrust=None, step=lambda *_: None, system=system, state=state, stats=stats)
-    assert flight._go(world, begin, end, "way") is world
+    vec = record(world=world, task=record(dt=2 / HZ))
+    assert flight._go(vec, begin, end, "way") is vec
     assert [each[0] for each in flight.team.sent[:4]] == [0, 1, 0, 1]
     (phase,) = flight.phases
-    assert phase[:2] == ("way", pytest.approx(len(flight.team.sent) / 2 / HZ)) and phase.separation == 2**0.5
+    steps = len(flight.team.sent) // 4  # two ticks of two drones
+    assert phase[:2] == ("way", pytest.approx(steps * 2 / HZ)) and phase.separation == 2**0.5
+    assert watched == [vec] * steps
     return tuple(np.array([each[k] for each in flight.team.sent]).reshape(-1, 2, *shape)
                  for k, shape in ((1, (3, 3)), (2, (3,)), (3, ())))  # fmt: skip
 
@@ -150,9 +155,9 @@ class Rehearsal(Flight):
     def _run(self, vec, observation, what):
         self.part(what)
 
-    def _go(self, world, begin, end, what):
+    def _go(self, vec, begin, end, what):
         self.part(what)
-        return world
+        return vec
 
     def _measure_task(self, *_):
         self.part("hover")

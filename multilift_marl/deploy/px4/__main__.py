@@ -8,13 +8,14 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
 from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
-from multilift_marl.agents.policy import NamedPolicy, find_policy
+from multilift_marl.agents.policy import find_policy
 from multilift_marl.command import CommandOptions, limit_torch_threads, make_folder, run_command, split_options, title
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
@@ -24,14 +25,19 @@ from multilift_marl.evaluation.metrics import format_table, make_report, write_r
 from multilift_marl.schema.values import Between, Float, Int
 
 if TYPE_CHECKING:
-    from multilift_marl.deploy.px4.flight import Flight, FlightResult, Phase
+    from multilift_marl.deploy.px4.flight import Flight, FlightResult, Maker, OnStep, Phase
+    from multilift_marl.deploy.px4.team import AutopilotTeam
+    from multilift_marl.deploy.ros.dds import Node
+    from multilift_marl.deploy.ros.live import SetPoints
 
 _USAGE = """Fly one episode of a task by PX4 autopilots, in lockstep with the simulation: from slack cables on the
 ground to the task, back, and down again; then the same task by the controller of this package.
 
   python -m multilift_marl.px4 config=hover policy=formation_integral px4=~/PX4-Autopilot [key=value ...]
 
-Everything stays on this machine (127.0.0.1). Any configuration key changes the environment: env.num_drones=6."""
+With live=true the flight is on ROS 2 topics, see docs/ros.md; with policy=none others fly the task, by
+/drone_<i>/setpoint. Everything stays on this machine (127.0.0.1) unless allow_network=true. Any configuration key
+changes the environment: env.num_drones=6."""
 OURS = "geometric controller"
 
 
@@ -39,7 +45,10 @@ class Options(CommandOptions):
     """Keys of the command beside those of the configuration."""
 
     config: str | None = Field(None, description="the task, name or path; None: what a policy was trained in, or hover")
-    policy: str = Field("formation_integral", description="a baseline, a run, module:Class, .onnx, .pt")
+    policy: str = Field(
+        "formation_integral",
+        description="a baseline, a run, module:Class, .onnx, .pt; none: others' set-points, with live=true",
+    )
     px4: str | None = Field(None, description="PX4's folder, with a build of px4_sitl_default; None: PX4_DIR")
     seed: Int = Field(1000, ge=0, description="evaluation seed: the episode is the first of evaluate.py")
     speed: Annotated[Float, Between(0, 100, "-")] = Field(
@@ -53,8 +62,14 @@ class Options(CommandOptions):
         {}, description="of PX4, in place of ours: parameters={MPC_XY_P: 1.2}"
     )
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the task, see docs/ros.md")
-    ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of that bag")
-    names: Literal["multilift", "report"] = Field("multilift", description="of its topics: ours or the report's")
+    live: bool = Field(False, description="whether the whole flight is published on ROS 2 topics, by DDS")
+    ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of bag and peers")
+    names: Literal["multilift", "report"] = Field("multilift", description="of the topics: ours or the report's")
+    domain: Annotated[Int, Between(0, 232)] = Field(0, description="ROS_DOMAIN_ID of the peers")
+    allow_network: bool = Field(False, description="whether other machines may hear and fly it, by multicast")
+    patience: Annotated[Float, Between(0, 10, "s")] = Field(
+        0.1, description="[s] of real time that a step waits for the set-points of others, with policy=none"
+    )
     log: bool = Field(False, description="also the flight logs of PX4, .ulg")
     out: str | None = Field(None, description="folder for metrics.json, plots and logs; None: runs/px4-...")
 
@@ -69,9 +84,14 @@ def _fly(values: dict[str, Any]) -> int:
     from multilift_marl.deploy.px4.launch import find_px4
 
     options, overrides = split_options(Options, values)
-    policy = find_policy(options.policy)
-    config = check_config(_find_config(options, policy.config, overrides))
-    policy.check(config, "policy")
+    policy = None if options.policy == "none" else find_policy(options.policy, others=["none"])
+    if policy is None and not (options.live and options.names == "multilift"):
+        raise ConfigError("with policy=none others fly the team, by topics of names=multilift; set live=true")
+    config = check_config(_find_config(options, None if policy is None else policy.config, overrides))
+    if policy is not None:
+        policy.check(config, "policy")
+    elif config.control.action != "reference":
+        raise ConfigError(f"set-points of others are for control.action=reference, not {config.control.action}")
     folder = options.px4 or os.environ.get("PX4_DIR")
     if not folder:
         raise ConfigError(
@@ -89,22 +109,38 @@ def _fly(values: dict[str, Any]) -> int:
         check_free(Path(options.bag))
     limit_torch_threads()
     with ending_at_once():
-        policy.bind(MultiliftVec(config))  # refuses what does not fit, before anything starts
+        vec = MultiliftVec(config)
+        if policy is not None:
+            policy.bind(vec)  # refuses what does not fit, before anything starts
     name = f"px4-{title({'config': options.config or config.task})}-{Path(options.policy).stem}"
     out = make_folder(Path(options.out) if options.out else Path("runs") / name / time.strftime("%Y%m%d-%H%M%S"))
 
     try:
-        return _fly_and_report(config, policy, options, build, out)
+        return _fly_and_report(config, None if policy is None else policy.bind, options, build, out)
     except BaseException:
         with suppress(OSError):
             out.rmdir()  # if nothing has been written
         raise
 
 
-def _fly_and_report(config: Config, policy: NamedPolicy, options: Options, build: Path, out: Path) -> int:
-    """Fly by PX4 and by our controller; write and print the results; return 1 if the flight ended before its end."""
+def _fly_and_report(config: Config, bind: Maker | None, options: Options, build: Path, out: Path) -> int:
+    """Fly by PX4 and by our controller; write and print the results; return 1 if the flight ended before its end.
+
+    `bind` returns the policy for environments; None: others fly the team.
+    """
     from multilift_marl.deploy.px4.flight import Flight
     from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
+
+    node = _open_node(options) if options.live else None
+    setpoints: list[SetPoints] = []
+
+    def bind_others(vec: MultiliftVec) -> SetPoints:
+        from multilift_marl.deploy.ros.live import SetPoints, subscribe_places
+
+        assert node is not None
+        take = subscribe_places(node, options.names, vec.num_drones)
+        setpoints.append(SetPoints(vec, take, node.wait, options.patience))
+        return setpoints[0]
 
     begin = time.perf_counter()
     settings = Settings(
@@ -112,15 +148,16 @@ def _fly_and_report(config: Config, policy: NamedPolicy, options: Options, build
         log=options.log, parameters=options.parameters,
     )  # fmt: skip
     with interrupted_by_signals(), AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
-        flight = Flight(config, team, options.seed, lambda text: print(text, flush=True))
+        say = partial(print, flush=True)
+        flight = Flight(config, team, options.seed, say, _publish(node, team, options) if node else _ignore)
         try:
-            result = _record(flight, policy, options)
+            result = _record(flight, bind or bind_others, options)
         finally:
             if options.log:
                 _keep_logs(team.autopilots.folder if team.autopilots else None, out)
         factor = team.time / (time.perf_counter() - begin)
-    ours = flight.fly_ours(policy.bind)
-    report = make_report(config, options.seed, result.metrics, {OURS: ours.metrics})
+    ours = None if bind is None else flight.fly_ours(bind)
+    report = make_report(config, options.seed, result.metrics, {} if ours is None else {OURS: ours.metrics})
     report["px4"] = {
         "drone_error_m": result.drone_error, "estimate_error_m": result.estimate_error,
         "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
@@ -128,23 +165,49 @@ def _fly_and_report(config: Config, policy: NamedPolicy, options: Options, build
     }  # fmt: skip
     if options.speed:
         report["px4"]["lateness_s"] = dict(zip(("50 %", "99 %", "99.9 %"), team.clock.lateness().tolist(), strict=True))
-    report["baselines"][OURS]["drone_error_m"] = ours.drone_error
+    if setpoints:
+        report["px4"]["steps_without_setpoint"] = setpoints[0].late.tolist()
+        print(f"steps without a fresh set-point, by drone: {setpoints[0].late.tolist()}")
+    compared = ""
+    if ours is not None:
+        report["baselines"][OURS]["drone_error_m"] = ours.drone_error
+        compared = f", with our controller {100 * ours.drone_error:.1f} cm"
     print(f"\n{options.policy} on {config.task}, seed {options.seed}\n\n{format_table(report, 'PX4')}")
     print(
-        f"drones from their references: {100 * result.drone_error:.1f} cm, with our controller "
-        f"{100 * ours.drone_error:.1f} cm (RMS); PX4's estimates of their places: "
-        f"{100 * result.estimate_error:.1f} cm; {factor:.1f} times real time"
+        f"drones from their references: {100 * result.drone_error:.1f} cm{compared} (RMS); PX4's estimates of their "
+        f"places: {100 * result.estimate_error:.1f} cm; {factor:.1f} times real time"
     )
     print(describe_phases(result.phases))
     if options.speed:
         late = " / ".join(f"{1e3 * seconds:.2f}" for seconds in team.clock.lateness())
         print(f"steps began late by {late} ms (50 / 99 / 99.9 %)")
     write_report(out / "metrics.json", report)
-    _draw(out, {"PX4": result.trace, OURS: ours.trace})
+    _draw(out, {"PX4": result.trace} | ({} if ours is None else {OURS: ours.trace}))
     print(f"wrote {out / 'metrics.json'} and plots beside it")
     if result.ended:
         print(f"the flight ended early: {result.ended}", file=sys.stderr)
     return 1 if result.ended else 0
+
+
+def _open_node(options: Options) -> Node:
+    from multilift_marl.deploy.ros.bag import DISTRIBUTIONS
+    from multilift_marl.deploy.ros.dds import Node, describe_reach
+
+    node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
+    print(f"publishing {describe_reach(options.domain, options.allow_network, options.ros)}", flush=True)
+    return node
+
+
+def _publish(node: Node, team: AutopilotTeam, options: Options) -> OnStep:
+    """Return what publishes the environment that is flown, with the time since the autopilots began."""
+    from multilift_marl.deploy.ros.live import LivePublisher
+
+    publisher = LivePublisher(node, options.names)
+    return lambda vec: publisher.send(vec, round(team.time * 1e9))
+
+
+def _ignore(vec: MultiliftVec) -> None:
+    """Do nothing."""
 
 
 def describe_phases(phases: Sequence[Phase]) -> str:
@@ -155,10 +218,10 @@ def describe_phases(phases: Sequence[Phase]) -> str:
     return "\n".join(lines)
 
 
-def _record(flight: Flight, policy: NamedPolicy, options: Options) -> FlightResult:
+def _record(flight: Flight, bind: Maker, options: Options) -> FlightResult:
     """Fly, with a bag of the task if asked."""
     if options.bag is None:
-        return flight.fly(policy.bind)
+        return flight.fly(bind)
     from multilift_marl.deploy.ros.bag import BagWriter
 
     bags: list[BagWriter] = []
@@ -171,7 +234,7 @@ def _record(flight: Flight, policy: NamedPolicy, options: Options) -> FlightResu
             else:
                 bags[0].write(vec.steps[0] * vec.task.dt)
 
-        result = flight.fly(policy.bind, record)
+        result = flight.fly(bind, record)
     print(f"wrote {options.bag}")
     return result
 

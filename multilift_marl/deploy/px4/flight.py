@@ -101,6 +101,7 @@ class Flight:
         team: the autopilots.
         seed: evaluation seed; the episode is the first of `evaluate.py`.
         say: called with what goes on.
+        watch: called with the environment of the part that is flown, after each of its policy steps.
 
     Attributes:
         start: state in which the task began; empty for `takeoff`, which begins as ever.
@@ -110,8 +111,10 @@ class Flight:
         ConfigError: what autopilots cannot fly.
     """
 
-    def __init__(self, config: Config, team: AutopilotTeam, seed: int, say: Say = print):
-        self.config, self.team, self.seed, self._say = check_config(config), team, seed, say
+    def __init__(
+        self, config: Config, team: AutopilotTeam, seed: int, say: Say = print, watch: OnStep = lambda vec: None
+    ):
+        self.config, self.team, self.seed, self._say, self._watch = check_config(config), team, seed, say, watch
         self._task = self._make(config)
         self._task.reset(seed=seed)
         self._landing = self._make(self._part("land", _LANDING, {"pad_xy": 0.0, "pad_yaw": 0.0}))
@@ -144,8 +147,8 @@ class Flight:
             takeoff = self._make(self._part("takeoff", _TAKEOFF, rise))
             self._run(takeoff, self._arm(takeoff), "take-off")
             self._say("to the task")
-            world = self._go(takeoff.world, _goal(takeoff), first, "the way to the task")
-            observation = self._take_over(self._task, world, self.config.task)
+            way = self._go(takeoff, _goal(takeoff), first, "the way to the task")
+            observation = self._take_over(self._task, way.world, self.config.task)
             self.start = self._begun
         result = self._measure_task(make_policy, observation, on_step)
         ended, world = "", self._task.world
@@ -155,8 +158,8 @@ class Flight:
             self._say("back, and landing")
             try:  # the task has been measured, whatever happens now
                 end = _goal(self._landing)
-                world = self._go(world, _goal(self._task), end, "the way back")
-                observation = self._take_over(self._landing, world, "landing")
+                way = self._go(self._task, _goal(self._task), end, "the way back")
+                observation = self._take_over(self._landing, way.world, "landing")
                 world = self._landing.world
                 self._run(self._landing, observation, "landing")
             except FlightError as error:
@@ -183,7 +186,7 @@ class Flight:
         self._begin(self.config.task)
 
         def note(vec: MultiliftVec) -> None:
-            self._note(vec.world, vec.task.dt)
+            self._note(vec, vec.task.dt)
             if on_step is not None:
                 on_step(vec)
 
@@ -220,20 +223,21 @@ class Flight:
         self._begin(what)
         for _ in range(vec.max_steps):
             observation, _, terminated, _, info = vec.step(policy.act(observation))
-            self._note(vec.world, vec.task.dt)
+            self._note(vec, vec.task.dt)
             if terminated[0]:
                 cause = vec.failure_causes[info["failure_cause"][0]]
                 raise FlightError(f"{what} failed after {vec.steps[0] * vec.task.dt:.1f} s: {cause}")
 
-    def _go(self, world: World, begin: Goal, end: Goal, what: str) -> World:
-        """Fly to where the team rests at `end`, its formation turned as a body, and return the world that is left."""
+    def _go(self, vec: MultiliftVec, begin: Goal, end: Goal, what: str) -> MultiliftVec:
+        """Fly to where the team rests at `end`, its formation turned as a body; return the environment in which."""
         if (way := plan_way(self.config, begin, end)) is not None:
             seconds, options = way
-            vec = self._make(self._part("track", seconds, options))
-            self._run(vec, self._take_over(vec, world, what), what)
-            world, begin = vec.world, _goal(vec)
+            before, vec = vec, self._make(self._part("track", seconds, options))
+            self._run(vec, self._take_over(vec, before.world, what), what)
+            begin = _goal(vec)
         else:
             self._begin(what)
+        world = vec.world
         turn = _wrapped(end.yaw - begin.yaw)
         seconds, dt = abs(turn) / _TURNING, 1.0 / self.config.sim.control_hz
         still = np.zeros_like(end.slots)
@@ -242,8 +246,9 @@ class Flight:
             share = ease(tick * dt, 0.0, max(seconds, dt))[0]
             self.team.tick(world, partial(self._send, motion, end.cable_force, begin.yaw + share * turn))
             world.step(world.thrust, world.system.control_interval)
-            self._note(world, dt)
-        return world
+            if (tick + 1) % round(vec.task.dt / dt) == 0:
+                self._note(vec, vec.task.dt)
+        return vec
 
     def _send(self, motion: np.ndarray, cable_force: np.ndarray, yaw: float, drone: int) -> None:
         self.team.send(drone, motion[drone], cable_force[drone], yaw + self.team.heading[drone])
@@ -263,8 +268,10 @@ class Flight:
     def _begin(self, name: str) -> None:
         self.phases.append(Phase(name, 0.0, np.inf, 0.0, 0.0))
 
-    def _note(self, world: World, seconds: float) -> None:
+    def _note(self, vec: MultiliftVec, seconds: float) -> None:
+        world = vec.world
         self.phases[-1] = self.phases[-1].joined(world.state, float(world.stats.tension_peak[0]), seconds)
+        self._watch(vec)
 
 
 _FOLLOWING = ("cable_tension", "cable_broken")  # from the places

@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(values: dict[str, Any]) -> int:
     from multilift_marl.deploy.ros.bag import DISTRIBUTIONS
-    from multilift_marl.deploy.ros.dds import Node
+    from multilift_marl.deploy.ros.dds import Node, describe_reach
 
     options, overrides = split_options(Options, values)
     policy = None if options.policy == "none" else find_policy(options.policy, others=["none"])
@@ -79,11 +79,7 @@ def _run(values: dict[str, Any]) -> int:
         policy.check(config, "policy")
     limit_torch_threads()
     node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
-    where = "all networks" if options.allow_network else "this machine alone"
-    setting = "ROS_LOCALHOST_ONLY" if options.ros == "humble" else "ROS_AUTOMATIC_DISCOVERY_RANGE"
-    here = {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}[setting]
-    peers = f"{setting} unset" if options.allow_network else f"{setting}={here}"
-    ending = f"in domain {options.domain}, for {where}; ROS 2 nodes need {peers} (Ctrl-C ends it)"
+    ending = f"{describe_reach(options.domain, options.allow_network, options.ros)} (Ctrl-C ends it)"
     if options.role == "policy":
         _fly(options, config, policy, node, ending)
     else:

@@ -162,6 +162,16 @@ class Node:
         )
 
 
+def describe_reach(domain: int, allow_network: bool, distribution: str) -> str:
+    """Return in which domain a node is, who hears it, and what nodes of a distribution of ROS 2 need for that."""
+    humble = distribution == "humble"
+    setting = "ROS_LOCALHOST_ONLY" if humble else "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    where, value = (
+        ("all networks", " unset") if allow_network else ("this machine alone", "=1" if humble else "=LOCALHOST")
+    )
+    return f"in domain {domain}, for {where}; ROS 2 nodes need {setting}{value}"
+
+
 @cache
 def _carrier(distribution: Stores, kind: str) -> Any:
     """Return a class with the DDS type of a message, whose instances carry its bytes as they are."""

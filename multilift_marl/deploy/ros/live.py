@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -26,18 +27,26 @@ class SetPoints:
     Args:
         vec: one environment, of the action interface `reference`.
         take: for each drone, the call that returns the places and attitudes that have come, see `read_place`.
+        wait: waits for something new for some seconds at most, and says whether there is, see `Node.wait`.
+        patience: for which a step waits for the set-points of drones that had one lately [s].
 
     Attributes:
         age: of each drone's last set-point (N,) [s], infinite before the first.
         late: steps in which a drone had none that was fresh (N,).
     """
 
-    def __init__(self, vec: MultiliftVec, take: list[Callable[[], list[Any]]]):
+    def __init__(
+        self,
+        vec: MultiliftVec,
+        take: list[Callable[[], list[Any]]],
+        wait: Callable[[float], bool] = lambda seconds: False,
+        patience: float = 0.0,
+    ):
         if vec.config.control.action != "reference":
             raise ConfigError(
                 f"set-points are places, for control.action=reference, not {vec.config.control.action}; change it"
             )
-        self._vec, self._take = vec, take
+        self._vec, self._take, self._wait, self._patience = vec, take, wait, patience
         self._place = np.zeros((vec.num_drones, 3))
         self._yaw = np.zeros(vec.num_drones)
         self.age = np.full(vec.num_drones, np.inf)
@@ -52,14 +61,23 @@ class SetPoints:
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (1, N, 4) whose references are the set-points, as far as offsets go."""
         dt = self._vec.task.dt
-        for n, take in enumerate(self._take):
-            self.age[n] += dt
-            for place, rotation in take():
-                self._place[n], self.age[n] = place, 0.0
-                self._yaw[n] = np.arctan2(rotation[1, 0], rotation[0, 0])
+        self.age += dt
+        self._read()
+        end = time.monotonic() + self._patience
+        while ((self.age > 0.0) & (self.age <= HOLD_AFTER)).any():
+            if (rest := end - time.monotonic()) <= 0.0 or not self._wait(rest):
+                break
+            self._read()
         self.late += self.age > HOLD_AFTER
         sink(self._place, is_landing(self.age), dt)
         return self._actions()
+
+    def _read(self) -> None:
+        """Take over what has come."""
+        for n, take in enumerate(self._take):
+            for place, rotation in take():
+                self._place[n], self.age[n] = place, 0.0
+                self._yaw[n] = np.arctan2(rotation[1, 0], rotation[0, 0])
 
     def _actions(self) -> np.ndarray:
         goal, control = self._vec.task.planned, self._vec.config.acting
@@ -72,6 +90,40 @@ class SetPoints:
         numbers = [c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]]
         action = np.stack([*(number / control.max_offset for number in numbers), turned / control.max_yaw], axis=-1)
         return np.clip(action, -1, 1)[None].astype(np.float32)
+
+
+def subscribe_places(node: Node, names: str, num_drones: int) -> list[Callable[[], list[Any]]]:
+    """Return for each drone what takes its set-points, see `SetPoints`."""
+    topics = [setpoint_topics(NAMES[names], i)[0]._replace(reliable=False) for i in range(num_drones)]
+    return [node.subscription(topic, read_place) for topic in topics]
+
+
+class LivePublisher:
+    """Publishes environment 0 of one batch after another, on the same topics.
+
+    Args:
+        node: publishes.
+        names: of the topics, a key of `messages.NAMES`.
+        acts: whether actions fly the drones, and are published.
+    """
+
+    def __init__(self, node: Node, names: str, acts: bool = True):
+        self._node, self._names, self._acts = node, names, acts
+        self._publish: dict[str, Callable[[Any], None]] = {}
+        self._vec: MultiliftVec | None = None
+
+    def send(self, vec: MultiliftVec, time_ns: int, landing: np.ndarray | None = None) -> None:
+        """Publish the state as it is, at a time [ns]; `landing` are the drones (N,) whose set-points are lost."""
+        if vec is not self._vec:
+            self._vec, self._messages = vec, FlightMessages(vec, self._node.store, self._names, self._acts)
+            for topic in self._messages.topics():
+                if topic.name not in self._publish:
+                    self._publish[topic.name] = self._node.publisher(topic)
+        if landing is not None:
+            self._messages.landing = landing
+        self._node.check_publishers()
+        for name, message in self._messages.messages(time_ns):
+            self._publish[name](message)
 
 
 class LiveFlight:
@@ -89,18 +141,16 @@ class LiveFlight:
     """
 
     def __init__(self, vec: MultiliftVec, node: Node, names: str = "multilift", policy: Policy | None = None):
-        self._vec, self._node = vec, node
+        self._vec = vec
         by_motion = policy is None and NAMES[names].is_report
-        self._messages = FlightMessages(vec, node.store, names, acts=not by_motion)
-        self._publish = {topic.name: node.publisher(topic) for topic in self._messages.topics()}
+        self._publisher = LivePublisher(node, names, acts=not by_motion)
         self.setpoints: SetPoints | TopicAutopilots | None = None
         if by_motion:
             self.setpoints = TopicAutopilots(vec.config, vec.world, node)
             vec.use_controller(self.setpoints)
             policy = make_scripted("formation", vec)  # whose actions do not count
         elif policy is None:
-            topics = [setpoint_topics(NAMES[names], i)[0]._replace(reliable=False) for i in range(vec.num_drones)]
-            self.setpoints = policy = SetPoints(vec, [node.subscription(topic, read_place) for topic in topics])
+            self.setpoints = policy = SetPoints(vec, subscribe_places(node, names, vec.num_drones))
         self._policy: Policy = policy
         self.time_ns = 0
 
@@ -117,7 +167,6 @@ class LiveFlight:
         """
         self._observation, _, terminated, truncated, _ = self._vec.step(self._policy.act(self._observation))
         self.time_ns += round(self._vec.task.dt * 1e9)
-        self._node.check_publishers()
         self._send()
         if terminated[0] or truncated[0]:
             self._observation, _ = self._vec.reset()
@@ -128,7 +177,5 @@ class LiveFlight:
         return True
 
     def _send(self) -> None:
-        if self.setpoints is not None:
-            self._messages.landing = is_landing(self.setpoints.age)
-        for topic, message in self._messages.messages(self.time_ns):
-            self._publish[topic](message)
+        landing = None if self.setpoints is None else is_landing(self.setpoints.age)
+        self._publisher.send(self._vec, self.time_ns, landing)
