@@ -158,6 +158,11 @@ MPC = {
     "control.disturbance": "none",
 }
 """Actions of the central planner, which knows all states and the path ahead."""
+OWN_PLANNERS: dict[str, dict[str, Any]] = {
+    # where delays of up to two steps and hidden cables come with thrusts near their limits
+    "track_realistic_5_8": {"planner.lead": 0.08, "planner.least_tension": 0.2, "planner.tension": 0.1},
+}
+"""Settings of the planner that differ from the defaults, by flight."""
 PLANNED_EPISODES = 250
 """Of the central planner, which takes a millisecond a step of each."""
 

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from flights import FLIGHTS, HERE, MPC, ROOT, SCRIPTED, SEED, episodes_of, error_metric
+from flights import FLIGHTS, HERE, MPC, OWN_PLANNERS, ROOT, SCRIPTED, SEED, episodes_of, error_metric
 from searched import SEARCHED, settings_of
 from tables import write_tables
 
@@ -198,6 +198,11 @@ def can_plan(config: Config) -> bool:
     return True
 
 
+def planner_of(flight: str) -> dict[str, Any]:
+    """Return the settings of the central planner."""
+    return MPC | OWN_PLANNERS.get(flight, {})
+
+
 def fly(job: Job) -> str:
     """Simulate a policy's episodes, write the results, and return a line about them."""
     import torch
@@ -217,7 +222,7 @@ def fly(job: Job) -> str:
         maker = policy.bind
         overrides = overrides | scales
     else:
-        settings = {"searched": settings_of, "mpc": lambda _: MPC}.get(job.team, lambda _: SCRIPTED)
+        settings = {"searched": settings_of, "mpc": planner_of}.get(job.team, lambda _: SCRIPTED)
         overrides = overrides | settings(job.flight)
     results = run_episodes(load_config(flight.config, overrides), maker, episodes_of(job.team), SEED)
     metrics = summarize(results)

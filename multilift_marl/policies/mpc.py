@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 
-SHARE = 0.6  # of what sensors say beside the prediction, by which states are corrected
+SHARE = 0.6  # of what filters of sensors say beside the prediction, by which states are corrected
+UNFILTERED = 0.35  # of what `randomization.observation_noise` leaves, which no filter has smoothed
 ENOUGH = {  # full scales of actions that limit no usual flight, and those to set
     "acc_rates": {"max_acceleration": (10.0, 25.0), "max_tilt_rate": (8.0, 15.0)},
     "full_state": {
@@ -79,12 +80,14 @@ class TeamMpc:
         self._vec, settings = vec, config.planner
         self.planner = (HardPlanner if settings.limits == "hard" else TeamPlanner)(system, settings, vec.num_envs)
         self._dt = vec.task.dt
-        noise = settings.estimate_noise or (0.5 if config.env.sensing == "ideal" else 1.0)
+        exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
+        noise = settings.estimate_noise or (0.5 if exact else 1.0)
         self._estimator = ForceEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None
         self._observer = None
-        if config.env.sensing != "ideal":
+        if not exact:
             late = CAMERA_DELAY if config.env.sensing == "mocap" else 0.0
-            self._observer = TeamObserver(self.planner.model, vec.num_envs, SHARE, late)
+            share = UNFILTERED if config.env.sensing == "ideal" else SHARE
+            self._observer = TeamObserver(self.planner.model, vec.num_envs, share, late)
         lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)
         self._full_state = None
         if config.control.action == "full_state":

@@ -108,7 +108,8 @@ class Sensing:
             unknown: Any = dict.fromkeys(name for name in SystemState._fields if name.startswith("payload_"))
             self.state = estimator.state._replace(**unknown)
         elif has_noise:
-            self.state = SystemState.zeros(e, n)
+            exact = {name: getattr(world.state, name) for name in ("rotor_speed", "cable_tension", "cable_broken")}
+            self.state = SystemState.zeros(e, n)._replace(**exact)
         self.load = self._load_sensing.load if self._load_sensing else true_load(self.state)
         self.measures = has_noise or estimator is not None
         self.errors = Errors.zeros(e, self.load.position.shape[1]) if self.measures else None

@@ -47,6 +47,11 @@ def test_it_holds_what_it_does_not_know():
 
 
 @pytest.mark.slow
+def test_noise_costs_a_centimetre():
+    noisy = fly("hover", {"randomization.observation_noise": 1.0}, episodes=6, seconds=8.0)
+    assert noisy["success_rate"].all() and (noisy["payload_position_error_m"] < 0.02).all()
+
+
 def test_late_cameras_cost_a_centimetre():
     assert (fly("track", FAST | {"env.sensing": "mocap"})["payload_rmse_m"] < 0.02).all()
 

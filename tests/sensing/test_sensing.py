@@ -49,6 +49,16 @@ def test_noise_has_the_standard_size_is_white_and_of_each_its_own(factor):
     assert turned.std() == pytest.approx(factor * 0.01, rel=0.05)
 
 
+def test_what_has_no_noise_is_known_as_it_is():
+    vec = make(num_envs=2, num_drones=4, **NOISE)
+    vec.reset(seed=0)
+    vec.step(np.full((2, 4, vec.action_size), 0.3, np.float32))
+    known, true = vec.task.view.estimated, vec.world.state
+    for name in ("rotor_speed", "cable_tension", "cable_broken"):
+        assert np.array_equal(getattr(known, name), getattr(true, name)), name
+    assert (known.rotor_speed > 100).all() and (known.cable_tension > 0).all()
+
+
 def test_noise_is_consistent_over_the_parts_of_an_observation():
     vec, gap = errors_of(NOISE, steps=3)
     own = gap[..., columns(vec, "slot_error")]
