@@ -292,3 +292,13 @@ def test_impossible_options_are_refused():
     assert "before it begins" in refusal(ml.make_vec, "pose", **{"task_options.target_share": [0.5, 0.2]})
     low = {"task_options.target_height": [0.1, 0.1]}
     assert "can hold hardly any" in refusal(lambda: make("pose", num_envs=1, **low).reset())
+
+
+def test_errors_count_in_the_last_second_of_every_target_alone():
+    """Three targets of 4 s, the last one cut off after 3.5 s; times are ends of steps."""
+    options = {"task_options.target_seconds": 4.0, "task_options.success_seconds": 1.0}
+    task = ml.make_vec("pose", num_envs=1, **options, **{"env.episode_seconds": 11.5}).task
+    counted = [k / 50 for k in range(1, 576) if task.in_error_window(k / 50, 11.5)]
+    windows = [(3.0, 4.0), (7.0, 8.0), (10.5, 11.5)]
+    assert counted == [k / 50 for k in range(1, 576) if any(a < k / 50 <= b for a, b in windows)]
+    assert task.success_windows() == tuple(windows)
