@@ -146,6 +146,19 @@ def test_a_flight_that_does_not_start_leaves_no_empty_folder(tmp_path, monkeypat
     assert not (tmp_path / "flight").exists()
 
 
+@pytest.mark.parametrize(
+    ("settings", "warned"),
+    [({}, True), ({"control.position_frequency": None}, True), ({"control.position_frequency": 2.1}, False)],
+)
+def test_policies_that_know_faster_drones_alone_are_warned_of(settings, warned, caplog):
+    command._warn_of_loops("mine", None)  # baselines know no drones
+    assert not caplog.records
+    name = f"mine_{len(settings)}_{warned}_{settings.get('control.position_frequency', 0)}"  # warnings come once each
+    command._warn_of_loops(name, ml.load_config("hover", settings))
+    assert [each.name for each in caplog.records] == ["multilift_marl.px4"] * warned
+    assert warned == (f"policy={name} was trained with drones" in caplog.text)
+
+
 def test_more_drones_than_px4_has_instances_are_refused(tmp_path, capsys):
     stub(tmp_path, "exit 0")
     assert command.main([f"px4={tmp_path}", "instance=7", "env.num_drones=4", f"out={tmp_path / 'out'}"]) == 2

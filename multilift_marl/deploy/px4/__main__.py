@@ -20,7 +20,7 @@ from multilift_marl.command import CommandOptions, limit_torch_threads, make_fol
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.errors import ConfigError
+from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.evaluation.metrics import format_table, make_report, write_report
 from multilift_marl.schema.values import Between, Float, Int
 
@@ -39,6 +39,7 @@ With live=true the flight is on ROS 2 topics, see docs/ros.md; with policy=none 
 /drone_<i>/setpoint. Everything stays on this machine (127.0.0.1) unless allow_network=true. Any configuration key
 changes the environment: env.num_drones=6."""
 OURS = "geometric controller"
+SLOW_LOOP = 2.5  # [rad/s] of position, up to which a policy may know what drones under PX4 are like
 
 
 class Options(CommandOptions):
@@ -90,6 +91,7 @@ def _fly(values: dict[str, Any]) -> int:
     config = check_config(_find_config(options, None if policy is None else policy.config, overrides))
     if policy is not None:
         policy.check(config, "policy")
+        _warn_of_loops(options.policy, policy.config)
     elif config.control.action != "reference":
         raise ConfigError(f"set-points of others are for control.action=reference, not {config.control.action}")
     folder = options.px4 or os.environ.get("PX4_DIR")
@@ -187,6 +189,17 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     if result.ended:
         print(f"the flight ended early: {result.ended}", file=sys.stderr)
     return 1 if result.ended else 0
+
+
+def _warn_of_loops(name: str, trained: Config | None) -> None:
+    """Warn of a learned policy whose drones answered faster in training than PX4's do."""
+    if trained is not None and (trained.control.position_frequency or SLOW_LOOP + 1.0) > SLOW_LOOP:
+        warn_once(
+            "px4",
+            f"policy={name} was trained with drones that follow their references faster than PX4's position loop of "
+            "about 2 rad/s; such policies have failed with PX4. Train with control.position_frequency="
+            f"{SLOW_LOOP:g} or less and with delays, see docs/flight.md",
+        )
 
 
 def _open_node(options: Options) -> Node:
