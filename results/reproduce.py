@@ -228,6 +228,8 @@ def fly(job: Job) -> str:
     metrics = summarize(results)
     error = results[error_metric(flight)]
     content = {"episodes": episodes_of(job.team), "seed": SEED, "config": flight.config, "overrides": flight.overrides}
+    if job.team == "mpc":
+        content["overrides"] = flight.overrides | OWN_PLANNERS.get(job.flight, {})
     report, episodes = job.files
     report.parent.mkdir(parents=True, exist_ok=True)
     arrays = io.BytesIO()

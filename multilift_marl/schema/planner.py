@@ -58,7 +58,7 @@ class PlannerConfig(Section):
     estimate_noise: Annotated[Float | None, Between(1e-3, 1000)] = Field(
         None,
         description="[-] of accelerations as measured for that, over gravity; larger: slower; None: 0.5 with "
-        "env.sensing=ideal, else 1",
+        "env.sensing=ideal and no observation_noise, else 1",
     )
     delay: Annotated[Float, Between(0, 1, "s")] = Field(
         0.0, description="[s] by which actions and what is measured are late: the plan begins with the state then"

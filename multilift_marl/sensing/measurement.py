@@ -31,6 +31,9 @@ Call = Callable[[int, int], None]  # of environments lo to hi
 STANDARD = np.array([0.005, 0.05, 0.01, 0.1])  # position [m], velocity [m/s], rotation [rad], angular velocity [rad/s]
 
 
+EXACT = ("rotor_speed", "cable_tension", "cable_broken")  # of a state, which has no noise
+
+
 class DelayBuffers(NamedTuple):
     """What sensors and links remember; environment first."""
 
@@ -108,7 +111,7 @@ class Sensing:
             unknown: Any = dict.fromkeys(name for name in SystemState._fields if name.startswith("payload_"))
             self.state = estimator.state._replace(**unknown)
         elif has_noise:
-            exact = {name: getattr(world.state, name) for name in ("rotor_speed", "cable_tension", "cable_broken")}
+            exact = {name: getattr(world.state, name) for name in EXACT}
             self.state = SystemState.zeros(e, n)._replace(**exact)
         self.load = self._load_sensing.load if self._load_sensing else true_load(self.state)
         self.measures = has_noise or estimator is not None
@@ -174,6 +177,9 @@ class Sensing:
             arrays |= {f"errors_{name}": array for name, array in self.errors._asdict().items()}
         if self._estimator is not None and self._load_sensing is not None:
             arrays |= self._estimator.arrays() | self._load_sensing.arrays()
+        elif self.measures:
+            noisy = set(SystemState._fields) - set(EXACT)
+            arrays |= {f"measured_{name}": getattr(self.state, name) for name in sorted(noisy)}
         return arrays
 
 

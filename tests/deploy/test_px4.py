@@ -35,8 +35,9 @@ from multilift_marl.deploy.px4.launch import rig_parameters
 from multilift_marl.deploy.px4.link import PORT
 from multilift_marl.deploy.px4.team import AutopilotController, AutopilotTeam, Settings
 from multilift_marl.deploy.ros.dds import Node
-from multilift_marl.deploy.ros.live import LivePublisher, SetPoints, subscribe_places
+from multilift_marl.deploy.ros.live import LivePublisher
 from multilift_marl.deploy.ros.messages import NAMES, ODOMETRY, Topic, pose_stamped, setpoint_topics
+from multilift_marl.deploy.ros.types import read_pose
 from multilift_marl.sensing.sensors import Sensor, SensorSuite
 
 DT = 0.004
@@ -145,7 +146,7 @@ def test_a_team_flies_from_the_ground_through_a_task_and_back(tmp_path):
     options = command.Options(bag=str(tmp_path / "bag"))
     with Airfield(config.system) as field:
         flight = Flight(config, field.team, 1000, said.append)
-        result = command._record(flight, named, options)
+        result = command._record(flight, named.bind, options)
         for fake in field.fakes:
             assert fake.complaints == []
             time.sleep(0.05)
@@ -173,7 +174,9 @@ def test_others_fly_autopilots_by_topics_that_they_hear_live():
     config = config_of("hover", **nothing_hidden, **{"env.episode_seconds": 3.0})
     here, there, over = Node(domain=DOMAIN), Node(domain=DOMAIN), threading.Event()
     drones = range(2)
-    stamps, slots = [], []
+    stamps, slots, points = [], [], []
+    publisher = LivePublisher(here, "multilift")
+    publisher.subscribe(2)
 
     def steer() -> None:
         takes = [there.subscription(Topic(f"/drone_{n}/odom", ODOMETRY)) for n in drones]
@@ -183,35 +186,36 @@ def test_others_fly_autopilots_by_topics_that_they_hear_live():
             there.wait(0.05)
             stamps.extend(each.clock.sec + 1e-9 * each.clock.nanosec for each in clock())
             for n in drones:
-                if takes[n]() and slots:
-                    sends[n](pose_stamped(there.store, 0, slots[0][n], np.eye(3)))
+                for message in takes[n]():
+                    now = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                    place = slots[0][n] if slots else read_pose(message.pose.pose)[0]
+                    sends[n](pose_stamped(there.store, now, place, np.eye(3)))
 
     def bind(vec):
-        slots.append(vec.task.goal.slots[0].copy())
-        return SetPoints(vec, subscribe_places(here, "multilift", 2), here.wait, 1.0)
+        slots.append(vec.task.goal.slots[0] + [0.2, 0.0, 0.1])
+        points.append(publisher.set_points(vec, 1.0, 30.0))
+        return points[0]
 
     thread = threading.Thread(target=steer)
     thread.start()
     try:
         with Airfield(config.system) as field:
-            publisher, said = LivePublisher(here, "multilift"), []
-            watch = partial(_send, publisher, field.team)
-            flight = Flight(config, field.team, 1000, said.append, watch)
+            flight = Flight(config, field.team, 1000, lambda text: None, partial(command._send, publisher, field.team))
             result = flight.fly(bind)
             lasted = field.team.time
     finally:
         over.set()
         thread.join()
     assert result.ended == "" and [phase.name for phase in result.phases][2] == "hover"
-    assert result.metrics["payload_position_error_m"][0] < 0.1
+    assert points[0].late.sum() == 0
+    # where it was told to fly to, beside its own target
+    off = result.trace.payload_position[-25:] - result.trace.target_position[-25:]
+    np.testing.assert_allclose(off.mean(axis=0), [0.2, 0.0, 0.1], atol=0.05)
+    np.testing.assert_allclose(result.trace.drone_position[-25:].mean(axis=0), slots[0], atol=0.07)
     # the whole flight was heard, by the time of the autopilots
     assert (np.diff(stamps) >= 0).all() and len(stamps) > 500 and stamps[-1] > lasted - 2.0
     least = min(phase.separation for phase in result.phases)
     assert 0.35 < least < 2.0 and all(phase.tilt < 45 for phase in result.phases)
-
-
-def _send(publisher, team, vec) -> None:
-    publisher.send(vec, round(team.time * 1e9))
 
 
 @pytest.mark.slow

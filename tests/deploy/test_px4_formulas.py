@@ -15,7 +15,16 @@ if sys.platform == "win32":
 
 import multilift_marl as ml
 from multilift_marl.deploy.px4 import __main__ as command
-from multilift_marl.deploy.px4.flight import Flight, FlightResult, Goal, Phase, _goal, check_config, plan_way
+from multilift_marl.deploy.px4.flight import (
+    Flight,
+    FlightResult,
+    Goal,
+    Phase,
+    _goal,
+    check_config,
+    find_failure,
+    plan_way,
+)
 from multilift_marl.deploy.px4.launch import rig_parameters
 from multilift_marl.deploy.px4.team import AutopilotTeam
 from multilift_marl.errors import FlightError
@@ -48,8 +57,10 @@ def rest_at(end: Goal, begin: Goal) -> tuple[np.ndarray, ...]:
     watched: list = []
     flight._watch = watched.append
     rotation = np.tile(np.eye(3), (1, 2, 1, 1))
-    state = record(drone_position=np.eye(3)[None, :2], drone_rotation=rotation, cable_tension=np.ones((1, 2)))
-    system, stats = record(control_interval=4), record(tension_peak=np.ones(1))
+    places, whole = np.eye(3)[None, :2], np.zeros((1, 2), bool)
+    state = record(drone_position=places, drone_rotation=rotation, cable_tension=np.ones((1, 2)), cable_broken=whole)
+    system = record(control_interval=4, min_separation=np.full((2, 2), 0.5))
+    stats = record(tension_peak=np.full(1, 9.0))  # of the phase before
     world = record(thrust=None, step=lambda *_: None, system=system, state=state, stats=stats)
     vec = record(world=world, task=record(dt=2 / HZ))
     assert flight._go(vec, begin, end, "way") is vec
@@ -57,7 +68,7 @@ def rest_at(end: Goal, begin: Goal) -> tuple[np.ndarray, ...]:
     (phase,) = flight.phases
     steps = len(flight.team.sent) // 4  # two ticks of two drones
     assert phase[:2] == ("way", pytest.approx(steps * 2 / HZ)) and phase.separation == 2**0.5
-    assert watched == [vec] * steps
+    assert watched == [vec] * steps and phase.tension == 1.0
     return tuple(np.array([each[k] for each in flight.team.sent]).reshape(-1, 2, *shape)
                  for k, shape in ((1, (3, 3)), (2, (3,)), (3, ())))  # fmt: skip
 
@@ -77,6 +88,22 @@ def test_at_the_end_of_a_way_drones_rest_and_turn_to_where_they_are_to_face(turn
     np.testing.assert_allclose(headings[0], 0.4 + Recorder.heading, atol=1e-12)
     np.testing.assert_allclose(headings[-1], 0.4 + shorter + Recorder.heading, atol=1e-12)
     assert abs(np.diff(headings, axis=0)).max() * HZ < 0.5 * 35 / 16 + 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({}, ""),
+        ({"drone_position": np.array([[[0.0, 0.0, 1.0], [0.49, 0.0, 1.0]]])}, "drone_collision"),
+        ({"cable_broken": np.array([[False, True]])}, "cable_broken"),
+        ({"drone_rotation": np.tile(np.diag([1.0, 0.17, 0.17]), (1, 2, 1, 1))}, "tilt"),
+    ],
+)
+def test_a_team_that_rests_fails_by(change, cause):
+    places = np.array([[[0.0, 0.0, 1.0], [0.51, 0.0, 1.0]]])
+    sound = {"drone_position": places, "cable_broken": np.zeros((1, 2), bool), "drone_rotation": np.eye(3)[None, None]}
+    world = record(state=record(**sound | change), system=record(min_separation=np.full((2, 2), 0.5)))
+    assert find_failure(world) == cause
 
 
 @pytest.mark.parametrize("turn", [2.0, -2.0, 4.0])
@@ -146,7 +173,7 @@ class Rehearsal(Flight):
 
     def part(self, name):
         self.did.append(name)
-        self._begin(name)
+        self.phases.append(Phase(name, 1.0, 1.0, 1.0, 1.0))
         if name == self.failing:
             raise FlightError(f"{name} failed after 1.0 s: tilt")
 

@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -36,8 +37,12 @@ def meet(role: str, *nodes: tuple[str, ...]) -> dict:
             stack.callback(process.kill)
             running.append(process)
         assert running[0].stdout is not None
+        alarm = threading.Timer(120.0, running[0].kill)
+        alarm.start()
+        stack.callback(alarm.cancel)
         # what it says is what a ROS 2 node needs
         (said,) = (word for word in running[0].stdout.readline().split() if word.startswith("ROS_AUTOMATIC"))
+        alarm.cancel()
         name, _, value = said.partition("=")
         peer = [PYTHON, str(PEER), role, str(DOMAIN)]
         found = subprocess.run(peer, env=os.environ | {name: value}, capture_output=True, text=True, timeout=200)

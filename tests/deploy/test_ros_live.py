@@ -21,7 +21,7 @@ from multilift_marl.deploy.ros import __main__ as command
 from multilift_marl.deploy.ros.bag import DISTRIBUTIONS
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER
-from multilift_marl.deploy.ros.live import LiveFlight, SetPoints
+from multilift_marl.deploy.ros.live import LiveFlight, SetPoints, Waiting, read_stamped
 from multilift_marl.deploy.ros.messages import FlightMessages, Topic
 from multilift_marl.deploy.ros.types import read_place, typestore
 
@@ -152,7 +152,7 @@ def test_lost_set_points_are_held_and_then_the_team_sinks():
     queue = [[], []]
 
     def taker(n: int):
-        return lambda: [read_place(queue[n].pop())] if queue[n] else []
+        return lambda: [read_stamped(queue[n].pop())] if queue[n] else []
 
     points = SetPoints(vec, [taker(0), taker(1)])
     points.reset()
@@ -173,6 +173,67 @@ def test_lost_set_points_are_held_and_then_the_team_sinks():
     assert points.late.min() >= steps - round(HOLD_AFTER / vec.task.dt)
     with pytest.raises(ValueError, match="a number is nan"):  # rubbish is no set-point
         read_place(setpoint(store, [np.nan, 0, 0]))
+
+
+class Others:
+    """Answers of others, which come while a step waits: lists of (drone, stamp, x) for each call of `wait`."""
+
+    def __init__(self, *arriving):
+        self.arriving, self.queue, self.waited = list(arriving), [[], []], []
+
+    def take(self, n):
+        def taken():
+            came, self.queue[n] = self.queue[n], []
+            return came
+
+        return taken
+
+    def wait(self, seconds):
+        self.waited.append(seconds)
+        if not self.arriving:
+            return False
+        for n, stamp, x in self.arriving.pop(0):
+            self.queue[n].append((stamp, np.array([x, 0.0, 1.0]), np.eye(3)))
+        return True
+
+
+def test_a_step_waits_for_the_answers_to_its_state():
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1, num_drones=2, **{"payload.mass": 0.7})
+    vec.reset(seed=3)
+    # the first ones are waited for; then an old answer, which does not do, and the new ones; then those without a stamp
+    new = [(0, 10, 2.0), (1, 20, 3.0)], [(0, 25, 3.0)], [(0, 0, 4.0), (1, 0, 4.0)]
+    others = Others([(1, 10, 1.0)], *new)
+    asked = [10]
+    points = SetPoints(vec, [others.take(n) for n in range(2)], Waiting(others.wait, lambda: asked[0], 5.0, 60.0))
+    here = np.array([1.0, 0.0, 1.0])
+    others.queue[0] += [(5, np.zeros(3), np.eye(3)), (10, here, np.eye(3))]  # of an earlier phase, and one that answers
+    others.queue[1] += [(5, np.zeros(3), np.eye(3))]
+    points.reset()
+    for stamp, x, left in ((10, 1.0, 3), (20, 3.0, 1), (30, 4.0, 0)):
+        asked[0] = stamp
+        points.act(None)
+        assert points._place[:, 0].tolist() == [x, x] and len(others.arriving) == left
+        assert (points.age == 0).all() and not points.late.any()
+    assert others.waited[0] > 50 and max(others.waited[1:]) <= 5.0
+    points.act(None)  # nobody answers: it goes on when the time is over
+    assert len(others.waited) == 5 and (points.age > 0).all()
+
+
+def test_nobody_is_waited_for_who_has_been_silent():
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1, num_drones=2, **{"payload.mass": 0.7})
+    vec.reset(seed=3)
+    others = Others()
+    points = SetPoints(vec, [others.take(n) for n in range(2)], Waiting(others.wait, lambda: 0, 5.0, 60.0))
+    points.reset()
+    for _ in range(3):
+        points.act(None)
+    assert len(others.waited) == 1  # for the first ones, once
+    for n in range(2):
+        others.queue[n].append((0, np.zeros(3), np.eye(3)))
+    steps = round(HOLD_AFTER / vec.task.dt)
+    for _ in range(steps + 10):
+        points.act(None)
+    assert len(others.waited) == 1 + steps
 
 
 def test_set_points_need_the_interface_of_places():

@@ -52,6 +52,7 @@ def test_noise_costs_a_centimetre():
     assert noisy["success_rate"].all() and (noisy["payload_position_error_m"] < 0.02).all()
 
 
+@pytest.mark.slow
 def test_late_cameras_cost_a_centimetre():
     assert (fly("track", FAST | {"env.sensing": "mocap"})["payload_rmse_m"] < 0.02).all()
 

@@ -59,6 +59,18 @@ def test_what_has_no_noise_is_known_as_it_is():
     assert (known.rotor_speed > 100).all() and (known.cable_tension > 0).all()
 
 
+def test_what_was_measured_is_saved_with_the_environments():
+    vec, other = make(num_envs=2, num_drones=2, **NOISE), make(num_envs=2, num_drones=2, **NOISE)
+    for each, seed in ((vec, 0), (other, 5)):
+        each.reset(seed=seed)
+        each.step(np.full((2, 2, each.action_size), 0.3, np.float32))
+    other.load_state_dict(vec.state_dict())
+    for name, known, loaded in zip(
+        vec.task.view.estimated._fields, vec.task.view.estimated, other.task.view.estimated, strict=True
+    ):
+        assert np.array_equal(known, loaded), name
+
+
 def test_noise_is_consistent_over_the_parts_of_an_observation():
     vec, gap = errors_of(NOISE, steps=3)
     own = gap[..., columns(vec, "slot_error")]

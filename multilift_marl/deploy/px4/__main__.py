@@ -25,10 +25,9 @@ from multilift_marl.evaluation.metrics import format_table, make_report, write_r
 from multilift_marl.schema.values import Between, Float, Int
 
 if TYPE_CHECKING:
-    from multilift_marl.deploy.px4.flight import Flight, FlightResult, Maker, OnStep, Phase
+    from multilift_marl.deploy.px4.flight import Flight, FlightResult, Maker, Phase
     from multilift_marl.deploy.px4.team import AutopilotTeam
-    from multilift_marl.deploy.ros.dds import Node
-    from multilift_marl.deploy.ros.live import SetPoints
+    from multilift_marl.deploy.ros.live import LivePublisher, SetPoints
 
 _USAGE = """Fly one episode of a task by PX4 autopilots, in lockstep with the simulation: from slack cables on the
 ground to the task, back, and down again; then the same task by the controller of this package.
@@ -133,15 +132,12 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     from multilift_marl.deploy.px4.flight import Flight
     from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
 
-    node = _open_node(options) if options.live else None
+    live = _open_live(config, options) if options.live else None
     setpoints: list[SetPoints] = []
 
     def bind_others(vec: MultiliftVec) -> SetPoints:
-        from multilift_marl.deploy.ros.live import SetPoints, subscribe_places
-
-        assert node is not None
-        take = subscribe_places(node, options.names, vec.num_drones)
-        setpoints.append(SetPoints(vec, take, node.wait, options.patience))
+        assert live is not None
+        setpoints.append(live.set_points(vec, options.patience, options.timeout))
         return setpoints[0]
 
     begin = time.perf_counter()
@@ -151,7 +147,7 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     )  # fmt: skip
     with interrupted_by_signals(), AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
         say = partial(print, flush=True)
-        flight = Flight(config, team, options.seed, say, _publish(node, team, options) if node else _ignore)
+        flight = Flight(config, team, options.seed, say, _ignore if live is None else partial(_send, live, team))
         try:
             result = _record(flight, bind or bind_others, options)
         finally:
@@ -163,7 +159,7 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     report["px4"] = {
         "drone_error_m": result.drone_error, "estimate_error_m": result.estimate_error,
         "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
-        "phases": [phase._asdict() for phase in result.phases], "ended": result.ended,
+        "phases": [phase._asdict() for phase in result.phases if phase.seconds > 0.0], "ended": result.ended,
     }  # fmt: skip
     if options.speed:
         report["px4"]["lateness_s"] = dict(zip(("50 %", "99 %", "99.9 %"), team.clock.lateness().tolist(), strict=True))
@@ -193,7 +189,9 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
 
 def _warn_of_loops(name: str, trained: Config | None) -> None:
     """Warn of a learned policy whose drones answered faster in training than PX4's do."""
-    if trained is not None and (trained.control.position_frequency or SLOW_LOOP + 1.0) > SLOW_LOOP:
+    if trained is None or trained.control.action != "reference":  # others do not fly by the position loop
+        return
+    if (trained.control.position_frequency or SLOW_LOOP + 1.0) > SLOW_LOOP:
         warn_once(
             "px4",
             f"policy={name} was trained with drones that follow their references faster than PX4's position loop of "
@@ -202,21 +200,22 @@ def _warn_of_loops(name: str, trained: Config | None) -> None:
         )
 
 
-def _open_node(options: Options) -> Node:
+def _open_live(config: Config, options: Options) -> LivePublisher:
     from multilift_marl.deploy.ros.bag import DISTRIBUTIONS
     from multilift_marl.deploy.ros.dds import Node, describe_reach
+    from multilift_marl.deploy.ros.live import LivePublisher
 
     node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
     print(f"publishing {describe_reach(options.domain, options.allow_network, options.ros)}", flush=True)
-    return node
+    live = LivePublisher(node, options.names)
+    if options.policy == "none":
+        live.subscribe(config.env.num_drones)  # before the flight, so that peers are found by the time of its task
+    return live
 
 
-def _publish(node: Node, team: AutopilotTeam, options: Options) -> OnStep:
-    """Return what publishes the environment that is flown, with the time since the autopilots began."""
-    from multilift_marl.deploy.ros.live import LivePublisher
-
-    publisher = LivePublisher(node, options.names)
-    return lambda vec: publisher.send(vec, round(team.time * 1e9))
+def _send(live: LivePublisher, team: AutopilotTeam, vec: MultiliftVec) -> None:
+    """Publish the environment that is flown, with the time since the autopilots began."""
+    live.send(vec, round(team.time * 1e9))
 
 
 def _ignore(vec: MultiliftVec) -> None:

@@ -20,6 +20,7 @@ from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, FlightError
 from multilift_marl.evaluation.rollout import Trace, Tracer, measure_episodes
 from multilift_marl.math3d import ease, heading
+from multilift_marl.mdp.failures import MAX_TILT
 from multilift_marl.planning.waypoints import plan_waypoints
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
@@ -55,7 +56,7 @@ class FlightResult(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """Extremes of a part of the flight."""
+    """Extremes of a part of the flight; without a step the separation is infinite."""
 
     name: str
     seconds: float
@@ -121,6 +122,7 @@ class Flight:
         self._landing.reset(seed=seed)
         self.start: dict[str, np.ndarray] = {}
         self.phases: list[Phase] = []
+        self._known_peak = 0.0
         self._begun: dict[str, np.ndarray] = {}
 
     @property
@@ -162,7 +164,7 @@ class Flight:
                 observation = self._take_over(self._landing, way.world, "landing")
                 world = self._landing.world
                 self._run(self._landing, observation, "landing")
-            except FlightError as error:
+            except (FlightError, ConfigError) as error:
                 return result._replace(phases=tuple(self.phases), ended=str(error))
         for autopilot in self.team.offboard:
             # By force: PX4 itself may not have noticed yet that it has landed.
@@ -219,8 +221,11 @@ class Flight:
         return {name: array[0] for name, array in drawn.items() if name != "observation_bias"}
 
     def _run(self, vec: MultiliftVec, observation: np.ndarray, what: str) -> None:
-        policy = make_scripted(SCRIPT, vec)
         self._begin(what)
+        self._fly_part(vec, observation, what)
+
+    def _fly_part(self, vec: MultiliftVec, observation: np.ndarray, what: str) -> None:
+        policy, self._known_peak = make_scripted(SCRIPT, vec), 0.0
         for _ in range(vec.max_steps):
             observation, _, terminated, _, info = vec.step(policy.act(observation))
             self._note(vec, vec.task.dt)
@@ -230,25 +235,30 @@ class Flight:
 
     def _go(self, vec: MultiliftVec, begin: Goal, end: Goal, what: str) -> MultiliftVec:
         """Fly to where the team rests at `end`, its formation turned as a body; return the environment in which."""
+        self._begin(what, vec)
         if (way := plan_way(self.config, begin, end)) is not None:
             seconds, options = way
+            # Task `track` lets drones face as the payload does.
+            self._rest(vec, begin, _wrapped(begin.pose[3] - begin.yaw), 0.0, what)
             before, vec = vec, self._make(self._part("track", seconds, options))
-            self._run(vec, self._take_over(vec, before.world, what), what)
+            self._fly_part(vec, self._take_over(vec, before.world, what), what)
             begin = _goal(vec)
-        else:
-            self._begin(what)
-        world = vec.world
-        turn = _wrapped(end.yaw - begin.yaw)
-        seconds, dt = abs(turn) / _TURNING, 1.0 / self.config.sim.control_hz
-        still = np.zeros_like(end.slots)
-        motion = np.stack([end.slots, still, still], axis=1)
-        for tick in range(round((seconds + _HOLD) / dt)):
+        self._rest(vec, end._replace(yaw=begin.yaw), _wrapped(end.yaw - begin.yaw), _HOLD, what)
+        return vec
+
+    def _rest(self, vec: MultiliftVec, goal: Goal, turn: float, hold: float, what: str) -> None:
+        """Let the drones rest in their slots while they turn about themselves by `turn` [rad], then for `hold` [s]."""
+        world, seconds, dt = vec.world, abs(turn) / _TURNING, 1.0 / self.config.sim.control_hz
+        still = np.zeros_like(goal.slots)
+        motion = np.stack([goal.slots, still, still], axis=1)
+        for tick in range(round((seconds + hold) / dt)):
             share = ease(tick * dt, 0.0, max(seconds, dt))[0]
-            self.team.tick(world, partial(self._send, motion, end.cable_force, begin.yaw + share * turn))
+            self.team.tick(world, partial(self._send, motion, goal.cable_force, goal.yaw + share * turn))
             world.step(world.thrust, world.system.control_interval)
             if (tick + 1) % round(vec.task.dt / dt) == 0:
                 self._note(vec, vec.task.dt)
-        return vec
+                if cause := find_failure(world):
+                    raise FlightError(f"{what} failed: {cause}")
 
     def _send(self, motion: np.ndarray, cable_force: np.ndarray, yaw: float, drone: int) -> None:
         self.team.send(drone, motion[drone], cable_force[drone], yaw + self.team.heading[drone])
@@ -265,12 +275,15 @@ class Flight:
         self.team.board(vec.world)
         return observation
 
-    def _begin(self, name: str) -> None:
+    def _begin(self, name: str, vec: MultiliftVec | None = None) -> None:
+        """Begin a phase, in an environment that has flown another one before, or one that begins."""
         self.phases.append(Phase(name, 0.0, np.inf, 0.0, 0.0))
+        self._known_peak = 0.0 if vec is None else float(vec.world.stats.tension_peak[0])
 
     def _note(self, vec: MultiliftVec, seconds: float) -> None:
-        world = vec.world
-        self.phases[-1] = self.phases[-1].joined(world.state, float(world.stats.tension_peak[0]), seconds)
+        peak = float(vec.world.stats.tension_peak[0])
+        own = peak if peak > self._known_peak else 0.0  # else it is an earlier phase's
+        self.phases[-1] = self.phases[-1].joined(vec.world.state, own, seconds)
         self._watch(vec)
 
 
@@ -282,6 +295,17 @@ def _goal(vec: MultiliftVec) -> Goal:
     x, y, z = goal.position[0].tolist()
     pose = x, y, z, float(heading(tuple(goal.rotation[0].ravel())))
     return Goal(goal.slots[0].copy(), goal.cable_force[0].copy(), float(goal.drone_yaw[0]), pose)
+
+
+def find_failure(world: World) -> str:
+    """Return what has failed of a team that rests, "" if nothing has."""
+    state, (n,) = world.state, world.state.drone_position.shape[1:2]
+    apart = np.linalg.norm(state.drone_position[0, :, None] - state.drone_position[0], axis=-1)
+    if (apart < world.system.min_separation)[~np.eye(n, dtype=bool)].any():
+        return "drone_collision"
+    if state.cable_broken[0].any():
+        return "cable_broken"
+    return "tilt" if state.drone_rotation[0, :, 2, 2].min() < np.cos(np.radians(MAX_TILT)) else ""
 
 
 def plan_way(config: Config, begin: Goal, end: Goal) -> tuple[float, dict[str, Any]] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,22 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
 
+Stamped = tuple[int, np.ndarray, np.ndarray]
+"""Stamp [ns], place and attitude of a set-point."""
+
+
+class Waiting(NamedTuple):
+    """How a simulation waits for the set-points of others."""
+
+    wait: Callable[[float], bool]
+    """Waits for something new for some seconds at most, and says whether there is, see `Node.wait`."""
+    asked: Callable[[], int]
+    """Returns the stamp of the state that was published last [ns]; older set-points answer an older one."""
+    patience: float
+    """[s] of real time in each step."""
+    first: float
+    """[s] for the first ones of an episode."""
+
 
 class SetPoints:
     """Set-points of others for each drone, in place of a policy: places, of which actions are made.
@@ -26,58 +42,67 @@ class SetPoints:
 
     Args:
         vec: one environment, of the action interface `reference`.
-        take: for each drone, the call that returns the places and attitudes that have come, see `read_place`.
-        wait: waits for something new for some seconds at most, and says whether there is, see `Node.wait`.
-        patience: for which a step waits for the set-points of drones that had one lately [s].
+        take: for each drone, the call that returns what has come: stamp [ns], place and attitude, see `read_stamped`.
+        waiting: how steps wait for others; None: not at all.
 
     Attributes:
         age: of each drone's last set-point (N,) [s], infinite before the first.
         late: steps in which a drone had none that was fresh (N,).
     """
 
-    def __init__(
-        self,
-        vec: MultiliftVec,
-        take: list[Callable[[], list[Any]]],
-        wait: Callable[[float], bool] = lambda seconds: False,
-        patience: float = 0.0,
-    ):
+    def __init__(self, vec: MultiliftVec, take: list[Callable[[], list[Stamped]]], waiting: Waiting | None = None):
         if vec.config.control.action != "reference":
             raise ConfigError(
                 f"set-points are places, for control.action=reference, not {vec.config.control.action}; change it"
             )
-        self._vec, self._take, self._wait, self._patience = vec, take, wait, patience
+        self._vec, self._take, self._waiting = vec, take, waiting
         self._place = np.zeros((vec.num_drones, 3))
         self._yaw = np.zeros(vec.num_drones)
+        self._answered = np.zeros(vec.num_drones, bool)
+        self._kept: list[list[Stamped]] = [[] for _ in take]
+        self._patient = True
         self.age = np.full(vec.num_drones, np.inf)
         self.late = np.zeros(vec.num_drones, int)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Hold where the drones are."""
+        """Hold where the drones are; what has come before, but for answers to the last state, does not count."""
+        asked = np.inf if self._waiting is None else self._waiting.asked()
+        self._kept = [[each for each in take() if each[0] >= asked] for take in self._take]
         self._place[:] = self._vec.world.state.drone_position[0]
         self._yaw[:] = self._vec.task.goal.drone_yaw[0] + self._vec.world.system.heading
-        self.age[:] = np.inf
+        self.age[:], self._patient = np.inf, True
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (1, N, 4) whose references are the set-points, as far as offsets go."""
         dt = self._vec.task.dt
         self.age += dt
+        self._answered[:] = False
         self._read()
-        end = time.monotonic() + self._patience
-        while ((self.age > 0.0) & (self.age <= HOLD_AFTER)).any():
-            if (rest := end - time.monotonic()) <= 0.0 or not self._wait(rest):
-                break
-            self._read()
+        if self._waiting is not None:
+            self._wait(self._waiting)
         self.late += self.age > HOLD_AFTER
         sink(self._place, is_landing(self.age), dt)
         return self._actions()
 
+    def _wait(self, waiting: Waiting) -> None:
+        """Wait for answers to the last state: of all drones for the first, then of those that had one lately."""
+        first = self._patient and not np.isfinite(self.age).all()
+        self._patient = False
+        end = time.monotonic() + (waiting.first if first else waiting.patience)
+        while (~self._answered & (first | (self.age <= HOLD_AFTER))).any():
+            if (rest := end - time.monotonic()) <= 0.0 or not waiting.wait(rest):
+                return
+            self._read()
+
     def _read(self) -> None:
         """Take over what has come."""
+        asked = 0 if self._waiting is None else self._waiting.asked()
         for n, take in enumerate(self._take):
-            for place, rotation in take():
+            came, self._kept[n] = [*self._kept[n], *take()], []
+            for stamp, place, rotation in came:
                 self._place[n], self.age[n] = place, 0.0
                 self._yaw[n] = np.arctan2(rotation[1, 0], rotation[0, 0])
+                self._answered[n] |= stamp == 0 or stamp >= asked
 
     def _actions(self) -> np.ndarray:
         goal, control = self._vec.task.planned, self._vec.config.acting
@@ -92,25 +117,44 @@ class SetPoints:
         return np.clip(action, -1, 1)[None].astype(np.float32)
 
 
-def subscribe_places(node: Node, names: str, num_drones: int) -> list[Callable[[], list[Any]]]:
+def read_stamped(message: Any) -> Stamped:
+    """Return stamp [ns], place (3,) and attitude (3, 3) of a `PoseStamped`; a stamp of 0 is none."""
+    stamp = message.header.stamp
+    return (stamp.sec * 10**9 + stamp.nanosec, *read_place(message))
+
+
+def subscribe_places(node: Node, names: str, num_drones: int) -> list[Callable[[], list[Stamped]]]:
     """Return for each drone what takes its set-points, see `SetPoints`."""
     topics = [setpoint_topics(NAMES[names], i)[0]._replace(reliable=False) for i in range(num_drones)]
-    return [node.subscription(topic, read_place) for topic in topics]
+    return [node.subscription(topic, read_stamped) for topic in topics]
 
 
 class LivePublisher:
-    """Publishes environment 0 of one batch after another, on the same topics.
+    """Publishes environment 0 of one batch after another, on the same topics, and hears set-points for them.
 
     Args:
         node: publishes.
         names: of the topics, a key of `messages.NAMES`.
         acts: whether actions fly the drones, and are published.
+
+    Attributes:
+        time_ns: of the state that was published last [ns].
     """
 
     def __init__(self, node: Node, names: str, acts: bool = True):
         self._node, self._names, self._acts = node, names, acts
         self._publish: dict[str, Callable[[Any], None]] = {}
         self._vec: MultiliftVec | None = None
+        self._take: list[Callable[[], list[Stamped]]] = []
+        self.time_ns = 0
+
+    def subscribe(self, num_drones: int) -> None:
+        """Hear set-points for the drones from now on."""
+        self._take = subscribe_places(self._node, self._names, num_drones)
+
+    def set_points(self, vec: MultiliftVec, patience: float, first: float) -> SetPoints:
+        """Return what flies an environment by what is heard; steps wait for it, see `Waiting`."""
+        return SetPoints(vec, self._take, Waiting(self._node.wait, lambda: self.time_ns, patience, first))
 
     def send(self, vec: MultiliftVec, time_ns: int, landing: np.ndarray | None = None) -> None:
         """Publish the state as it is, at a time [ns]; `landing` are the drones (N,) whose set-points are lost."""
@@ -122,6 +166,7 @@ class LivePublisher:
         if landing is not None:
             self._messages.landing = landing
         self._node.check_publishers()
+        self.time_ns = time_ns
         for name, message in self._messages.messages(time_ns):
             self._publish[name](message)
 
