@@ -10,6 +10,7 @@ from conftest import GRAVITY, make_system, refusal, refuse_system, refuse_task
 
 import multilift_marl as ml
 from multilift_marl.errors import ConfigError
+from multilift_marl.rig import balance
 from multilift_marl.rig.balance import formation_forces, nonnegative_least_squares
 from multilift_marl.rig.feasibility import MIN_THRUST_TO_WEIGHT
 from multilift_marl.rig.presets import PRESETS
@@ -247,3 +248,17 @@ def test_non_negative_least_squares_meets_its_conditions():
         np.testing.assert_allclose(slope[x > 0], 0, atol=1e-8)
         bound += (x == 0).any()
     assert bound > 50
+
+
+@pytest.mark.parametrize(
+    ("force", "pull"),
+    [
+        ([0.0, 0.3, 1.0], True),
+        ([0.0, 0.3, 1e-4], False),  # too little of its share
+        ([1e-9, 0.0, 1e-4], False),  # likewise, upright
+        ([0.0, 300.0, 1.0], False),  # too flat
+    ],
+)
+def test_every_cable_is_to_pull_and_to_stand(force, pull):
+    forces = np.array([[0.0, -0.3, 1.0], force])
+    assert balance._all_pull(forces, np.ones(2)) is pull

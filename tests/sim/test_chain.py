@@ -327,11 +327,13 @@ def test_the_payload_comes_to_rest_on_the_ground():
     assert calm(world)
 
 
-def test_a_tumbling_team_keeps_its_angular_momentum_whatever_its_bodies_are():
+@pytest.mark.parametrize("bending", [0.0, 1.0])
+def test_a_tumbling_team_keeps_its_angular_momentum_whatever_its_bodies_are(bending):
     """Bodies of three different moments, hooks and a centre of mass off every axis, none of them level."""
     own = {"payload.center_of_mass": [0.05, -0.03, 0.04], "payload.inertia": [0.02, 0.035, 0.05]}
     hooks = {"cable.hook": [0.02, 0.03, -0.04], "vehicle.inertia": [2e-3, 3.5e-3, 5e-3]}
-    system = without_drag(make_system(3, **CHAIN, **own, **hooks, **{"sim.timestep": 1e-3}))
+    settings = CHAIN | own | hooks | {"sim.timestep": 1e-3, "cable.bending_stiffness": bending}
+    system = without_drag(make_system(3, **settings))
     world, rng = World(system, 1, 1), np.random.default_rng(0)
     state, turn = world.state, np.reshape(axis_angle((0.48, -0.6, 0.64), 1.2), (3, 3))
     state.drone_position[0] = state.payload_position[0] + (state.drone_position[0] - state.payload_position[0]) @ turn.T

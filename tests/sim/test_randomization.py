@@ -20,6 +20,7 @@ from conftest import (
     zeros,
 )
 
+import multilift_marl as ml
 from multilift_marl.math3d import axis_angle
 from multilift_marl.sim import World
 from multilift_marl.sim.parameters import nominal_parameters
@@ -314,3 +315,18 @@ def test_drag_of_a_turning_payload_is_that_of_its_true_centre_of_mass():
 )
 def test_ranges_that_cannot_be_are_refused(settings, words):
     assert words in refuse_system(4, **settings)
+
+
+def test_rotors_hold_the_cable_at_its_hook_from_the_start():
+    """Their speeds at a start give the force and the moment that a cable beside the centre of mass asks for."""
+    vec = ml.make_vec("hover", **{"env.num_envs": 1, "env.num_drones": 3, "cable.hook": [0.02, -0.01, -0.03]})
+    vec.reset(seed=0)
+    state, system = vec.world.state, vec.world.system
+    for n, vehicle in enumerate(system.vehicles):
+        rotation = state.drone_rotation[0, n]
+        low, high = (vec.world.cable_points(0, n)[i] for i in (0, -1))
+        pull = state.cable_tension[0, n] * (high - low) / np.linalg.norm(high - low)  # of the drone on its cable
+        wrench = vehicle.allocation @ (vehicle.thrust_coefficient * state.rotor_speed[0, n] ** 2)
+        hold = rotation.T @ (pull + [0.0, 0.0, vehicle.mass * 9.80665])
+        assert wrench[0] == pytest.approx(hold[2], rel=0.01) and abs(hold[:2]).max() < 0.02 * hold[2]
+        np.testing.assert_allclose(wrench[1:3], np.cross(system.hooks[n], rotation.T @ pull)[:2], atol=2e-3)

@@ -205,3 +205,10 @@ def test_drones_rest_at_their_slots_distance_or_clear_of_the_payload():
                                       "task_options.start_spread": 0.2 / 0.6})  # fmt: skip
     height = 0.05 + 0.05 - drone_half_size(wide.vehicle)[2]
     assert f"takes {np.hypot(level, height) / 0.6:.2f} of its length" in said
+
+
+def test_drones_start_within_a_share_of_their_shortest_cable():
+    """`start_spread` is in lengths of the shortest cable."""
+    for length in (0.5, 2.0):
+        task = ml.make_vec("takeoff", **{"env.num_envs": 1, "env.num_drones": 3, "cable.length": length}).task
+        assert task._spread == pytest.approx(length * task.options.start_spread)
