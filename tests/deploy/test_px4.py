@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import sys
@@ -216,6 +217,37 @@ def test_others_fly_autopilots_by_topics_that_they_hear_live():
     assert (np.diff(stamps) >= 0).all() and len(stamps) > 500 and stamps[-1] > lasted - 2.0
     least = min(phase.separation for phase in result.phases)
     assert 0.35 < least < 2.0 and all(phase.tilt < 45 for phase in result.phases)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["formation_integral", "none"])
+def test_the_command_reports_a_flight_that_ends_on_its_way_back(policy, tmp_path, monkeypatch, capsys):
+    """With a phase that has no step; with policy=none, too, where nobody sends set-points and drones hold theirs."""
+    config = config_of("hover", **{"randomization.payload_force": 0.0, "env.episode_seconds": 1.0})
+    fakes = make_fakes(config.system)
+    go, settings = Flight._go, Settings(first=FIRST, timeout=20.0, suite=EXACT)
+
+    def fail_on_the_way_back(flight, vec, begin, end, what):
+        if what == "the way back":
+            flight._begin(what, vec)
+            raise FlightError("PX4 7 has ended")
+        return go(flight, vec, begin, end, what)
+
+    monkeypatch.setattr(Flight, "_go", fail_on_the_way_back)
+    fly_fakes = partial(AutopilotTeam, settings=settings)
+    monkeypatch.setattr("multilift_marl.deploy.px4.team.AutopilotTeam", lambda rig, dt, _: fly_fakes(rig, dt))
+    options = command.Options(policy=policy, live=policy == "none", domain=DOMAIN, timeout=0.5)
+    bind = None if policy == "none" else find_policy(policy).bind
+    try:
+        assert command._fly_and_report(config, bind, options, tmp_path, tmp_path) == 1
+    finally:
+        for fake in fakes:
+            fake.end()
+    printed, report = capsys.readouterr(), json.loads((tmp_path / "metrics.json").read_text())
+    assert "the flight ended early: PX4 7 has ended" in printed.err
+    assert [phase["name"] for phase in report["px4"]["phases"]] == ["take-off", "the way to the task", "hover"]
+    assert ("steps_without_setpoint" in report["px4"]) == (policy == "none") == (not report["baselines"])
+    assert (tmp_path / "errors.png").is_file()
 
 
 @pytest.mark.slow

@@ -57,7 +57,9 @@ class Options(CommandOptions):
     instance: Annotated[Int, Between(0, 9)] = Field(
         0, description="of the first PX4, which makes the ports: 4560, 14540, 14580 + instance"
     )
-    timeout: Annotated[Float, Between(0.1, 600, "s")] = Field(30.0, description="[s] for a PX4 to connect or to answer")
+    timeout: Annotated[Float, Between(0.1, 600, "s")] = Field(
+        30.0, description="[s] for a PX4 to connect or to answer, and for others' first set-points"
+    )
     parameters: dict[Annotated[str, Field(pattern="^[A-Z][A-Z0-9_]{1,15}$")], Float] = Field(
         {}, description="of PX4, in place of ours: parameters={MPC_XY_P: 1.2}"
     )
