@@ -23,6 +23,7 @@ from multilift_marl.rig.resolve import whole_ratio
 from multilift_marl.sensing.estimator import StateEstimator
 from multilift_marl.sensing.measurement import Sensing
 from multilift_marl.sim.saved import check_counts, check_saved, fingerprint
+from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 from multilift_marl.tasks import find_task
 
@@ -309,9 +310,16 @@ class MultiliftVec:
         name = self.reward_terms[int(bad.argmax())] if bad.any() else "the sum"
         raise ConfigError(f"reward term {name} is not finite in environment {env}; mend what computes it")
 
-    def use_controller(self, controller: Controller) -> None:
-        """Let another controller of this world fly the drones from the next reset on."""
+    def use_controller(self, controller: Controller, report: Callable[[SystemState], None] | None = None) -> None:
+        """Let another controller of this world fly the drones from the next reset on.
+
+        Args:
+            controller: flies them.
+            report: writes after each control tick what drones know of themselves, but with `env.sensing=ideal`.
+        """
         self.controller, self.reference = controller, controller.reference
+        if self._estimator is not None and report is not None:
+            self._estimator.follow(report)
         self._bind()
 
     def _bind(self) -> None:

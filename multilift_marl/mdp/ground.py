@@ -6,6 +6,7 @@ from math import cos, hypot, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import inlined, kernel
@@ -180,6 +181,9 @@ def cable_rise(e, n, state, rig):
     turned = mul(matrow(state.payload_rotation, e), row(rig.anchors, n))
     return state.drone_position[e, n, 2] - state.payload_position[e, 2] - turned[2]
 
+
+PACE = Field(1.0, description="[-] of the plan: with 0.5 it takes twice the time (raise env.episode_seconds, too)")
+"""Option of tasks that begin or end on the ground."""
 
 CARRIED = {
     "position": Term(0.4, position, 0.25, "m"),

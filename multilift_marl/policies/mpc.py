@@ -23,7 +23,7 @@ from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.policies.full_state_command import FullStateCommand
 from multilift_marl.policies.hold import HoldAccRates, HoldFullState
 from multilift_marl.policies.last_plan import LastPlan
-from multilift_marl.sensing.load_sensing import CAMERA_DELAY
+from multilift_marl.sensing.load_sensing import CAMERA_DELAY, CAMERAS
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -85,7 +85,7 @@ class TeamMpc:
         self._estimator = ForceEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None
         self._observer = None
         if not exact:
-            late = CAMERA_DELAY if config.env.sensing == "mocap" else 0.0
+            late = CAMERA_DELAY if config.env.sensing in CAMERAS else 0.0
             share = UNFILTERED if config.env.sensing == "ideal" else SHARE
             self._observer = TeamObserver(self.planner.model, vec.num_envs, share, late)
         lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)

@@ -45,7 +45,7 @@ class EnvConfig(Section):
     policy_hz: Annotated[Float, Between(1, 1e5, "Hz")] = Field(
         50.0, gt=0, description="[Hz] rate of actions and observations"
     )
-    sensing: Literal["ideal", "mocap", "onboard", "blind"] = Field(
+    sensing: Literal["ideal", "mocap", "rtk", "onboard", "blind"] = Field(
         "ideal", description="what drones know of themselves and of the payload (docs/sensing.md)"
     )
     communication: Literal["none", "neighbours", "all"] = Field(

@@ -1,8 +1,8 @@
 """What each drone knows of the payload, by the level of `env.sensing`.
 
-`mocap`: cameras tell all drones one pose of the payload. `onboard`: a drone measures where its own cable points and how
-strongly it pulls, and takes the cable to be as long, and the payload as level, as planned. `blind`: it measures nothing
-of the load, and takes its cable to hang as in the resting formation. Velocities follow by an alpha-beta filter
+`mocap`, `rtk`: cameras tell all drones one pose of the payload. `onboard`: a drone measures where its own cable points
+and how strongly it pulls, and takes the cable to be as long, and the payload as level, as planned. `blind`: it measures
+nothing of the load, and takes its cable to hang as in the resting formation. Velocities follow by an alpha-beta filter
 (Kalata, IEEE TAES 20(2), 1984). Drones that hear of others' anchors fit the payload to all that they know.
 """
 
@@ -61,6 +61,7 @@ class LoadMemory(NamedTuple):
 
 
 CAMERA_DELAY = 0.008  # [s] of a pose by motion capture
+CAMERAS = ("mocap", "rtk")  # levels at which cameras measure the payload
 
 
 class LoadSensor(NamedTuple):
@@ -115,7 +116,7 @@ def make_sensor(level: str, dt: float, length: float) -> LoadSensor:
         dt: a policy step [s].
         length: of the cables [m].
     """
-    if level == "mocap":  # as for the drones: 1 mm, 0.2°, 8 ms
+    if level in CAMERAS:  # as for the drones of mocap: 1 mm, 0.2°, 8 ms
         place, turned = 1e-3, radians(0.2)
         gains = alpha_beta(ACCELERATION, place, dt), alpha_beta(ANGULAR_ACCELERATION, turned, dt)
         return LoadSensor(dt, CAMERA_DELAY, place, turned, follow=gains[0], turn=gains[1])
@@ -145,7 +146,7 @@ class LoadSensing:
         self, level: str, true: SystemState, own: SystemState, dt: float, length: float, links: Links | None = None
     ):  # fmt: skip
         e, n = true.cable_tension.shape
-        rows = 1 if level == "mocap" else n
+        rows = 1 if level in CAMERAS else n
         self._level, self._true, self._own = level, true, own
         self.load = Load(
             np.zeros((e, rows, 3)), np.tile(np.eye(3), (e, rows, 1, 1)), np.zeros((e, rows, 3)),
@@ -167,7 +168,7 @@ class LoadSensing:
     def bind(self, planned: Goal, rig: RigArrays, resting_tension: np.ndarray, first: bool) -> Call:
         """Return the call of (lo, hi) that measures the payload; `first` of an episode, without a past to filter."""
         scene = self._scene(planned, rig, resting_tension)
-        if self._level == "mocap":
+        if self._level in CAMERAS:
             return prebind(measure_payload, scene, self.load, first)
         see = prebind(measure_cable if self._level == "onboard" else assume_nominal_cable, scene, self.load, first)
         if self._messages is None:
@@ -208,7 +209,7 @@ def draw_offsets(e, memory, sensor):
 
 @kernel
 def measure_payload(lo, hi, scene, load, first):
-    """Measure the payload's pose by cameras: `mocap`.
+    """Measure the payload's pose by cameras: `mocap`, `rtk`.
 
     Args:
         lo, hi: the environments.

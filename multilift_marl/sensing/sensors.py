@@ -15,7 +15,7 @@ own (SplitMix64, see `rng.py`), so results do not depend on how many are compute
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import exp, expm1, sqrt
 from typing import NamedTuple
 
@@ -67,6 +67,11 @@ class Sensor:
     drift: float | tuple[float, ...] = 0.0
     drift_time: float = 100.0
     drifting: bool = True
+
+    def scaled(self, factor: float) -> Sensor:
+        """Return the sensor with `factor` times its errors."""
+        noise, offset, drift = (tuple(factor * np.atleast_1d(x)) for x in (self.noise, self.offset, self.drift))
+        return replace(self, noise=noise, offset=offset, drift=drift)
 
 
 def white(density: float, rate: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import hypot, radians
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +15,7 @@ from multilift_marl.mdp.criteria import CONDITION, Criterion, length
 from multilift_marl.mdp.failures import LOAD_GROUND, TOUCH, Limits, ignore, payload_height
 from multilift_marl.mdp.ground import (
     CARRIED,
+    PACE,
     Ground,
     cable_chord,
     make_ground,
@@ -27,7 +28,7 @@ from multilift_marl.mdp.ground import (
 from multilift_marl.mdp.initial_states import set_equilibrium
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import Term, action_rate, tolerance
-from multilift_marl.schema.values import Float, Section
+from multilift_marl.schema.values import Between, Float, Section
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks.base import Kernels, Task
@@ -57,6 +58,7 @@ class LandOptions(Section):
         0.3, gt=0, description="[m] drones from payload and ground; less for a span below a falcon's"
     )
     success_seconds: Float = Field(1.0, gt=0, description="[s] at rest, slack and clear throughout the last seconds")
+    pace: Annotated[Float, Between(0.1, 2)] = PACE
 
 
 class LandArrays(NamedTuple):
@@ -76,6 +78,8 @@ class LandSettings(NamedTuple):
     """Constants of the task, and what counts as landed."""
 
     ground: Ground
+    pace: float
+    """Of the plan [-]."""
     radius: float
     """Payload within this of the pad's middle [m]."""
     speed: float
@@ -102,7 +106,7 @@ def start_above_origin(e, rng, v, equilibrium, ranges):
 @inlined
 def advance(e, v):
     """Move the goal on: to the pad, down, slowly onto it; then cable forces fade and drones come closer."""
-    goal, rig, own, ground, t = v.goal, v.rig, v.own, v.settings.ground, v.time[e]
+    goal, rig, own, ground, t, pace = v.goal, v.rig, v.own, v.settings.ground, v.time[e], v.settings.pace
     course = row(own.course, e)
     # At every control step, and not only after a policy step, in which a payload could touch and bounce unseen.
     see_touchdown(e, v)
@@ -110,13 +114,13 @@ def advance(e, v):
     near = min(NEAR * ground.size, -course[2])
     # The start again, from the course alone; the three phases add up on it.
     set_resting_goal(e, goal, (0.0, 0.0, ground.payload - course[2]))
-    move_goal(e, goal, (course[0], course[1], 0.0), ease(t, APPROACH[0], APPROACH[1]))
-    move_goal(e, goal, (0.0, 0.0, course[2] + near), ease(t, DESCEND[0], DESCEND[1]))
-    move_goal(e, goal, (0.0, 0.0, -near), ease(t, SETTLE[0], SETTLE[1]))
+    move_goal(e, goal, (course[0], course[1], 0.0), ease(t, APPROACH[0] / pace, APPROACH[1] / pace))
+    move_goal(e, goal, (0.0, 0.0, course[2] + near), ease(t, DESCEND[0] / pace, DESCEND[1] / pace))
+    move_goal(e, goal, (0.0, 0.0, -near), ease(t, SETTLE[0] / pace, SETTLE[1] / pace))
     place_formation(e, goal, rig)
     # After the formation, which writes slots and full cable forces anew in each step: both are changed from there.
-    own.pull_fraction[e] = 1.0 - ease(t, RELEASE[0], RELEASE[1])[0]
-    lower = ease(t, LOWER[0], LOWER[1])
+    own.pull_fraction[e] = 1.0 - ease(t, RELEASE[0] / pace, RELEASE[1] / pace)[0]
+    lower = ease(t, LOWER[0] / pace, LOWER[1] / pace)
     for n in range(rig.slots.shape[0]):
         chord = cable_chord(e, n, goal, rig)
         put(goal.slots[e, n], add(vec(goal.slots, e, n), scale(-SHORTER * lower[0], chord)))
@@ -198,7 +202,7 @@ def slackness(e, v, margin):
 @inlined
 def time_to_touch(e, n, v):
     """Time until the target is on the ground."""
-    return DOWN - v.time[e]
+    return DOWN / v.settings.pace - v.time[e]
 
 
 @inlined
@@ -248,6 +252,7 @@ class Land(Task):
         self.own = LandArrays(np.zeros((e, 3)), np.zeros(e, np.int64), np.zeros(e), np.zeros(e))
         self.settings = LandSettings(
             ground=ground,
+            pace=option.pace,
             radius=option.pad_radius,
             speed=option.touch_speed,
             clearance=option.clearance * min(ground.size, 1.0),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import radians
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +15,7 @@ from multilift_marl.mdp.criteria import Criterion, rest_criteria
 from multilift_marl.mdp.failures import BELOW, CABLE, GROUND, LOAD_GROUND, ignore, payload_height
 from multilift_marl.mdp.ground import (
     CARRIED,
+    PACE,
     Ground,
     cable_chord,
     cable_rise,
@@ -29,7 +30,7 @@ from multilift_marl.mdp.ground import (
 )
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import RestBounds, Term, action_rate, is_at_rest
-from multilift_marl.schema.values import Float, Section
+from multilift_marl.schema.values import Between, Float, Section
 from multilift_marl.tasks.base import Kernels, Task
 
 RISE = (0.1, 1.6)  # begin and length of each phase [s], as of the next ones: drones rise,
@@ -57,6 +58,7 @@ class TakeoffOptions(Section):
     success_angle: Float = Field(5.0, gt=0, description="[deg] ... and within this of its attitude ...")
     success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds")
     success_tension: Float = Field(2.0, gt=1, description="[-] largest tension at any time, over the resting tension")
+    pace: Annotated[Float, Between(0.1, 2)] = PACE
 
 
 class TakeoffArrays(NamedTuple):
@@ -81,6 +83,8 @@ class TakeoffSettings(NamedTuple):
     bounds: RestBounds
     climb: float
     """Of the target [m]."""
+    pace: float
+    """Of the plan [-]."""
 
 
 @drawing
@@ -96,11 +100,12 @@ def start_on_ground(e, rng, v, ranges, distance):
 @inlined
 def advance(e, v):
     """Move the goal on, and find out who has left the ground."""
-    goal, rig, own, t = v.goal, v.rig, v.own, v.time[e]
+    goal, rig, own, t, pace = v.goal, v.rig, v.own, v.time[e], v.settings.pace
     set_resting_goal(e, goal, row(own.place, e))
-    move_goal(e, goal, (0.0, 0.0, v.settings.climb), ease(t, LIFT[0], LIFT[1]))
+    move_goal(e, goal, (0.0, 0.0, v.settings.climb), ease(t, LIFT[0] / pace, LIFT[1] / pace))
     place_formation(e, goal, rig)
-    pulled, risen, tight = ease(t, PULL[0], PULL[1]), ease(t, RISE[0], RISE[1]), ease(t, TIGHTEN[0], TIGHTEN[1])
+    risen, tight = ease(t, RISE[0] / pace, RISE[1] / pace), ease(t, TIGHTEN[0] / pace, TIGHTEN[1] / pace)
+    pulled = ease(t, PULL[0] / pace, PULL[1] / pace)
     own.pull_fraction[e] = pulled[0]
     for n in range(rig.slots.shape[0]):
         # along the cable: short of taut, a little beyond, then where the force puts the slot
@@ -145,7 +150,7 @@ def _stage(e, v):
 @inlined
 def is_lifted(e, v):
     """Payload at its final target."""
-    return v.time[e] >= ARRIVED and is_at_rest(e, v, v.settings.bounds)
+    return v.time[e] >= ARRIVED / v.settings.pace and is_at_rest(e, v, v.settings.bounds)
 
 
 @inlined
@@ -163,7 +168,7 @@ def forget_peak(e, v):
 @inlined
 def time_to_lift(e, n, v):
     """Time until the target leaves the ground."""
-    return max(LIFT[0] - v.time[e], -4.0)
+    return max(LIFT[0] / v.settings.pace - v.time[e], -4.0)
 
 
 @inlined
@@ -209,7 +214,9 @@ class Takeoff(Task):
         self._spread = option.start_spread * float(system.cable_length.min())
         self._distance = resting_distance(system, self._spread)
         self.own = TakeoffArrays(np.zeros((e, 3)), np.zeros((e, n, 3)), np.zeros(e, np.int64), np.zeros(e), np.zeros(e))
-        self.settings = TakeoffSettings(ground, RestBounds.of(option), option.target_height - ground.payload)
+        self.settings = TakeoffSettings(
+            ground, RestBounds.of(option), option.target_height - ground.payload, option.pace
+        )
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw where the payload and the drones are on the ground; see `Task.start`."""

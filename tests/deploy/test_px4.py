@@ -253,7 +253,8 @@ def test_the_command_reports_a_flight_that_ends_on_its_way_back(policy, tmp_path
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["takeoff", "land"])
 def test_take_off_and_landing_are_tasks_too(task):
-    config, said = config_of(task, **{"randomization.payload_mass": 0.0}), []
+    slow = {"task_options.pace": 0.5, "env.episode_seconds": 24.0} if task == "land" else {}
+    config, said = config_of(task, **{"randomization.payload_mass": 0.0} | slow), []
     with Airfield(config.system) as field:
         flight = Flight(config, field.team, 1000, said.append)
         result = flight.fly(lambda vec: make_scripted("formation_integral", vec))

@@ -45,6 +45,9 @@ DT = 0.004
         (["px4=/nowhere", "parameters={MPC_XY_P: much}"], "parameters"),
         (["px4=/nowhere", "parameters={MPC_XY_P: 1.2}"], "px4=/nowhere holds no PX4"),
         (["px4=/nowhere", "config=loss"], "PX4 cannot fly config=loss"),
+        (["px4=/nowhere", "config=land"], "set task_options.pace=0.5 and env.episode_seconds=24"),
+        (["px4=/nowhere", "config=land", "task_options.pace=0.5"], "px4=/nowhere holds no PX4"),
+        (["px4=/nowhere", "position_errors=-1"], "position_errors"),
         (["px4=/nowhere", "instance=12"], "instance"),
         (["px4=/nowhere", "policy=formations"], "unknown policy 'formations'"),
         (["px4=/nowhere", "policy=none"], "set live=true"),
@@ -163,6 +166,7 @@ def test_policies_that_know_faster_drones_alone_are_warned_of(settings, warned, 
     assert not caplog.records
     name = f"mine_{len(settings)}_{warned}_{settings.get('control.position_frequency', 0)}"  # warnings come once each
     command._warn_of_loops(name, ml.load_config("hover", settings))
+    command._warn_of_loops("of_conditions_px4", ml.load_config("hover_px4"))
     assert [each.name for each in caplog.records] == ["multilift_marl.px4"] * warned
     assert warned == (f"policy={name} was trained with drones" in caplog.text)
 

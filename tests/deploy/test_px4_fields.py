@@ -20,11 +20,14 @@ from multilift_marl.control.autopilot import LoadFeedforward
 from multilift_marl.deploy.px4.link import SimulatorLink
 from multilift_marl.deploy.px4.offboard import PX4_PORT, OffboardLink
 from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
+from multilift_marl.math3d import mat_to_quat, quat_to_mat
 from multilift_marl.sensing.sensors import SIZES
-from multilift_marl.sim.earth import Site
+from multilift_marl.sim.earth import Site, swap_attitude
+from multilift_marl.sim.state import SystemState
 
 INDEX = FIRST + 8
 FORCE, RATES, FIELD = [1.5, -2.5, 9.25], [0.5, -0.25, 0.125], [21.0, -3.0, -43.0]  # FLU: [m/s²], [rad/s], [µT]
+ROTATION = np.reshape(quat_to_mat(0.9, 0.1, -0.2, 0.3), (3, 3))  # FLU to ENU
 PLACE, VELOCITY = [30.0, -40.0, 5.0], [3.0, 4.0, -2.0]  # ENU: [m], [m/s]
 
 
@@ -126,3 +129,40 @@ def test_a_teams_set_points_are_in_the_frame_of_each_autopilot():
     np.testing.assert_allclose(acceleration, expected[[1, 0, 2]] * [1, 1, -1])
     still = team._feedforward.acceleration(1, np.zeros(3), np.zeros(3), np.array([0.5, -1.0, 2.0]), 0.25)
     np.testing.assert_allclose(still, np.array([0.5, -1.0, 2.0]) / system.vehicles[1].mass)
+
+
+def test_what_autopilots_report_is_what_drones_know():
+    """PX4's estimate is 20 ms old, NED from a place of its own; drones know it in the world, carried on to now."""
+    team = AutopilotTeam.__new__(AutopilotTeam)
+    team.settings, team._time_us = Settings(), 1_020_000
+    turned = np.array(swap_attitude(ROTATION))
+    own = SimpleNamespace(
+        origin=Site().to_geodetic(np.array([1.0, 2.0, 3.0])), position=np.array([4.0, 3.0, -6.0]), time_us=1_000_000,
+        velocity=np.array([0.2, 0.1, -0.4]), attitude=turned, rates=np.array([0.3, -0.2, 0.1]),
+    )  # fmt: skip
+    silent = SimpleNamespace(
+        origin=np.full(3, np.nan), position=np.zeros(3), velocity=np.zeros(3), attitude=turned, rates=np.zeros(3)
+    )
+    team.offboard = [own, silent]
+    state = SystemState.zeros(1, 2)
+    team.report(state)
+    expected = np.array([4.0, 6.0, 9.0]) + 0.02 * np.array([0.1, 0.2, 0.4])
+    np.testing.assert_allclose(state.drone_position[0, 0], expected, atol=0.02)  # PX4's sphere is no ellipsoid
+    np.testing.assert_allclose(state.drone_velocity[0, 0], [0.1, 0.2, 0.4])
+    np.testing.assert_allclose(state.drone_rotation[0, 0], ROTATION, atol=1e-12)
+    np.testing.assert_allclose(state.drone_body_rates[0, 0], [0.3, 0.2, -0.1])
+    assert not state.drone_position[0, 1].any()  # of one that has not said anything yet
+
+
+def test_attitudes_are_heard_as_px4_sends_them():
+    link = OffboardLink(FIRST + 9)
+    w, x, y, z = mat_to_quat(tuple(np.ravel(swap_attitude(ROTATION))))
+    try:
+        link._take(mavlink.MAVLink_attitude_quaternion_message(7, w, x, y, z, 0.3, -0.2, 0.1))
+        np.testing.assert_allclose(swap_attitude(link.attitude), ROTATION, atol=1e-6)
+        np.testing.assert_allclose(link.rates, [0.3, -0.2, 0.1])
+        for wrong in ((2.0, 0, 0, 0, 1, 1, 1), (1.0, 0, 0, 0, np.nan, 0, 0), (np.nan, 0, 0, 0, 1, 1, 1)):
+            link._take(mavlink.MAVLink_attitude_quaternion_message(8, *wrong))
+        np.testing.assert_allclose(link.rates, [0.3, -0.2, 0.1])  # what cannot be is left out
+    finally:
+        link.close()

@@ -41,7 +41,7 @@ def fly(level, script="formation_integral", **settings):
 
 @pytest.mark.parametrize(
     ("level", "position", "velocity", "angle"),
-    [("mocap", 0.001, 0.008, 0.6), ("onboard", 0.03, 0.03, 1.2), ("blind", 0.03, 0.03, 1.2)],
+    [("mocap", 0.001, 0.008, 0.6), ("rtk", 0.03, 0.03, 1.2), ("onboard", 0.03, 0.03, 1.2), ("blind", 0.03, 0.03, 1.2)],
 )
 def test_filters_stay_as_close_as_their_sensors(level, position, velocity, angle):
     _, errors = fly(level)

@@ -14,7 +14,7 @@ from multilift_marl.policies.baselines import fitting_scripts, make_scripted
 from multilift_marl.sensing.load_filter import alpha_beta
 from multilift_marl.sim.state import SystemState
 
-LEVELS = ("mocap", "onboard", "blind")
+LEVELS = ("mocap", "rtk", "onboard", "blind")
 REST = ("gate", "pose", "recover", "loss", "land", "takeoff")
 
 
@@ -49,6 +49,7 @@ def move_payload(state: SystemState):
 
 def test_who_sees_the_payload():
     assert changed(settled("mocap"), move_payload).all()
+    assert changed(settled("rtk"), move_payload).all()
     assert changed(settled("onboard"), move_payload).all()  # by the own cable
     assert not changed(settled("blind"), move_payload).any()
 
@@ -58,6 +59,7 @@ def test_who_feels_a_tension():
         state.cable_tension[0, 1] *= 1.1
 
     assert not changed(settled("mocap"), pull).any()
+    assert not changed(settled("rtk"), pull).any()
     assert changed(settled("onboard"), pull).tolist() == [False, True, False, False]
     assert not changed(settled("blind"), pull).any()
 
@@ -79,7 +81,7 @@ def test_only_cameras_see_the_payload_turn():
         state.payload_rotation[0] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ state.payload_rotation[0]
 
     part = [i for i, name in enumerate(settled("mocap").observation_names) if "payload_rotation_error" in name]
-    for level, knows in (("mocap", True), ("onboard", False), ("blind", False)):
+    for level, knows in (("mocap", True), ("rtk", True), ("onboard", False), ("blind", False)):
         vec = settled(level)
         before, twin = observe(copy.copy(vec))[0], copy.copy(vec)
         turn(twin.world.state)
@@ -87,7 +89,12 @@ def test_only_cameras_see_the_payload_turn():
 
 
 def test_levels_are_as_exact_as_stated():
-    for level, low, high in (("mocap", 5e-4, 4e-3), ("onboard", 5e-3, 0.05), ("blind", 0.01, 0.15)):
+    for level, low, high in (
+        ("mocap", 5e-4, 4e-3),
+        ("rtk", 5e-4, 4e-3),
+        ("onboard", 5e-3, 0.05),
+        ("blind", 0.01, 0.15),
+    ):
         vec = make(num_envs=32, **{"env.sensing": level})
         vec.reset(seed=1)
         for _ in range(150):
@@ -95,7 +102,7 @@ def test_levels_are_as_exact_as_stated():
         off = vec.task.view.payload_estimate.position - vec.world.state.payload_position[:, None]
         rms = np.sqrt((off**2).sum(-1).mean())
         assert low < rms < high, (level, rms)
-        assert off.shape[1] == (1 if level == "mocap" else 4)
+        assert off.shape[1] == (1 if level in ("mocap", "rtk") else 4)
 
 
 def test_a_longer_cable_than_known_deceives_the_drone_that_measures_it():
@@ -227,7 +234,38 @@ def test_teams_that_are_measured_have_no_simulated_sensors():
         check_flyable(load_config("hover", {"env.sensing": "onboard"}))
 
 
+def test_with_rtk_drones_know_themselves_as_by_onboard_sensors():
+    known = {}
+    for level in ("rtk", "onboard"):
+        vec = make(num_envs=8, **{"env.sensing": level})
+        vec.reset(seed=3)
+        vec.step(np.zeros((8, 4, 4)))
+        known[level] = vec.controller.state.drone_position.copy()
+    assert same(known["rtk"], known["onboard"])
+
+
+def test_what_another_reports_is_what_drones_know():
+    vec = make(num_envs=1, **{"env.sensing": "rtk"})
+
+    def report(state):
+        for name in ("drone_position", "drone_velocity", "drone_rotation", "drone_body_rates"):
+            getattr(state, name)[:] = getattr(vec.world.state, name)
+        state.drone_position[:] += (0.01, -0.02, 0.03)
+
+    vec.use_controller(vec.controller, report)
+    vec.reset(seed=2)
+    for _ in range(30):
+        vec.step(np.zeros((1, 4, 4)))
+    off = vec.controller.state.drone_position - vec.world.state.drone_position
+    np.testing.assert_allclose(off, np.broadcast_to((0.01, -0.02, 0.03), off.shape), atol=1e-12)
+    before = observe(vec)[0]
+    report(vec.controller.state)
+    vec.controller.state.drone_position[:] += 0.05
+    assert np.abs(observe(vec)[0] - before).max(axis=1).min() > 0.04  # which is also what they observe
+
+
 def test_conditions_go_below_any_task():
+    assert load_config("hover_px4").env.sensing == "rtk"
     config = load_config("hover_realistic")
     assert config.task == "hover" and config.env.sensing == "mocap" and config.randomization.cable_length == 0.2
     assert config.randomization.payload_force == 1.5 and config.wind.turbulence  # the task's own stays

@@ -279,3 +279,14 @@ def test_a_drift_that_has_gone_on_for_long_keeps_its_deviation():
     np.testing.assert_allclose(read.std(axis=1)[::25], 0.05, rtol=0.1)
     together = (read[0] * read[125]).mean() / 0.05**2
     assert together == pytest.approx(np.exp(-1.0), abs=0.1)
+
+
+def test_a_scaled_sensor_has_as_many_times_the_errors():
+    usual = SensorSuite().position
+    twice = usual.scaled(2.0)
+    for part in ("noise", "offset", "drift"):
+        np.testing.assert_allclose(
+            np.broadcast_to(getattr(twice, part), 3), 2 * np.broadcast_to(getattr(usual, part), 3)
+        )
+    assert (twice.rate, twice.delay, twice.drift_time) == (usual.rate, usual.delay, usual.drift_time)
+    assert not np.any(usual.scaled(0.0).noise)

@@ -12,6 +12,7 @@ from multilift_marl.math3d import axis_angle
 from multilift_marl.mdp.ground import resting_distance
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.tasks import land, takeoff
 from multilift_marl.tasks.takeoff import ARRIVED, FLYING, LIFT, LIFTED, PULL, RESTING, TIGHTEN
 
 CALM = {"randomization.payload_mass": 0.0}
@@ -80,6 +81,29 @@ def test_the_velocities_of_the_plan_are_those_of_target_and_slots():
     np.testing.assert_allclose(own[1:-1], slot_velocity[1:-1], atol=0.02)  # the closing of the cables is not told
     assert np.abs(slot_velocity).max() > 0.5
     assert target[-1, 2] == pytest.approx(vec.task.options.target_height, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("task", "advance", "until", "bound"),
+    [("takeoff", takeoff.advance, takeoff.time_to_lift, -4.0), ("land", land.advance, land.time_to_touch, -np.inf)],
+)
+def test_at_half_the_pace_the_plan_takes_twice_the_time(task, advance, until, bound):
+    usual, slow = (make(task, num_envs=1, **{"task_options.pace": pace}) for pace in (1.0, 0.5))
+    fastest = 0.0
+    for vec in (usual, slow):
+        vec.reset(seed=0)
+    for seconds in (0.5, 2.0, 3.4, 4.5, 5.6, 7.0, 9.3):
+        for vec, time in ((usual, seconds), (slow, 2 * seconds)):
+            vec.task.time[0] = time
+            advance(0, vec.task.view_for(advance))
+        goal, other = usual.task.goal, slow.task.goal
+        np.testing.assert_allclose(other.position, goal.position, atol=1e-9)
+        np.testing.assert_allclose(2 * other.velocity, goal.velocity, atol=1e-9)
+        np.testing.assert_allclose(2 * other.slot_velocity, goal.slot_velocity, atol=1e-9)
+        fastest = max(fastest, np.abs(goal.velocity).max(), np.abs(goal.slot_velocity).max())
+        left = [until(0, 0, vec.task.view_for(until)) for vec in (usual, slow)]
+        assert left[1] == pytest.approx(max(2 * left[0], bound)) or left[0] == bound
+    assert fastest > 0.2
 
 
 def test_cables_are_slack_until_the_drones_close_them_and_taut_when_they_pull():

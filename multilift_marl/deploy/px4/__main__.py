@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -62,6 +63,9 @@ class Options(CommandOptions):
     )
     parameters: dict[Annotated[str, Field(pattern="^[A-Z][A-Z0-9_]{1,15}$")], Float] = Field(
         {}, description="of PX4, in place of ours: parameters={MPC_XY_P: 1.2}"
+    )
+    position_errors: Annotated[Float, Between(0, 100, "-")] = Field(
+        1.0, description="of the satellite positioning of all drones, in multiples of an RTK receiver's"
     )
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the task, see docs/ros.md")
     live: bool = Field(False, description="whether the whole flight is published on ROS 2 topics, by DDS")
@@ -133,6 +137,7 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     """
     from multilift_marl.deploy.px4.flight import Flight
     from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
+    from multilift_marl.sensing.sensors import SensorSuite
 
     live = _open_live(config, options) if options.live else None
     setpoints: list[SetPoints] = []
@@ -142,10 +147,12 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
         setpoints.append(live.set_points(vec, options.patience, options.timeout))
         return setpoints[0]
 
+    suite = SensorSuite()
+    suite = replace(suite, position=suite.position.scaled(options.position_errors))
     begin = time.perf_counter()
     settings = Settings(
         build=build, first=options.instance, timeout=options.timeout, speed=options.speed, seed=options.seed,
-        log=options.log, parameters=options.parameters,
+        log=options.log, parameters=options.parameters, suite=suite,
     )  # fmt: skip
     with interrupted_by_signals(), AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
         say = partial(print, flush=True)

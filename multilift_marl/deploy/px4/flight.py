@@ -33,6 +33,7 @@ _HOLD = 2.0  # [s] at the end of the way
 _TURNING = 0.5  # [rad/s] of drones about themselves there, on average
 _NEAR = 0.01  # [m], [rad] within which there is no way to go
 _TAKEOFF, _LANDING = 10.0, 12.0  # [s]
+LANDING_PACE = 0.5  # at most, of task `land`: at 1 drones are 8 cm late, and payloads have hit the ground
 _OWN = ("task", "task_options", "reward")  # what take-off and landing have of their own
 Maker = Callable[[MultiliftVec], Policy]
 Say = Callable[[str], None]
@@ -211,7 +212,7 @@ class Flight:
 
     def _make(self, config: Config) -> MultiliftVec:
         vec = MultiliftVec(config, EVALUATION)
-        vec.use_controller(AutopilotController(config, vec.world, self.team))
+        vec.use_controller(AutopilotController(config, vec.world, self.team), self.team.report)
         return vec
 
     def _drawn(self) -> dict[str, np.ndarray]:
@@ -360,6 +361,11 @@ def check_config(config: Config) -> Config:
         )
     if config.task == "loss":
         raise ConfigError("PX4 cannot fly config=loss: a team that has lost a drone cannot be brought back")
+    if config.task == "land" and (pace := config.task_options.get("pace", 1.0)) > LANDING_PACE:
+        raise ConfigError(
+            f"drones under PX4 follow config=land too late at task_options.pace={pace:g}, and the "
+            f"payload hits the ground; set task_options.pace={LANDING_PACE:g} and env.episode_seconds=24"
+        )
     if config.cable.model != "massless":
         raise ConfigError("flights by PX4 go on from state to state, which chains cannot; set cable.model=massless")
     return build_config(config.model_dump(), {"env.num_envs": 1, "env.num_threads": 1})

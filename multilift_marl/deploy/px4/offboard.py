@@ -11,12 +11,14 @@ from multilift_marl.deploy.px4.launch import PX4_PORT
 from multilift_marl.deploy.px4.link import HOST
 from multilift_marl.deploy.px4.mavlink import MAVLink, Splitter, mavlink
 from multilift_marl.errors import FlightError, shorten
+from multilift_marl.math3d import quat_to_mat
 
 OWN_PORT = 14540
 OFFBOARD, LAND = (6, 0), (4, 6)  # main and sub mode of PX4
 POSITION_MASK = mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 ACCELERATION_MASK = 0x3F | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 RATES_MASK = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
+_ROUNDING = 1e-3  # by which the length of a quaternion in single precision may be off
 _LARGEST = 2048  # [bytes] of a datagram; PX4's fit into an Ethernet frame
 _MOST = 256  # datagrams that are heard at once; PX4 sends some ten between two set-points
 _CUSTOM = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -25,6 +27,7 @@ _WANTED = frozenset(
         mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
         mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, mavlink.MAVLINK_MSG_ID_COMMAND_ACK,
         mavlink.MAVLINK_MSG_ID_STATUSTEXT, mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
     }
 )  # fmt: skip
 
@@ -39,6 +42,7 @@ class OffboardLink:
         armed, mode: as the last heartbeat said; mode is PX4's main and sub mode.
         position, velocity: as PX4 estimates them, in its local frame, NED [m, m/s]; NaN before the first.
         time_us: of that estimate, by PX4's clock [us].
+        attitude, rates: (3, 3) from FRD to NED, and (3,) about FRD [rad/s], as it estimates them.
         origin: latitude, longitude [deg] and altitude [m] of that frame; NaN before PX4 has said.
         said: its last words, and which commands it refused.
         left_out: datagrams of others, or larger than PX4's.
@@ -50,6 +54,7 @@ class OffboardLink:
         self.mode = (0, 0)
         self.position, self.velocity, self.origin = (np.full(3, np.nan) for _ in range(3))
         self.time_us = 0
+        self.attitude, self.rates = np.eye(3), np.zeros(3)
         self.said: list[str] = []
         self.left_out = 0
         self._system = index + 1
@@ -90,6 +95,11 @@ class OffboardLink:
             motion = np.array([message.x, message.y, message.z, message.vx, message.vy, message.vz])
             if np.isfinite(motion).all():
                 self.time_us, self.position[:], self.velocity[:] = 1000 * message.time_boot_ms, motion[:3], motion[3:]
+        elif kind == "ATTITUDE_QUATERNION":
+            turned = np.array([message.q1, message.q2, message.q3, message.q4])
+            rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+            if abs(np.linalg.norm(turned) - 1.0) < _ROUNDING and np.isfinite(rates).all():
+                self.attitude, self.rates = np.array(quat_to_mat(*turned.tolist())).reshape(3, 3), rates
         elif kind == "GPS_GLOBAL_ORIGIN":
             self.origin[:] = message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3
         elif kind == "STATUSTEXT":

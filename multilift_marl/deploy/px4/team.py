@@ -24,7 +24,8 @@ from multilift_marl.math3d import heading
 from multilift_marl.realtime import RealTime
 from multilift_marl.rig.system import System
 from multilift_marl.sensing.sensors import Sensors, SensorSuite
-from multilift_marl.sim.earth import Site, project_local, swap_enu_ned, swap_flu_frd, swap_yaw
+from multilift_marl.sim.earth import Site, project_local, swap_attitude, swap_enu_ned, swap_flu_frd, swap_yaw
+from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
 SETPOINT_RATE = 50.0  # [Hz]
@@ -229,6 +230,20 @@ class AutopilotTeam:
             local = project_local(self.settings.site.to_geodetic(places[i]), each.origin)
             errors.append(np.linalg.norm(local - each.position))
         return np.array(errors)
+
+    def report(self, state: SystemState) -> None:
+        """Write where the autopilots believe their drones to be, and how they move, to a state of one environment."""
+        for i, each in enumerate(self.offboard):
+            if not np.isfinite(np.concatenate([each.origin, each.position, each.velocity])).all():
+                continue
+            # Over the metres of a flight, its local frame and the world differ by a shift alone.
+            shift = project_local(self.settings.site.to_geodetic(np.zeros(3)), each.origin)
+            velocity = swap_enu_ned(each.velocity)
+            age = 1e-6 * (self._time_us - each.time_us)
+            state.drone_position[0, i] = swap_enu_ned(each.position - shift) + age * velocity
+            state.drone_velocity[0, i] = velocity
+            state.drone_rotation[0, i] = swap_attitude(each.attitude)
+            state.drone_body_rates[0, i] = swap_flu_frd(each.rates)
 
     def settle(self, world: World, seconds: float = 1.0) -> None:
         """Let the autopilots run without set-points, as after landing."""
