@@ -151,6 +151,13 @@ def test_a_flight_that_does_not_start_leaves_no_empty_folder(tmp_path, monkeypat
     assert not (tmp_path / "flight").exists()
 
 
+def test_what_stands_for_an_autopilots_delay_and_integral_is_not_added_to_its_own():
+    trained = ml.load_config("hover_px4")
+    flown = check_config(trained)
+    assert trained.randomization.action_delay == (1, 3) and flown.randomization.action_delay == (0, 0)
+    assert trained.control.disturbance == "integral" and flown.control.disturbance == "none"
+
+
 @pytest.mark.parametrize(
     ("settings", "warned"),
     [

@@ -368,4 +368,6 @@ def check_config(config: Config) -> Config:
         )
     if config.cable.model != "massless":
         raise ConfigError("flights by PX4 go on from state to state, which chains cannot; set cable.model=massless")
-    return build_config(config.model_dump(), {"env.num_envs": 1, "env.num_threads": 1})
+    # Autopilots are late and reject disturbances by themselves.
+    own = {"env.num_envs": 1, "env.num_threads": 1, "randomization.action_delay": 0, "control.disturbance": "none"}
+    return build_config(config.model_dump(), own)

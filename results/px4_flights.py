@@ -1,0 +1,95 @@
+"""Flights by PX4 over seeds that nobody chose: each row of the table is a task, a team and a policy.
+
+  python results/px4_flights.py px4=DIR [rows=hover,circle] [flights=20] [out=docs/data/px4_runs.csv] [policy=RUN]
+
+`policy` flies `hover_px4` as row `hover_learned`.
+
+Each flight is one run of `python -m multilift_marl.px4`; flights that the file has are not flown again.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+FIRST = 2000  # seed of the first flight; tuning and training used others
+CIRCLE = ["config=track_circle", "policy=formation_lead", "env.episode_seconds=36"]
+ROWS: dict[str, list[str]] = {
+    "hover": ["config=hover", "policy=formation_integral"],
+    "circle": CIRCLE,
+    "circle_6": [*CIRCLE, "env.num_drones=6"],
+    "takeoff": ["config=takeoff", "policy=formation_integral", "task_options.pace=0.5", "env.episode_seconds=20"],
+    "land": ["config=land", "policy=formation_integral", "task_options.pace=0.5", "env.episode_seconds=24"],
+    "pose": ["config=pose", "policy=formation_integral"],
+    "hover_rtk_halved": ["config=hover", "policy=formation_integral", "position_errors=0.5"],
+    "hover_conditions": ["config=hover_px4", "policy=formation_integral"],
+}
+COLUMNS = (
+    "row", "seed", "success", "position_cm", "rmse_cm", "attitude_deg", "drones_cm", "estimates_cm", "separation_m",
+    "tension_task_N", "tension_N", "tilt_deg", "real_time_factor", "success_geometric_controller", "ended",
+)  # fmt: skip
+
+
+def fly(row: str, seed: int, px4: str) -> dict[str, Any]:
+    """Fly once; return what the table says of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "multilift_marl.px4", *ROWS[row], f"seed={seed}", f"px4={px4}"]
+        done = subprocess.run([*command, f"out={folder}/out"], cwd=ROOT, capture_output=True, text=True)
+        written = Path(folder) / "out" / "metrics.json"
+        said = (done.stderr or done.stdout).strip().split("\n")[-1]
+        if not written.is_file():
+            return {"row": row, "seed": seed, "success": 0, "ended": said}
+        report = json.loads(written.read_text())
+    metrics = {name: value["mean"] for name, value in report["policy"].items()}
+    flight, phases = report["px4"], report["px4"]["phases"]
+    own = next(phase for phase in phases if phase["name"] == report["config"]["task"])
+    ours = report["baselines"]["geometric controller"]["success_rate"]["mean"]
+    return {
+        "row": row, "seed": seed,
+        "success": round(metrics["success_rate"]),
+        "position_cm": round(100 * metrics["payload_position_error_m"], 2),
+        "rmse_cm": round(100 * metrics["payload_rmse_m"], 2),
+        "attitude_deg": round(metrics["payload_attitude_error_deg"], 2),
+        "drones_cm": round(100 * flight["drone_error_m"], 2),
+        "estimates_cm": round(100 * flight["estimate_error_m"], 2),
+        "separation_m": round(min(phase["separation"] for phase in phases), 3),
+        "tension_task_N": round(own["tension"], 1), "tension_N": round(max(phase["tension"] for phase in phases), 1),
+        "tilt_deg": round(max(phase["tilt"] for phase in phases), 1),
+        "real_time_factor": round(flight["real_time_factor"], 2),
+        "success_geometric_controller": round(ours),
+        "ended": flight["ended"],
+    }  # fmt: skip
+
+
+def main(arguments: list[str]) -> int:
+    """Fly what is not in the file yet."""
+    options = dict(argument.split("=", 1) for argument in arguments)
+    out = Path(options.get("out", ROOT / "docs" / "data" / "px4_runs.csv"))
+    rows = options.get("rows", "hover,circle").split(",")
+    if "policy" in options:
+        ROWS["hover_learned"] = ["config=hover_px4", f"policy={options['policy']}"]
+    known: set[tuple[str, int]] = set()
+    if out.is_file():
+        with out.open(newline="") as file:
+            known = {(line["row"], int(line["seed"])) for line in csv.DictReader(file)}
+    else:
+        out.write_text(",".join(COLUMNS) + "\n")
+    for row in rows:
+        for seed in range(FIRST, FIRST + int(options.get("flights", 20))):
+            if (row, seed) in known:
+                continue
+            line = fly(row, seed, options["px4"])
+            with out.open("a", newline="") as file:
+                csv.DictWriter(file, COLUMNS, lineterminator="\n").writerow(line)
+            print(line, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
