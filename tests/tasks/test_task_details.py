@@ -110,8 +110,9 @@ def test_a_loss_is_observed_by_those_who_know_of_it():
 @pytest.mark.parametrize("time, left", [(0.0, 4.1), (3.0, 1.1), (6.1, -2.0), (9.0, -4.0)])
 def test_the_time_to_the_lift_is_observed(time, left):
     view = record(
-        time=np.array([time]), goal=record(velocity=np.array([[0.1, 0.2, 0.3]])), own=record(peak=np.array([1.8]))
-    )
+        time=np.array([time]), goal=record(velocity=np.array([[0.1, 0.2, 0.3]])), own=record(peak=np.array([1.8])),
+        settings=record(pace=1.0),
+    )  # fmt: skip
     assert plain(takeoff.time_to_lift)(0, 0, view) == pytest.approx(left)
     assert plain(takeoff.climb_rate)(0, 0, view) == 0.3
     for peak, cost in ((1.8, 0.3), (1.5, 0.0), (2.7, 1.0)):
@@ -130,7 +131,12 @@ def landed_team():
         pull_fraction=np.array([0.25]),
     )  # fmt: skip
     settings = record(
-        radius=0.1, speed=0.3, clearance=0.3, drone_half=0.1, ground=record(cable_weight=np.array([0.5, 0.4]))
+        radius=0.1,
+        speed=0.3,
+        clearance=0.3,
+        drone_half=0.1,
+        pace=1.0,
+        ground=record(cable_weight=np.array([0.5, 0.4])),
     )
     state.cable_tension[0] = [0.5, 0.4]
     return record(
