@@ -1,10 +1,10 @@
 """Flights by PX4 over seeds that nobody chose: each row of the table is a task, a team and a policy.
 
   python results/px4_flights.py px4=DIR [rows=hover,circle] [flights=20] [out=docs/data/px4_runs.csv] [policy=RUN]
+  python results/px4_flights.py table [out=...]     what docs/flight.md says of them
 
-`policy` flies `hover_px4` as row `hover_learned`.
-
-Each flight is one run of `python -m multilift_marl.px4`; flights that the file has are not flown again.
+`policy` flies `hover_px4` as row `hover_learned`. Each flight is one run of `python -m multilift_marl.px4`; those that
+the file has are not flown again.
 """
 
 from __future__ import annotations
@@ -16,6 +16,10 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from multilift_marl.evaluation.metrics import bootstrap
 
 ROOT = Path(__file__).resolve().parent.parent
 FIRST = 2000  # seed of the first flight; tuning and training used others
@@ -32,7 +36,7 @@ ROWS: dict[str, list[str]] = {
 }
 COLUMNS = (
     "row", "seed", "success", "position_cm", "rmse_cm", "attitude_deg", "drones_cm", "estimates_cm", "separation_m",
-    "tension_task_N", "tension_N", "tilt_deg", "real_time_factor", "success_geometric_controller", "ended",
+    "tension_task_N", "tension_N", "tilt_deg", "real_time_factor", "ended",
 )  # fmt: skip
 
 
@@ -49,7 +53,6 @@ def fly(row: str, seed: int, px4: str) -> dict[str, Any]:
     metrics = {name: value["mean"] for name, value in report["policy"].items()}
     flight, phases = report["px4"], report["px4"]["phases"]
     own = next(phase for phase in phases if phase["name"] == report["config"]["task"])
-    ours = report["baselines"]["geometric controller"]["success_rate"]["mean"]
     return {
         "row": row, "seed": seed,
         "success": round(metrics["success_rate"]),
@@ -62,15 +65,43 @@ def fly(row: str, seed: int, px4: str) -> dict[str, Any]:
         "tension_task_N": round(own["tension"], 1), "tension_N": round(max(phase["tension"] for phase in phases), 1),
         "tilt_deg": round(max(phase["tilt"] for phase in phases), 1),
         "real_time_factor": round(flight["real_time_factor"], 2),
-        "success_geometric_controller": round(ours),
         "ended": flight["ended"],
     }  # fmt: skip
 
 
+def print_table(lines: list[dict[str, str]]) -> None:
+    """Print a row of the table for each row that was flown, and what the learned team gains over its baseline."""
+    flown: dict[str, dict[str, dict[str, str]]] = {}
+    for line in lines:
+        flown.setdefault(line["row"], {})[line["seed"]] = line
+    for row, flights in flown.items():
+
+        def column(name: str, flights: dict[str, dict[str, str]] = flights) -> np.ndarray:
+            return np.array([float(line[name]) for line in flights.values()])
+
+        place, angle, success = column("position_cm"), column("attitude_deg"), int(column("success").sum())
+        numbers = [
+            row, len(flights), success, f"{np.median(place):.1f} ({place.max():.1f})",
+            f"{np.median(angle):.1f} ({angle.max():.1f})", (angle <= 5.0).sum(), f"{column('separation_m').min():.2f}",
+            f"{column('tension_task_N').max():.1f}, {column('tension_N').max():.0f}",
+        ]  # fmt: skip
+        print("|" + "|".join(str(number) for number in numbers) + "|")
+    learned, base = flown.get("hover_learned", {}), flown.get("hover_conditions", {})
+    if both := sorted(learned.keys() & base.keys()):
+        for name in ("position_cm", "attitude_deg"):
+            gain = np.array([float(learned[seed][name]) - float(base[seed][name]) for seed in both])
+            low, high = bootstrap(gain)
+            print(f"hover_learned - hover_conditions, {name}: {gain.mean():.2f} ({low:.2f} to {high:.2f}), {len(both)}")
+
+
 def main(arguments: list[str]) -> int:
     """Fly what is not in the file yet."""
-    options = dict(argument.split("=", 1) for argument in arguments)
+    options = dict(argument.split("=", 1) for argument in arguments if argument != "table")
     out = Path(options.get("out", ROOT / "docs" / "data" / "px4_runs.csv"))
+    if "table" in arguments:
+        with out.open(newline="") as file:
+            print_table(list(csv.DictReader(file)))
+        return 0
     rows = options.get("rows", "hover,circle").split(",")
     if "policy" in options:
         ROWS["hover_learned"] = ["config=hover_px4", f"policy={options['policy']}"]

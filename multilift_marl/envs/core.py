@@ -313,9 +313,7 @@ class MultiliftVec:
     def use_controller(self, controller: Controller, report: Callable[[SystemState], None] | None = None) -> None:
         """Let another controller of this world fly the drones from the next reset on.
 
-        Args:
-            controller: flies them.
-            report: writes after each control tick what drones know of themselves, but with `env.sensing=ideal`.
+        `report` writes after each control tick what drones know of themselves, but with `env.sensing=ideal`.
         """
         self.controller, self.reference = controller, controller.reference
         if self._estimator is not None and report is not None:

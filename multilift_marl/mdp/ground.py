@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import cos, hypot, pi, sin, sqrt
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -16,6 +16,7 @@ from multilift_marl.mdp.rewards import Term, tolerance
 from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.resolve import MIN_SEPARATION
 from multilift_marl.rig.system import System
+from multilift_marl.schema.values import Between, Float
 from multilift_marl.sim.contact import drone_half_size
 
 FAR = 0.5  # [m] from its target, at which a payload's pose earns half
@@ -182,7 +183,11 @@ def cable_rise(e, n, state, rig):
     return state.drone_position[e, n, 2] - state.payload_position[e, 2] - turned[2]
 
 
-PACE = Field(1.0, description="[-] of the plan: with 0.5 it takes twice the time (raise env.episode_seconds, too)")
+Pace = Annotated[
+    Float,
+    Between(0.1, 1),
+    Field(description="[-] of the plan: with 0.5 it takes twice the time (raise env.episode_seconds, too)"),
+]
 """Option of tasks that begin or end on the ground."""
 
 CARRIED = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import hypot, radians
-from typing import Annotated, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,8 +15,8 @@ from multilift_marl.mdp.criteria import CONDITION, Criterion, length
 from multilift_marl.mdp.failures import LOAD_GROUND, TOUCH, Limits, ignore, payload_height
 from multilift_marl.mdp.ground import (
     CARRIED,
-    PACE,
     Ground,
+    Pace,
     cable_chord,
     make_ground,
     move_goal,
@@ -28,7 +28,7 @@ from multilift_marl.mdp.ground import (
 from multilift_marl.mdp.initial_states import set_equilibrium
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import Term, action_rate, tolerance
-from multilift_marl.schema.values import Between, Float, Section
+from multilift_marl.schema.values import Float, Section
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks.base import Kernels, Task
@@ -58,7 +58,7 @@ class LandOptions(Section):
         0.3, gt=0, description="[m] drones from payload and ground; less for a span below a falcon's"
     )
     success_seconds: Float = Field(1.0, gt=0, description="[s] at rest, slack and clear throughout the last seconds")
-    pace: Annotated[Float, Between(0.1, 2)] = PACE
+    pace: Pace = 1.0
 
 
 class LandArrays(NamedTuple):

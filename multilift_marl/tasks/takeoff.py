@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import radians
-from typing import Annotated, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,8 +15,8 @@ from multilift_marl.mdp.criteria import Criterion, rest_criteria
 from multilift_marl.mdp.failures import BELOW, CABLE, GROUND, LOAD_GROUND, ignore, payload_height
 from multilift_marl.mdp.ground import (
     CARRIED,
-    PACE,
     Ground,
+    Pace,
     cable_chord,
     cable_rise,
     make_ground,
@@ -30,7 +30,7 @@ from multilift_marl.mdp.ground import (
 )
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import RestBounds, Term, action_rate, is_at_rest
-from multilift_marl.schema.values import Between, Float, Section
+from multilift_marl.schema.values import Float, Section
 from multilift_marl.tasks.base import Kernels, Task
 
 RISE = (0.1, 1.6)  # begin and length of each phase [s], as of the next ones: drones rise,
@@ -58,7 +58,7 @@ class TakeoffOptions(Section):
     success_angle: Float = Field(5.0, gt=0, description="[deg] ... and within this of its attitude ...")
     success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds")
     success_tension: Float = Field(2.0, gt=1, description="[-] largest tension at any time, over the resting tension")
-    pace: Annotated[Float, Between(0.1, 2)] = PACE
+    pace: Pace = 1.0
 
 
 class TakeoffArrays(NamedTuple):

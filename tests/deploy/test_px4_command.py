@@ -48,6 +48,8 @@ DT = 0.004
         (["px4=/nowhere", "config=land"], "set task_options.pace=0.5 and env.episode_seconds=24"),
         (["px4=/nowhere", "config=land", "task_options.pace=0.5"], "px4=/nowhere holds no PX4"),
         (["px4=/nowhere", "position_errors=-1"], "position_errors"),
+        (["px4=/nowhere", "position_errors=11"], "position_errors"),
+        (["px4=/nowhere", "position_errors=10"], "px4=/nowhere holds no PX4"),
         (["px4=/nowhere", "instance=12"], "instance"),
         (["px4=/nowhere", "policy=formations"], "unknown policy 'formations'"),
         (["px4=/nowhere", "policy=none"], "set live=true"),
@@ -149,13 +151,6 @@ def test_a_flight_that_does_not_start_leaves_no_empty_folder(tmp_path, monkeypat
     assert command.main([*arguments, "out=flight"]) == 2
     assert "no simulator" in capsys.readouterr().err
     assert not (tmp_path / "flight").exists()
-
-
-def test_what_stands_for_an_autopilots_delay_and_integral_is_not_added_to_its_own():
-    trained = ml.load_config("hover_px4")
-    flown = check_config(trained)
-    assert trained.randomization.action_delay == (1, 3) and flown.randomization.action_delay == (0, 0)
-    assert trained.control.disturbance == "integral" and flown.control.disturbance == "none"
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,15 @@ def test_on_the_way_to_a_task_no_drone_comes_near_another(task, seed, drones):
     np.testing.assert_allclose(way.world.state.payload_position[0], end.pose[:3], atol=0.05)
 
 
+def test_what_stands_for_an_autopilots_delay_and_integral_is_not_added_to_its_own():
+    flight = Flight(ml.load_config("hover_px4"), record(report=lambda state: None), 2000)
+    for config in (flight.vec.config, flight._part("track", 1.0, {})):
+        assert config.randomization.action_delay == (0, 0) and config.control.disturbance == "none"
+        assert config.env.sensing == "rtk"
+    ours = flight.config  # flown by our controller, from the same state
+    assert ours.randomization.action_delay == (1, 3) and ours.control.disturbance == "integral"
+
+
 class Rehearsal(Flight):
     """A flight without autopilots: parts follow each other, and one of them may fail."""
 

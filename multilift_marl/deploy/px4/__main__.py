@@ -64,7 +64,7 @@ class Options(CommandOptions):
     parameters: dict[Annotated[str, Field(pattern="^[A-Z][A-Z0-9_]{1,15}$")], Float] = Field(
         {}, description="of PX4, in place of ours: parameters={MPC_XY_P: 1.2}"
     )
-    position_errors: Annotated[Float, Between(0, 100, "-")] = Field(
+    position_errors: Annotated[Float, Between(0, 10, "-")] = Field(
         1.0, description="of the satellite positioning of all drones, in multiples of an RTK receiver's"
     )
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the task, see docs/ros.md")

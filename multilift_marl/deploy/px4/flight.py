@@ -34,6 +34,7 @@ _TURNING = 0.5  # [rad/s] of drones about themselves there, on average
 _NEAR = 0.01  # [m], [rad] within which there is no way to go
 _TAKEOFF, _LANDING = 10.0, 12.0  # [s]
 LANDING_PACE = 0.5  # at most, of task `land`: at 1 drones are 8 cm late, and payloads have hit the ground
+_BY_AUTOPILOTS = {"randomization.action_delay": 0, "control.disturbance": "none"}  # they are late, and reject forces
 _OWN = ("task", "task_options", "reward")  # what take-off and landing have of their own
 Maker = Callable[[MultiliftVec], Policy]
 Say = Callable[[str], None]
@@ -117,7 +118,8 @@ class Flight:
         self, config: Config, team: AutopilotTeam, seed: int, say: Say = print, watch: OnStep = lambda vec: None
     ):
         self.config, self.team, self.seed, self._say, self._watch = check_config(config), team, seed, say, watch
-        self._task = self._make(config)
+        self._flown = build_config(self.config.model_dump(), _BY_AUTOPILOTS)
+        self._task = self._make(self._flown)
         self._task.reset(seed=seed)
         self._landing = self._make(self._part("land", _LANDING, {"pad_xy": 0.0, "pad_yaw": 0.0}))
         self._landing.reset(seed=seed)
@@ -205,7 +207,7 @@ class Flight:
 
     def _part(self, task: str, seconds: float, options: dict[str, Any]) -> Config:
         """Return the configuration of another task by the same rig."""
-        values = {key: value for key, value in self.config.model_dump().items() if key not in _OWN}
+        values = {key: value for key, value in self._flown.model_dump().items() if key not in _OWN}
         overrides = {f"task_options.{key}": value for key, value in options.items()}
         overrides |= {"task": task, "env.episode_seconds": seconds, "control.action": "reference"}
         return build_config(values, overrides)
@@ -368,6 +370,4 @@ def check_config(config: Config) -> Config:
         )
     if config.cable.model != "massless":
         raise ConfigError("flights by PX4 go on from state to state, which chains cannot; set cable.model=massless")
-    # Autopilots are late and reject disturbances by themselves.
-    own = {"env.num_envs": 1, "env.num_threads": 1, "randomization.action_delay": 0, "control.disturbance": "none"}
-    return build_config(config.model_dump(), own)
+    return build_config(config.model_dump(), {"env.num_envs": 1, "env.num_threads": 1})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -236,8 +237,7 @@ class AutopilotTeam:
         for i, each in enumerate(self.offboard):
             if not np.isfinite(np.concatenate([each.origin, each.position, each.velocity])).all():
                 continue
-            # Over the metres of a flight, its local frame and the world differ by a shift alone.
-            shift = project_local(self.settings.site.to_geodetic(np.zeros(3)), each.origin)
+            shift = _world_origin(self.settings.site, *each.origin.tolist())
             velocity = swap_enu_ned(each.velocity)
             age = 1e-6 * (self._time_us - each.time_us)
             state.drone_position[0, i] = swap_enu_ned(each.position - shift) + age * velocity
@@ -267,6 +267,12 @@ class AutopilotTeam:
         self.close()
 
 
+@lru_cache(maxsize=64)
+def _world_origin(site: Site, *origin: float) -> np.ndarray:
+    """Return where the world begins in a PX4's local frame: over the metres of a flight they differ by that alone."""
+    return project_local(site.to_geodetic(np.zeros(3)), np.array(origin))
+
+
 ACTIONS = ("reference", "acceleration", "ctbr")
 """Action interfaces that PX4 has set-points for."""
 
@@ -289,7 +295,6 @@ class AutopilotController(Controller):
     ) -> tuple[Call, tuple[Call, ...]]:
         """See `Controller.bind`; the autopilots fly in place of the last call."""
         set_action, steps = super().bind(lo, hi, action, goal, plan)
-        cable_force = goal.cable_force if self.disturbance is None else self.disturbance.cable_force
 
         def send(i: int) -> None:
             own = self.reference
@@ -297,7 +302,7 @@ class AutopilotController(Controller):
                 self._team.send_rates(i, self._setpoint.rates[0, i], self._setpoint.thrust[0, i])
             else:
                 motion = np.stack([own.position[0, i], own.velocity[0, i], own.acceleration[0, i]])
-                self._team.send(i, motion, cable_force[0, i], own.yaw[0, i], self._action == "reference")
+                self._team.send(i, motion, goal.cable_force[0, i], own.yaw[0, i], self._action == "reference")
 
         def autopilots() -> None:
             self._team.tick(self.world, send)
