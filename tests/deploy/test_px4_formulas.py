@@ -144,7 +144,7 @@ def test_on_the_way_to_a_task_no_drone_comes_near_another(task, seed, drones):
     begin = end._replace(pose=(0.0, 0.0, end.pose[2], 0.0))
     seconds, options = plan_way(config, begin, end)
     flight = Flight.__new__(Flight)
-    flight.config = config
+    flight._flown = config
     way = ml.make_vec(flight._part("track", seconds, options), **{"env.episode_seconds": seconds})
     observation, _ = way.reset(seed=seed)
     policy, least = make_scripted("formation_integral", way), np.inf
