@@ -88,6 +88,11 @@ class Controller:
         estimate = bind(REJECTIONS[self._kind], lo, hi, *known, rejection, self._rejection)
         return set_action, (*control_step[:-1], estimate, control_step[-1])
 
+    @property
+    def commanded_force(self) -> np.ndarray:
+        """(E, N, 3) force on each cable, where the interface commands it, world frame [N]."""
+        return self._setpoint.cable_force
+
     def start(self, e: int) -> None:
         """Let references and estimates of environment e start from the state of its drones."""
         start_reference(e, self.state, self.reference)

@@ -139,6 +139,52 @@ def desired_force(feedback, acceleration, velocity, cable_force, attitude, g):
 
 
 @kernel
+def following_force(e, n, state, reference, cable, g):
+    """Return the force [N] with which drone n of environment e follows its reference, world frame.
+
+    Args:
+        e, n: environment and drone.
+        state, reference: SystemState, Reference.
+        cable: force that the drone is to exert on its cable [N].
+        g: DroneGains.
+    """
+    velocity = vec(reference.velocity, e, n)
+    position_error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
+    velocity_error = sub(vec(state.drone_velocity, e, n), velocity)
+    feedback = add(scale(g.k_p, position_error), scale(g.k_v, velocity_error))
+    attitude = mat(state.drone_rotation, e, n)
+    return desired_force(feedback, vec(reference.acceleration, e, n), velocity, cable, attitude, g)
+
+
+@kernel
+def thrust_along(force, attitude):
+    """Return the total thrust [N] of a desired force along the actual body z axis, F · R e3 (Lee 2010), not negative.
+
+    In place of eq 27's |a_d|.
+    """
+    return max(dot(force, unit(column(attitude, 2))), 0.0)
+
+
+@kernel
+def command_attitude(lo, hi, state, reference, cable_force, desired, total, g):
+    """Compute attitudes and total thrusts with which drones follow their references, for autopilots that take these.
+
+    Args:
+        lo, hi: the environments.
+        state, reference, cable_force, g: see `fly`.
+        desired: written, (E, N, 3, 3).
+        total: written, (E, N) [N].
+    """
+    for e in range(lo, hi):
+        for n in range(total.shape[1]):
+            force = following_force(e, n, state, reference, vec(cable_force, e, n), drone_gains(g, n))
+            frame = thrust_frame(force, reference.yaw[e, n])
+            for k in range(9):
+                desired[e, n, k // 3, k % 3] = frame[k]
+            total[e, n] = thrust_along(force, mat(state.drone_rotation, e, n))
+
+
+@kernel
 def fly(lo, hi, state, reference, cable_force, thrust, g, tilt_rates=None):
     """Compute the rotor thrusts with which the drones of environments lo to hi follow their references.
 
@@ -160,15 +206,10 @@ def fly(lo, hi, state, reference, cable_force, thrust, g, tilt_rates=None):
             d = drone_gains(g, n)
             attitude = mat(state.drone_rotation, e, n)
             cable = vec(cable_force, e, n)
-            velocity = vec(reference.velocity, e, n)
-            acceleration = vec(reference.acceleration, e, n)
             yaw = reference.yaw[e, n]
 
             # Position and velocity errors to the desired force.
-            position_error = sub(vec(state.drone_position, e, n), vec(reference.position, e, n))
-            velocity_error = sub(vec(state.drone_velocity, e, n), velocity)
-            feedback = add(scale(d.k_p, position_error), scale(d.k_v, velocity_error))
-            force = desired_force(feedback, acceleration, velocity, cable, attitude, d)
+            force = following_force(e, n, state, reference, cable, d)
 
             # Force and its rate to the desired attitude and its body rates.
             desired = thrust_frame(force, yaw)
@@ -177,10 +218,9 @@ def fly(lo, hi, state, reference, cable_force, thrust, g, tilt_rates=None):
             if tilt_rates is not None:
                 desired_rate = (tilt_rates[e, n, 0], tilt_rates[e, n, 1], desired_rate[2])
 
-            # Thrust is the desired force along the actual body z axis, F · R e3 (Lee 2010), in place of eq 27's |a_d|.
-            total = max(dot(force, unit(column(attitude, 2))), 0.0)
+            total = thrust_along(force, attitude)
             torque = attitude_torque(attitude, vec(state.drone_body_rates, e, n), desired, desired_rate, d)
-            torque = add(torque, hook_moment(n, attitude, cable, acceleration, g))
+            torque = add(torque, hook_moment(n, attitude, cable, vec(reference.acceleration, e, n), g))
             rotors = allocate(total, torque, d.allocation, d.thrust_min, d.thrust_max)
             for k in range(4):
                 thrust[e, n, k] = rotors[k]

@@ -31,7 +31,7 @@ class MeasuredTeam(MultiliftVec):
     """One environment whose state is measured; `command`, `advance` and `observe` in turn are a policy step.
 
     Observations, references and targets are those of the task in the simulation; noise and delays that it may simulate
-    are left to what is measured.
+    are left to what is measured. Rotor speeds follow from the thrusts that the geometric controller would command.
 
     Args:
         config: the task and its rig.
@@ -47,6 +47,10 @@ class MeasuredTeam(MultiliftVec):
             build_config(config.model_dump(), _PERFECT | {"env.num_envs": 1, "env.num_threads": 1}), EVALUATION
         )
         self._ticks_left = 0
+        vehicles, dt = self.world.system.vehicles, self.task.control_dt
+        self._lift = np.array([vehicle.thrust_coefficient for vehicle in vehicles])[:, None]
+        times = ([v.rotor_time_constant_up for v in vehicles], [v.rotor_time_constant_down for v in vehicles])
+        self._closing = 1.0 - np.exp(-dt / np.array(times))[..., None]  # of the gap in a tick, (2, N, 1)
 
     def begin(
         self, measured: Measured, seed: int | None = None, target: tuple[np.ndarray, np.ndarray] | None = None
@@ -87,7 +91,15 @@ class MeasuredTeam(MultiliftVec):
             self._ticks_left -= 1
             for call in self._pipelines[0].tick:
                 call()
+            self._turn_rotors()
         return self.reference
+
+    def _turn_rotors(self) -> None:
+        """Let rotor speeds, which nobody measures, follow the controller's thrusts as those of the motors would."""
+        speed, limits = self.world.state.rotor_speed[0], self.controller.gains
+        within = np.clip(self.world.thrust[0], limits.thrust_min[:, None], limits.thrust_max[:, None])
+        gap = np.sqrt(within / self._lift) - speed
+        speed += np.where(gap > 0.0, *self._closing) * gap
 
     def observe(self, measured: Measured) -> np.ndarray:
         """Take what has been measured a policy step after the last command; return the observation (1, N, D)."""

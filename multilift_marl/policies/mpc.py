@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.approach import Approach, begin_approaches, write_approaches
@@ -53,7 +52,7 @@ class TeamMpc:
         planner: TeamPlanner.
 
     Raises:
-        ConfigError: a task that it cannot fly, see `Task.CAN_PLAN`; a team that flies elsewhere; a payload on one point
+        ConfigError: a task that it cannot fly, see `Task.CAN_PLAN`; a payload on one point
             or one cable, which has no attitude to plan; drones that reject the forces that it estimates.
     """
 
@@ -67,8 +66,6 @@ class TeamMpc:
                 f"policy=mpc cannot fly task {config.task}: it plans for taut cables, all drones and free air; take "
                 "another policy"
             )
-        if isinstance(vec, MeasuredTeam):
-            raise ConfigError("policy=mpc reads rotor speeds, which are not measured of this team; take another policy")
         if vec.task.rig.is_point or n < 2:
             raise ConfigError("policy=mpc plans for payloads on two cables or more; take another policy for this rig")
         rejection = config.control.disturbance

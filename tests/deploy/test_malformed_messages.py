@@ -253,5 +253,5 @@ def fuzz_simulation(names: str, make: dict) -> None:
             if "attitude" not in name:
                 wire.queues[name].append(message(vec.task.goal.slots[0, n]))
         live.step()
-    assert (live.setpoints.age < HOLD_AFTER).all()
+    assert (live.answers.age < HOLD_AFTER).all()
     np.testing.assert_allclose(vec.world.state.drone_position[0], vec.task.goal.slots[0], atol=0.3)

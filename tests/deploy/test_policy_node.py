@@ -115,7 +115,7 @@ def test_a_flight_by_the_node_is_the_flight_by_the_policy(task):
     fly_together(live, node, 200)
     for _ in range(201):
         observation, *_ = plain.step(policy.act(observation))
-    assert node.mode == FLYING and (live.setpoints.late == 0).all()
+    assert node.mode == FLYING and (live.answers.late == 0).all()
     np.testing.assert_allclose(vec.world.state.payload_position, plain.world.state.payload_position, atol=1e-12)
     np.testing.assert_allclose(vec.world.state.drone_position, plain.world.state.drone_position, atol=1e-12)
 
@@ -155,7 +155,7 @@ def test_the_node_flies_drones_that_hear_what_px4_hears(task):
     live.step()
     fly_together(live, node, 500)
     error = np.linalg.norm(vec.world.state.payload_position[0] - vec.task.goal.position[0])
-    assert error < (0.02 if task == "hover" else 0.05) and (live.setpoints.late == 0).all()
+    assert error < (0.02 if task == "hover" else 0.05) and (live.answers.late == 0).all()
 
 
 @pytest.mark.parametrize(

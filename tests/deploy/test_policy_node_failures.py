@@ -316,7 +316,7 @@ def test_a_policy_that_fails_ends_in_landing(monkeypatch):
 
 
 def test_it_begins_and_ends_when_it_is_told(monkeypatch):
-    bench = Bench(monkeypatch, at_once=False)
+    bench = Bench(monkeypatch, start="topic")
     for _ in range(50):
         bench.pass_by()
     assert bench.node.mode == READY and bench.node.steps == 0

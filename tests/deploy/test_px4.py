@@ -34,9 +34,9 @@ from multilift_marl.deploy.px4 import __main__ as command
 from multilift_marl.deploy.px4.flight import Flight, check_config
 from multilift_marl.deploy.px4.launch import rig_parameters
 from multilift_marl.deploy.px4.link import PORT
+from multilift_marl.deploy.px4.live import LiveTeam
 from multilift_marl.deploy.px4.team import AutopilotController, AutopilotTeam, Settings
 from multilift_marl.deploy.ros.dds import Node
-from multilift_marl.deploy.ros.live import LivePublisher
 from multilift_marl.deploy.ros.messages import NAMES, ODOMETRY, Topic, pose_stamped, setpoint_topics
 from multilift_marl.deploy.ros.types import read_pose
 from multilift_marl.sensing.sensors import Sensor, SensorSuite
@@ -175,9 +175,7 @@ def test_others_fly_autopilots_by_topics_that_they_hear_live():
     config = config_of("hover", **nothing_hidden, **{"env.episode_seconds": 3.0})
     here, there, over = Node(domain=DOMAIN), Node(domain=DOMAIN), threading.Event()
     drones = range(2)
-    stamps, slots, points = [], [], []
-    publisher = LivePublisher(here, "multilift")
-    publisher.subscribe(2)
+    stamps, slots = [], []
 
     def steer() -> None:
         takes = [there.subscription(Topic(f"/drone_{n}/odom", ODOMETRY)) for n in drones]
@@ -194,21 +192,21 @@ def test_others_fly_autopilots_by_topics_that_they_hear_live():
 
     def bind(vec):
         slots.append(vec.task.goal.slots[0] + [0.2, 0.0, 0.1])
-        points.append(publisher.set_points(vec, 1.0, 30.0))
-        return points[0]
+        return live.bind_others(vec)
 
     thread = threading.Thread(target=steer)
     thread.start()
     try:
         with Airfield(config.system) as field:
-            flight = Flight(config, field.team, 1000, lambda text: None, partial(command._send, publisher, field.team))
+            live = LiveTeam(config, here, "multilift", field.team, others=True, waiting=(1.0, 30.0))
+            flight = Flight(config, field.team, 1000, lambda text: None, live.publish, live)
             result = flight.fly(bind)
             lasted = field.team.time
     finally:
         over.set()
         thread.join()
     assert result.ended == "" and [phase.name for phase in result.phases][2] == "hover"
-    assert points[0].late.sum() == 0
+    assert live.answers.late.sum() == 0
     # where it was told to fly to, beside its own target
     off = result.trace.payload_position[-25:] - result.trace.target_position[-25:]
     np.testing.assert_allclose(off.mean(axis=0), [0.2, 0.0, 0.1], atol=0.05)

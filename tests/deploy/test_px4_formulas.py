@@ -15,18 +15,12 @@ if sys.platform == "win32":
 
 import multilift_marl as ml
 from multilift_marl.deploy.px4 import __main__ as command
-from multilift_marl.deploy.px4.flight import (
-    Flight,
-    FlightResult,
-    Goal,
-    Phase,
-    _goal,
-    check_config,
-    find_failure,
-    plan_way,
-)
+from multilift_marl.deploy.px4.flight import Flight, FlightResult, check_config
 from multilift_marl.deploy.px4.launch import rig_parameters
+from multilift_marl.deploy.px4.phases import Phase, find_failure
 from multilift_marl.deploy.px4.team import AutopilotTeam
+from multilift_marl.deploy.px4.ways import Goal, plan_way, read_goal
+from multilift_marl.deploy.ros.stages import Orders, Stage
 from multilift_marl.errors import FlightError
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.sim.earth import Site, project_local
@@ -55,7 +49,8 @@ def rest_at(end: Goal, begin: Goal) -> tuple[np.ndarray, ...]:
     flight = Flight.__new__(Flight)
     flight.config, flight.team, flight.phases = record(sim=record(control_hz=HZ)), Recorder(), []
     watched: list = []
-    flight._watch = watched.append
+    flight.stage = Stage.GO_TO
+    flight._watch = lambda vec, stage: watched.append(vec)
     rotation = np.tile(np.eye(3), (1, 2, 1, 1))
     places, whole = np.eye(3)[None, :2], np.zeros((1, 2), bool)
     state = record(drone_position=places, drone_rotation=rotation, cable_tension=np.ones((1, 2)), cable_broken=whole)
@@ -140,7 +135,7 @@ def test_on_the_way_to_a_task_no_drone_comes_near_another(task, seed, drones):
     config = check_config(ml.load_config(task, {"env.num_drones": drones}))
     vec = ml.make_vec(config)
     vec.reset(seed=seed)
-    end = _goal(vec)
+    end = read_goal(vec)
     begin = end._replace(pose=(0.0, 0.0, end.pose[2], 0.0))
     seconds, options = plan_way(config, begin, end)
     flight = Flight.__new__(Flight)
@@ -158,7 +153,7 @@ def test_on_the_way_to_a_task_no_drone_comes_near_another(task, seed, drones):
     assert least > 1.0
     rest = np.linalg.norm(end.slots[:, None] - end.slots, axis=-1) + 9 * np.eye(drones)
     assert least > 0.8 * (rest / np.where(np.eye(drones), 1.0, config.system.min_separation)).min()
-    np.testing.assert_allclose(_goal(way).slots, end.slots, atol=2e-3)
+    np.testing.assert_allclose(read_goal(way).slots, end.slots, atol=2e-3)
     np.testing.assert_allclose(way.world.state.payload_position[0], end.pose[:3], atol=0.05)
 
 
@@ -179,6 +174,7 @@ class Rehearsal(Flight):
         self._task = self._landing = record(world=record(), failure_causes=("none", "ground"))
         self.team = record(offboard=[], settle=lambda world: self.did.append("disarmed"))
         self.cause, self._say, self._begun = cause, lambda text: None, {}
+        self._orders, self._watch = Orders(), lambda vec, stage: None
 
     def part(self, name):
         self.did.append(name)
@@ -188,7 +184,7 @@ class Rehearsal(Flight):
 
     _make = _arm = _take_over = _part = lambda self, *_: record(world=None)
 
-    def _run(self, vec, observation, what):
+    def _run(self, vec, observation, what, stage):
         self.part(what)
 
     def _go(self, vec, begin, end, what):
@@ -213,7 +209,7 @@ WHOLE = ["take-off", "the way to the task", "hover", "the way back", "landing"]
     ],
 )
 def test_a_flight_that_fails_after_its_task_keeps_what_was_measured(monkeypatch, cause, failing, did, ended):
-    monkeypatch.setattr("multilift_marl.deploy.px4.flight._goal", lambda vec: record(pose=(0.0, 0.0, 1.0, 0.0)))
+    monkeypatch.setattr("multilift_marl.deploy.px4.flight.read_goal", lambda vec: record(pose=(0.0, 0.0, 1.0, 0.0)))
     flight = Rehearsal(cause, failing)
     result = flight.fly(lambda vec: None)
     assert flight.did == did and result.ended == ended

@@ -18,10 +18,11 @@ pytest.importorskip("rosbags")  # of the ros extra
 pytest.importorskip("cyclonedds")
 
 from multilift_marl.deploy.ros import __main__ as command
+from multilift_marl.deploy.ros.answers import Waiting
 from multilift_marl.deploy.ros.bag import DISTRIBUTIONS
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER
-from multilift_marl.deploy.ros.live import LiveFlight, SetPoints, Waiting, read_stamped
+from multilift_marl.deploy.ros.live import LiveFlight, SetPoints, read_stamped
 from multilift_marl.deploy.ros.messages import FlightMessages, Topic
 from multilift_marl.deploy.ros.types import read_place, typestore
 
@@ -141,7 +142,7 @@ def test_others_fly_the_team_by_set_points():
     assert until(fly)
     np.testing.assert_allclose(vec.world.state.drone_position[0], places, atol=0.15)
     assert np.linalg.norm(vec.world.state.drone_position[0] - vec.task.goal.slots[0], axis=1).min() > 0.15
-    assert flight.setpoints.age.max() < HOLD_AFTER
+    assert flight.answers.age.max() < HOLD_AFTER
 
 
 def test_lost_set_points_are_held_and_then_the_team_sinks():
@@ -170,7 +171,7 @@ def test_lost_set_points_are_held_and_then_the_team_sinks():
     for _ in range(51):
         points.act(None)
     np.testing.assert_allclose(points._place[:, 2], wanted[:, 2] - 0.4, atol=0.01)  # one second at 0.4 m/s
-    assert points.late.min() >= steps - round(HOLD_AFTER / vec.task.dt)
+    assert points.answers.late.min() >= steps - round(HOLD_AFTER / vec.task.dt)
     with pytest.raises(ValueError, match="a number is nan"):  # rubbish is no set-point
         read_place(setpoint(store, [np.nan, 0, 0]))
 
@@ -193,7 +194,7 @@ class Others:
         if not self.arriving:
             return False
         for n, stamp, x in self.arriving.pop(0):
-            self.queue[n].append((stamp, np.array([x, 0.0, 1.0]), np.eye(3)))
+            self.queue[n].append((stamp, (np.array([x, 0.0, 1.0]), np.eye(3))))
         return True
 
 
@@ -206,17 +207,20 @@ def test_a_step_waits_for_the_answers_to_its_state():
     asked = [10]
     points = SetPoints(vec, [others.take(n) for n in range(2)], Waiting(others.wait, lambda: asked[0], 5.0, 60.0))
     here = np.array([1.0, 0.0, 1.0])
-    others.queue[0] += [(5, np.zeros(3), np.eye(3)), (10, here, np.eye(3))]  # of an earlier phase, and one that answers
-    others.queue[1] += [(5, np.zeros(3), np.eye(3))]
+    others.queue[0] += [
+        (5, (np.zeros(3), np.eye(3))),
+        (10, (here, np.eye(3))),
+    ]  # of an earlier phase; an answer
+    others.queue[1] += [(5, (np.zeros(3), np.eye(3)))]
     points.reset()
     for stamp, x, left in ((10, 1.0, 3), (20, 3.0, 1), (30, 4.0, 0)):
         asked[0] = stamp
         points.act(None)
         assert points._place[:, 0].tolist() == [x, x] and len(others.arriving) == left
-        assert (points.age == 0).all() and not points.late.any()
+        assert (points.answers.age == 0).all() and not points.answers.late.any()
     assert others.waited[0] > 50 and max(others.waited[1:]) <= 5.0
     points.act(None)  # nobody answers: it goes on when the time is over
-    assert len(others.waited) == 5 and (points.age > 0).all()
+    assert len(others.waited) == 5 and (points.answers.age > 0).all()
 
 
 def test_nobody_is_waited_for_who_has_been_silent():
@@ -229,7 +233,7 @@ def test_nobody_is_waited_for_who_has_been_silent():
         points.act(None)
     assert len(others.waited) == 1  # for the first ones, once
     for n in range(2):
-        others.queue[n].append((0, np.zeros(3), np.eye(3)))
+        others.queue[n].append((0, (np.zeros(3), np.eye(3))))
     steps = round(HOLD_AFTER / vec.task.dt)
     for _ in range(steps + 10):
         points.act(None)

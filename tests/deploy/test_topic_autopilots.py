@@ -13,9 +13,10 @@ pytest.importorskip("rosbags")  # of the ros extra
 pytest.importorskip("cyclonedds")
 from ros_wire import Wire
 
-from multilift_marl.deploy.ros.autopilots import TopicAutopilots
+from multilift_marl.deploy.ros.autopilots import TopicAutopilots, subscribe_px4
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER, SINK
-from multilift_marl.deploy.ros.messages import FLYING, LANDING, FlightMessages
+from multilift_marl.deploy.ros.messages import FlightMessages
+from multilift_marl.deploy.ros.stages import Stage
 from multilift_marl.deploy.ros.types import (
     ATTITUDE,
     TRAJECTORY,
@@ -41,7 +42,9 @@ class Team:
             "hover", num_envs=1, num_threads=1, num_drones=2, **{"payload.mass": 0.7, "env.episode_seconds": 60}
         )
         self.wire = Wire()
-        self.autopilots = TopicAutopilots(self.vec.config, self.vec.world, self.wire)
+        self.autopilots = TopicAutopilots(
+            self.vec.config, self.vec.world, subscribe_px4(self.wire, self.vec.world.system)
+        )
         self.vec.use_controller(self.autopilots)
         nominal = {"payload_mass": 0.7, "payload_force": np.zeros(3)}
         self.vec.reset(seed=2, options={"randomization": nominal})
@@ -71,7 +74,7 @@ def test_places_are_flown_to_and_held():
     np.testing.assert_allclose(team.state.drone_position[0], places, atol=0.05)  # the payload swings below
     yaw = np.arctan2(team.state.drone_rotation[0, :, 1, 0], team.state.drone_rotation[0, :, 0, 0])
     np.testing.assert_allclose(yaw, 0.4, atol=0.05)
-    assert (team.autopilots.late == 0).all()
+    assert (team.autopilots.answers.late == 0).all()
 
 
 def test_a_place_alone_is_held_with_the_force_on_the_cable():
@@ -129,7 +132,7 @@ def test_attitudes_and_thrusts_fly_the_team_as_the_reports_own_nodes_do():
             )  # fmt: skip
         team.step()
     np.testing.assert_allclose(team.state.drone_position[0], team.slots, atol=0.03)
-    assert (team.autopilots.late == 0).all()
+    assert (team.autopilots.answers.late == 0).all()
 
 
 def test_lost_set_points_are_held_then_landed():
@@ -144,7 +147,7 @@ def test_lost_set_points_are_held_then_landed():
     assert (held[:, 2] - team.slots[:, 2]).max() < 0.2 * (HOLD_AFTER + 0.02) + 0.05
     team.step(50)
     np.testing.assert_allclose(team.vec.reference.position[0, :, 2], held[:, 2] - SINK, atol=0.02)
-    assert (team.autopilots.late > 0).all()
+    assert (team.autopilots.answers.late > 0).all()
 
 
 def test_empty_set_points_do_not_count():
@@ -153,7 +156,7 @@ def test_empty_set_points_do_not_count():
         for n in range(2):
             team.say(n)
         team.step()
-    assert np.isinf(team.autopilots.age).all() and (team.autopilots.late == 20).all()
+    assert np.isinf(team.autopilots.answers.age).all() and (team.autopilots.answers.late == 20).all()
 
 
 def test_odometry_and_attitudes_keep_their_meaning_through_px4s_frames():
@@ -232,8 +235,8 @@ def test_bytes_are_those_of_px4s_messages():
 def test_the_report_hears_of_its_state_machine():
     team = Team()
     messages = FlightMessages(team.vec, team.wire.store, "report")
-    messages.landing = np.array([False, True])
+    messages.stages = np.array([Stage.TRAJECTORY, Stage.LAND])
     heard = dict(messages.messages(0))
-    assert heard["/state/state_drone_0"].data == FLYING and heard["/state/state_drone_1"].data == LANDING
+    assert heard["/state/state_drone_0"].data == Stage.TRAJECTORY and heard["/state/state_drone_1"].data == Stage.LAND
     assert {topic.name for topic in messages.topics()} == set(heard) | {"/drone_1/action", "/drone_2/action"}
     assert "/fmu/out/vehicle_odometry" in heard and "/px4_1/fmu/out/vehicle_local_position" in heard

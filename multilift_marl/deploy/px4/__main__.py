@@ -21,14 +21,15 @@ from multilift_marl.command import CommandOptions, limit_torch_threads, make_fol
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.errors import ConfigError, warn_once
+from multilift_marl.errors import ConfigError, FlightError, warn_once
 from multilift_marl.evaluation.metrics import format_table, make_report, write_report
 from multilift_marl.schema.values import Between, Float, Int
 
 if TYPE_CHECKING:
-    from multilift_marl.deploy.px4.flight import Flight, FlightResult, Maker, Phase
+    from multilift_marl.deploy.px4.flight import Flight, FlightResult, Maker
+    from multilift_marl.deploy.px4.live import LiveTeam
+    from multilift_marl.deploy.px4.phases import Phase
     from multilift_marl.deploy.px4.team import AutopilotTeam
-    from multilift_marl.deploy.ros.live import LivePublisher, SetPoints
 
 _USAGE = """Fly one episode of a task by PX4 autopilots, in lockstep with the simulation: from slack cables on the
 ground to the task, back, and down again; then the same task by the controller of this package.
@@ -36,8 +37,8 @@ ground to the task, back, and down again; then the same task by the controller o
   python -m multilift_marl.px4 config=hover policy=formation_integral px4=~/PX4-Autopilot [key=value ...]
 
 With live=true the flight is on ROS 2 topics, see docs/ros.md; with policy=none others fly the task, by
-/drone_<i>/setpoint. Everything stays on this machine (127.0.0.1) unless allow_network=true. Any configuration key
-changes the environment: env.num_drones=6."""
+/drone_<i>/setpoint, or with names=report by set-points of PX4. Everything stays on this machine (127.0.0.1) unless
+allow_network=true. Any configuration key changes the environment: env.num_drones=6."""
 OURS = "geometric controller"
 SLOW_LOOP = 2.5  # [rad/s] of position, up to which a policy may know what drones under PX4 are like
 
@@ -71,6 +72,10 @@ class Options(CommandOptions):
     live: bool = Field(False, description="whether the whole flight is published on ROS 2 topics, by DDS")
     ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of bag and peers")
     names: Literal["multilift", "report"] = Field("multilift", description="of the topics: ours or the report's")
+    start: Literal["at_once", "topic"] = Field(
+        "at_once", description="topic: take-off waits for 2, the task for 5 on all /state/command_drone_<i>"
+    )
+    sync: bool = Field(True, description="with names=report, whether /sync_time is published; role=clock does, too")
     domain: Annotated[Int, Between(0, 232)] = Field(0, description="ROS_DOMAIN_ID of the peers")
     allow_network: bool = Field(False, description="whether other machines may hear and fly it, by multicast")
     patience: Annotated[Float, Between(0, 10, "s")] = Field(
@@ -91,8 +96,10 @@ def _fly(values: dict[str, Any]) -> int:
 
     options, overrides = split_options(Options, values)
     policy = None if options.policy == "none" else find_policy(options.policy, others=["none"])
-    if policy is None and not (options.live and options.names == "multilift"):
-        raise ConfigError("with policy=none others fly the team, by topics of names=multilift; set live=true")
+    if policy is None and not options.live:
+        raise ConfigError("with policy=none others fly the team, by topics; set live=true")
+    if options.start == "topic" and not options.live:
+        raise ConfigError("with start=topic the flight waits for orders by topics; set live=true")
     config = check_config(_find_config(options, None if policy is None else policy.config, overrides))
     if policy is not None:
         policy.check(config, "policy")
@@ -139,14 +146,6 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
     from multilift_marl.sensing.sensors import SensorSuite
 
-    live = _open_live(config, options) if options.live else None
-    setpoints: list[SetPoints] = []
-
-    def bind_others(vec: MultiliftVec) -> SetPoints:
-        assert live is not None
-        setpoints.append(live.set_points(vec, options.patience, options.timeout))
-        return setpoints[0]
-
     suite = SensorSuite()
     suite = replace(suite, position=suite.position.scaled(options.position_errors))
     begin = time.perf_counter()
@@ -156,9 +155,14 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     )  # fmt: skip
     with interrupted_by_signals(), AutopilotTeam(config.system, 1 / config.sim.control_hz, settings) as team:
         say = partial(print, flush=True)
-        flight = Flight(config, team, options.seed, say, _ignore if live is None else partial(_send, live, team))
+        live = _open_live(config, options, team) if options.live else None
+        watched = () if live is None else (live.publish, live)
+        flight = Flight(config, team, options.seed, say, *watched)
         try:
-            result = _record(flight, bind or bind_others, options)
+            result = _record(flight, bind or _others(live), options)
+        except FlightError:
+            print(describe_phases(flight.phases))
+            raise
         finally:
             if options.log:
                 _keep_logs(team.autopilots.folder if team.autopilots else None, out)
@@ -166,24 +170,19 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     ours = None if bind is None else flight.fly_ours(bind)
     report = make_report(config, options.seed, result.metrics, {} if ours is None else {OURS: ours.metrics})
     report["px4"] = {
-        "drone_error_m": result.drone_error, "estimate_error_m": result.estimate_error,
+        "drone_error_m": None if bind is None else result.drone_error, "estimate_error_m": result.estimate_error,
         "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
         "phases": [phase._asdict() for phase in result.phases if phase.seconds > 0.0], "ended": result.ended,
     }  # fmt: skip
     if options.speed:
         report["px4"]["lateness_s"] = dict(zip(("50 %", "99 %", "99.9 %"), team.clock.lateness().tolist(), strict=True))
-    if setpoints:
-        report["px4"]["steps_without_setpoint"] = setpoints[0].late.tolist()
-        print(f"steps without a fresh set-point, by drone: {setpoints[0].late.tolist()}")
-    compared = ""
+    if live is not None and live.answers is not None:
+        report["px4"]["steps_without_setpoint"] = live.answers.late.tolist()
+        print(f"steps without a fresh set-point, by drone: {live.answers.late.tolist()}")
     if ours is not None:
         report["baselines"][OURS]["drone_error_m"] = ours.drone_error
-        compared = f", with our controller {100 * ours.drone_error:.1f} cm"
     print(f"\n{options.policy} on {config.task}, seed {options.seed}\n\n{format_table(report, 'PX4')}")
-    print(
-        f"drones from their references: {100 * result.drone_error:.1f} cm{compared} (RMS); PX4's estimates of their "
-        f"places: {100 * result.estimate_error:.1f} cm; {factor:.1f} times real time"
-    )
+    print(describe_errors(result, ours) + f"{factor:.1f} times real time")
     print(describe_phases(result.phases))
     if options.speed:
         late = " / ".join(f"{1e3 * seconds:.2f}" for seconds in team.clock.lateness())
@@ -209,26 +208,29 @@ def _warn_of_loops(name: str, trained: Config | None) -> None:
         )
 
 
-def _open_live(config: Config, options: Options) -> LivePublisher:
+def _open_live(config: Config, options: Options, team: AutopilotTeam) -> LiveTeam:
+    from multilift_marl.deploy.px4.live import LiveTeam
     from multilift_marl.deploy.ros.bag import DISTRIBUTIONS
     from multilift_marl.deploy.ros.dds import Node, describe_reach
-    from multilift_marl.deploy.ros.live import LivePublisher
 
     node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
     print(f"publishing {describe_reach(options.domain, options.allow_network, options.ros)}", flush=True)
-    live = LivePublisher(node, options.names)
-    if options.policy == "none":
-        live.subscribe(config.env.num_drones)  # before the flight, so that peers are found by the time of its task
-    return live
+    others, waiting = options.policy == "none", (options.patience, options.timeout)
+    return LiveTeam(config, node, options.names, team, others, waiting, options.start == "topic", options.sync)
 
 
-def _send(live: LivePublisher, team: AutopilotTeam, vec: MultiliftVec) -> None:
-    """Publish the environment that is flown, with the time since the autopilots began."""
-    live.send(vec, round(team.time * 1e9))
+def _others(live: LiveTeam | None) -> Maker:
+    assert live is not None  # others fly by topics
+    return live.bind_others
 
 
-def _ignore(vec: MultiliftVec) -> None:
-    """Do nothing."""
+def describe_errors(result: FlightResult, ours: FlightResult | None) -> str:
+    """Return, in words, how far drones were from their references, where these are known, and from their estimates."""
+    estimates = f"PX4's estimates of their places: {100 * result.estimate_error:.1f} cm; "
+    if ours is None:  # others flew, who know their references
+        return estimates
+    found, compared = 100 * result.drone_error, 100 * ours.drone_error
+    return f"drones from their references: {found:.1f} cm, with our controller {compared:.1f} cm (RMS); {estimates}"
 
 
 def describe_phases(phases: Sequence[Phase]) -> str:

@@ -7,6 +7,7 @@ left; the autopilots notice nothing of that.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,23 +16,20 @@ import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
+from multilift_marl.deploy.px4.phases import Phase, find_failure
 from multilift_marl.deploy.px4.team import ACTIONS, AutopilotController, AutopilotTeam
+from multilift_marl.deploy.px4.ways import HOLD, Goal, plan_way, read_goal, wrapped
+from multilift_marl.deploy.ros.stages import Orders, Stage
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, FlightError
 from multilift_marl.evaluation.rollout import Trace, Tracer, measure_episodes
 from multilift_marl.math3d import ease, heading
-from multilift_marl.mdp.failures import MAX_TILT
-from multilift_marl.planning.waypoints import plan_waypoints
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
-from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
 SCRIPT = "formation_integral"  # of all parts but the task
-SPEED, ACCELERATION = 1.0, 0.7  # [m/s], [m/s²] at most on the way to and from the task, of payload and outermost slot
-_HOLD = 2.0  # [s] at the end of the way
 _TURNING = 0.5  # [rad/s] of drones about themselves there, on average
-_NEAR = 0.01  # [m], [rad] within which there is no way to go
 _TAKEOFF, _LANDING = 10.0, 12.0  # [s]
 LANDING_PACE = 0.5  # at most, of task `land`: at 1 drones are 8 cm late, and payloads have hit the ground
 _BY_AUTOPILOTS = {"randomization.action_delay": 0, "control.disturbance": "none"}  # they are late, and reject forces
@@ -39,6 +37,7 @@ _OWN = ("task", "task_options", "reward")  # what take-off and landing have of t
 Maker = Callable[[MultiliftVec], Policy]
 Say = Callable[[str], None]
 OnStep = Callable[[MultiliftVec], None]
+Watch = Callable[[MultiliftVec, Stage], None]
 
 
 class FlightResult(NamedTuple):
@@ -57,43 +56,8 @@ class FlightResult(NamedTuple):
     """How the flight ended before it was over; empty if it did not."""
 
 
-class Phase(NamedTuple):
-    """Extremes of a part of the flight; without a step the separation is infinite."""
-
-    name: str
-    seconds: float
-    separation: float
-    """[m] least distance of two drones."""
-    tension: float
-    """[N] largest of a cable."""
-    tilt: float
-    """[deg] largest of a drone."""
-
-    def joined(self, state: SystemState, peak: float, seconds: float) -> Phase:
-        """Return the phase with a further state, reached after `seconds` with a peak tension [N]."""
-        places, up = state.drone_position[0], state.drone_rotation[0, :, 2, 2]
-        apart = np.linalg.norm(places[:, None] - places, axis=-1)[~np.eye(len(places), dtype=bool)]
-        tilt = float(np.degrees(np.arccos(np.clip(up.min(), -1.0, 1.0))))
-        return Phase(
-            self.name,
-            self.seconds + seconds,
-            min(self.separation, float(apart.min(initial=np.inf))),
-            max(self.tension, peak, float(state.cable_tension[0].max())),
-            max(self.tilt, tilt),
-        )
-
-
-class Goal(NamedTuple):
-    """Where a team is to be, N drones."""
-
-    slots: np.ndarray
-    """(N, 3) [m]."""
-    cable_force: np.ndarray
-    """(N, 3) [N]."""
-    yaw: float
-    """To which the drones face, beside their own headings [rad]."""
-    pose: tuple[float, float, float, float]
-    """Place [m] and heading [rad] of the payload."""
+class _LandNow(Exception):
+    """The task is to end, and the team to land, for the reason given."""
 
 
 class Flight:
@@ -104,20 +68,24 @@ class Flight:
         team: the autopilots.
         seed: evaluation seed; the episode is the first of `evaluate.py`.
         say: called with what goes on.
-        watch: called with the environment of the part that is flown, after each of its policy steps.
+        watch: called with the environment of the part that is flown, after each of its policy steps, and the stage.
+        orders: may hold the flight back, or end its task.
 
     Attributes:
         start: state in which the task began; empty for `takeoff`, which begins as ever.
         phases: of the flight so far.
+        stage: in which it is.
 
     Raises:
         ConfigError: what autopilots cannot fly.
     """
 
     def __init__(
-        self, config: Config, team: AutopilotTeam, seed: int, say: Say = print, watch: OnStep = lambda vec: None
-    ):
+        self, config: Config, team: AutopilotTeam, seed: int, say: Say = print,
+        watch: Watch = lambda vec, stage: None, orders: Orders | None = None,
+    ):  # fmt: skip
         self.config, self.team, self.seed, self._say, self._watch = check_config(config), team, seed, say, watch
+        self._orders, self.stage = orders or Orders(), Stage.INIT
         self._flown = build_config(self.config.model_dump(), _BY_AUTOPILOTS)
         self._task = self._make(self._flown)
         self._task.reset(seed=seed)
@@ -141,46 +109,92 @@ class Flight:
             on_step: called with that environment at the start of the task and after every step.
 
         Raises:
-            FlightError: an autopilot that does not do its part, or a failure before the task.
+            FlightError: an autopilot that does not do its part, a failure before the task, or an end by order, after
+                landing.
         """
-        self.phases = []
-        if self.config.task == "takeoff":
-            observation = self._arm(self._task)
-        else:
-            first = _goal(self._task)
-            rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": first.pose[2]}
-            takeoff = self._make(self._part("takeoff", _TAKEOFF, rise))
-            self._run(takeoff, self._arm(takeoff), "take-off")
-            self._say("to the task")
-            way = self._go(takeoff, _goal(takeoff), first, "the way to the task")
-            observation = self._take_over(self._task, way.world, self.config.task)
-            self.start = self._begun
-        result = self._measure_task(make_policy, observation, on_step)
-        ended, world = "", self._task.world
+        self.phases, begin = [], read_goal(self._task)
+        way = self._task
+        try:
+            if self.config.task == "takeoff":
+                observation = self._arm(self._task)
+            else:
+                rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": begin.pose[2]}
+                takeoff = self._make(self._part("takeoff", _TAKEOFF, rise))
+                self._run(takeoff, self._arm(takeoff), "take-off", Stage.TAKE_OFF)
+                self._say("to the task")
+                way = self._go(takeoff, read_goal(takeoff), begin, "the way to the task")
+                self._hover(way, begin)
+                observation = self._take_over(self._task, way.world, self.config.task)
+                self.start, way = self._begun, self._task
+            result = self._measure_task(make_policy, observation, on_step)
+        except _LandNow as why:
+            self._say(f"{why}: back, and landing")
+            if way is self._task:
+                begin = self._here()
+                self._begin("stop", way)
+                self._rest(way, begin, 0.0, HOLD, "stop")
+            self._end(self._return(way, begin))
+            raise FlightError(f"the task was not flown to its end: {why}") from None
+        ended, vec = "", self._task
         if (cause := int(result.metrics["failure_cause"][0])) != 0:
             ended = f"task {self.config.task} failed: {self._task.failure_causes[cause]}"
         elif self.config.task != "land":
             self._say("back, and landing")
             try:  # the task has been measured, whatever happens now
-                end = _goal(self._landing)
-                way = self._go(self._task, _goal(self._task), end, "the way back")
-                observation = self._take_over(self._landing, way.world, "landing")
-                world = self._landing.world
-                self._run(self._landing, observation, "landing")
+                vec = self._return(self._task, read_goal(self._task))
             except (FlightError, ConfigError) as error:
                 return result._replace(phases=tuple(self.phases), ended=str(error))
+        self._end(vec)
+        return result._replace(phases=tuple(self.phases), ended=ended)
+
+    def _hover(self, vec: MultiliftVec, goal: Goal) -> None:
+        """Rest until the task may begin."""
+        self.stage = Stage.HOVER
+        while not self._orders.may_begin(Stage.TRAJECTORY):
+            if self.phases[-1].name != "hover until ordered":
+                self._begin("hover until ordered", vec)
+                self._say("in hover, until it may begin")
+            self._rest(vec, goal, 0.0, vec.task.dt, "hover")
+            if why := self._orders.why_to_land():
+                raise _LandNow(why)
+
+    def _here(self) -> Goal:
+        """Return where the team of the task rests if its payload stays where it is."""
+        vec, state = self._make(self._part("hover", HOLD, {})), self._task.world.state
+        vec.reset(seed=self.seed)
+        yaw = heading(tuple(state.payload_rotation[0].ravel()))
+        c, s = np.cos(yaw), np.sin(yaw)
+        vec.task.place_goal(0, state.payload_position[0], np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+        return read_goal(vec)
+
+    def _return(self, vec: MultiliftVec, begin: Goal) -> MultiliftVec:
+        """Fly back and land; return the environment in which."""
+        way = self._go(vec, begin, read_goal(self._landing), "the way back")
+        observation = self._take_over(self._landing, way.world, "landing")
+        self._run(self._landing, observation, "landing", Stage.LAND)
+        return self._landing
+
+    def _end(self, vec: MultiliftVec) -> None:
         for autopilot in self.team.offboard:
             # By force: PX4 itself may not have noticed yet that it has landed.
             autopilot.arm(False, force=True)
-        self.team.settle(world)  # so that they do, and close their logs
-        return result._replace(phases=tuple(self.phases), ended=ended)
+        self.team.settle(vec.world)  # so that they do, and close their logs
+        self.stage = Stage.END
+        self._watch(vec, self.stage)
 
     def _arm(self, vec: MultiliftVec) -> np.ndarray:
         """Begin a take-off, arm the autopilots there, and return its first observation."""
         observation, _ = vec.reset(seed=self.seed, options={"randomization": self._drawn()})
         self.team.board(vec.world)
         self._say("waiting for the autopilots")
-        self.team.prepare(vec.world)
+        self.stage, every, ticks = Stage.INIT, round(vec.task.dt * self.config.sim.control_hz), itertools.count(1)
+
+        def watch() -> None:
+            if next(ticks) % every == 0:
+                self.stage = Stage.ARMING if self.team.settled else Stage.INIT
+                self._watch(vec, self.stage)
+
+        self.team.prepare(vec.world, watch, partial(self._orders.may_begin, Stage.TAKE_OFF))
         self._say(f"armed after {self.team.time:.0f} s; take-off")
         # While they armed, drones may have moved a little: references begin where they are now.
         vec.controller.start(0)
@@ -189,12 +203,16 @@ class Flight:
     def _measure_task(self, make_policy: Maker, observation: np.ndarray, on_step: OnStep | None) -> FlightResult:
         self._say(f"{self.config.task}, {self._task.max_steps * self._task.task.dt:g} s")
         self._begin(self.config.task)
+        self.stage = Stage.TRAJECTORY
 
         def note(vec: MultiliftVec) -> None:
             self._note(vec, vec.task.dt)
+            if why := self._orders.why_to_land():
+                raise _LandNow(why)
             if on_step is not None:
                 on_step(vec)
 
+        self._watch(self._task, self.stage)  # others are asked for their first set-points
         if on_step is not None:
             on_step(self._task)
         return _measure(self._task, make_policy(self._task), observation, self.team, note)
@@ -223,7 +241,8 @@ class Flight:
         drawn = self._task.current()[1]["randomization"]
         return {name: array[0] for name, array in drawn.items() if name != "observation_bias"}
 
-    def _run(self, vec: MultiliftVec, observation: np.ndarray, what: str) -> None:
+    def _run(self, vec: MultiliftVec, observation: np.ndarray, what: str, stage: Stage) -> None:
+        self.stage = stage
         self._begin(what)
         self._fly_part(vec, observation, what)
 
@@ -238,15 +257,16 @@ class Flight:
 
     def _go(self, vec: MultiliftVec, begin: Goal, end: Goal, what: str) -> MultiliftVec:
         """Fly to where the team rests at `end`, its formation turned as a body; return the environment in which."""
+        self.stage = Stage.GO_TO
         self._begin(what, vec)
         if (way := plan_way(self.config, begin, end)) is not None:
             seconds, options = way
             # Task `track` lets drones face as the payload does.
-            self._rest(vec, begin, _wrapped(begin.pose[3] - begin.yaw), 0.0, what)
+            self._rest(vec, begin, wrapped(begin.pose[3] - begin.yaw), 0.0, what)
             before, vec = vec, self._make(self._part("track", seconds, options))
             self._fly_part(vec, self._take_over(vec, before.world, what), what)
-            begin = _goal(vec)
-        self._rest(vec, end._replace(yaw=begin.yaw), _wrapped(end.yaw - begin.yaw), _HOLD, what)
+            begin = read_goal(vec)
+        self._rest(vec, end._replace(yaw=begin.yaw), wrapped(end.yaw - begin.yaw), HOLD, what)
         return vec
 
     def _rest(self, vec: MultiliftVec, goal: Goal, turn: float, hold: float, what: str) -> None:
@@ -287,48 +307,10 @@ class Flight:
         peak = float(vec.world.stats.tension_peak[0])
         own = peak if peak > self._known_peak else 0.0  # else it is an earlier phase's
         self.phases[-1] = self.phases[-1].joined(vec.world.state, own, seconds)
-        self._watch(vec)
+        self._watch(vec, self.stage)
 
 
 _FOLLOWING = ("cable_tension", "cable_broken")  # from the places
-
-
-def _goal(vec: MultiliftVec) -> Goal:
-    goal = vec.task.planned  # where controllers are to hold the team: in `pose` that is not its target yet
-    x, y, z = goal.position[0].tolist()
-    pose = x, y, z, float(heading(tuple(goal.rotation[0].ravel())))
-    return Goal(goal.slots[0].copy(), goal.cable_force[0].copy(), float(goal.drone_yaw[0]), pose)
-
-
-def find_failure(world: World) -> str:
-    """Return what has failed of a team that rests, "" if nothing has."""
-    state, (n,) = world.state, world.state.drone_position.shape[1:2]
-    apart = np.linalg.norm(state.drone_position[0, :, None] - state.drone_position[0], axis=-1)
-    if (apart < world.system.min_separation)[~np.eye(n, dtype=bool)].any():
-        return "drone_collision"
-    if state.cable_broken[0].any():
-        return "cable_broken"
-    return "tilt" if state.drone_rotation[0, :, 2, 2].min() < np.cos(np.radians(MAX_TILT)) else ""
-
-
-def plan_way(config: Config, begin: Goal, end: Goal) -> tuple[float, dict[str, Any]] | None:
-    """Return how long the way between two goals takes with a rest at its end [s], and its `task_options` of `track`.
-
-    The payload goes on a straight line and turns the shorter way round, and the formation with it. None if it is there.
-    """
-    before, after = np.array(begin.pose), np.array(end.pose)
-    after[3] = before[3] + _wrapped(after[3] - before[3])
-    if np.abs(after - before).max() < _NEAR:
-        return None
-    places = tuple(before.tolist()), tuple(after.tolist())
-    path = plan_waypoints(places, None, (SPEED, SPEED), (ACCELERATION, ACCELERATION), config.system)
-    options = {"path": "waypoints", "waypoints": places, "waypoint_times": path.times.tolist()}
-    return float(path.times[-1]) + _HOLD, options
-
-
-def _wrapped(angle: float) -> float:
-    """Return an angle in [-π, π)."""
-    return float(np.remainder(angle + np.pi, 2 * np.pi) - np.pi)
 
 
 def _measure(

@@ -11,12 +11,15 @@ from multilift_marl.deploy.px4.launch import PX4_PORT
 from multilift_marl.deploy.px4.link import HOST
 from multilift_marl.deploy.px4.mavlink import MAVLink, Splitter, mavlink
 from multilift_marl.errors import FlightError, shorten
-from multilift_marl.math3d import quat_to_mat
+from multilift_marl.math3d import mat_to_quat, quat_to_mat
 
 OWN_PORT = 14540
 OFFBOARD, LAND = (6, 0), (4, 6)  # main and sub mode of PX4
 POSITION_MASK = mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 ACCELERATION_MASK = 0x3F | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+ATTITUDE_MASK = (
+    mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE | mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
+)
 RATES_MASK = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 _ROUNDING = 1e-3  # by which the length of a quaternion in single precision may be off
 _LARGEST = 2048  # [bytes] of a datagram; PX4's fit into an Ethernet frame
@@ -121,8 +124,16 @@ class OffboardLink:
     def send_position(
         self, time_us: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float
     ) -> None:
-        """Ask for a place, with the velocity and the acceleration that belong to it; NED, yaw from north [rad]."""
-        self._send_target(time_us, POSITION_MASK, np.concatenate([position, velocity, acceleration]), yaw)
+        """Ask for a place, with the velocity and the acceleration that belong to it; NED, yaw from north [rad].
+
+        NaN is not controlled.
+        """
+        numbers = np.concatenate([position, velocity, acceleration])
+        free = ~np.isfinite(numbers)
+        mask = POSITION_MASK | int((free << np.arange(9)).sum())
+        if not np.isfinite(yaw):
+            mask, yaw = mask | mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE, 0.0
+        self._send_target(time_us, mask, np.where(free, 0.0, numbers), yaw)
 
     def send_acceleration(self, time_us: int, acceleration: np.ndarray, yaw: float) -> None:
         """Ask for an acceleration, NED [m/s²], and a yaw from north [rad]."""
@@ -143,6 +154,15 @@ class OffboardLink:
         self._send(
             self._mavlink.set_attitude_target_encode(
                 time_us // 1000, self._system, 1, RATES_MASK, quaternion, *rates.tolist(), thrust
+            )
+        )
+
+    def send_attitude(self, time_us: int, attitude: np.ndarray, yaw_rate: float, thrust: float) -> None:
+        """Ask for an attitude (3, 3) from FRD to NED, a rate about the vertical [rad/s], and a thrust of 0 to 1."""
+        quaternion = mat_to_quat(tuple(attitude.ravel()))
+        self._send(
+            self._mavlink.set_attitude_target_encode(
+                time_us // 1000, self._system, 1, ATTITUDE_MASK, quaternion, 0.0, 0.0, yaw_rate, thrust
             )
         )
 

@@ -110,6 +110,11 @@ class AutopilotTeam:
         """Of the simulation since the autopilots began [s]."""
         return self._ticks * self._dt
 
+    @property
+    def settled(self) -> bool:
+        """Whether the estimators have had time to converge, so that arming begins."""
+        return self.time > _SETTLE
+
     def board(self, world: World) -> None:
         """Fly the drones of another world from now on; sensors keep their errors and what they remember."""
         sensors = Sensors(self.settings.suite, world.state, self._dt, self.settings.site)
@@ -167,8 +172,15 @@ class AutopilotTeam:
             if np.isfinite(autopilot.origin).all():
                 send(i)
 
-    def prepare(self, world: World) -> None:
+    def prepare(
+        self, world: World, on_tick: Callable[[], None] = lambda: None, may_go: Callable[[], bool] = lambda: True
+    ) -> None:
         """Let the autopilots start, converge at rest and arm, in offboard mode.
+
+        Args:
+            world: that has been boarded.
+            on_tick: called after each tick.
+            may_go: whether they are waited for no longer, once they are armed.
 
         Raises:
             FlightError: one was not armed in time, with what it said.
@@ -181,18 +193,19 @@ class AutopilotTeam:
             self.send(i, np.stack([here[i], zero[i], zero[i]]), zero[i], yaw[i])
 
         steps = world.system.control_interval
-        while not all(each.armed and each.mode == OFFBOARD for each in self.offboard):
+        while not (ready := all(each.armed and each.mode == OFFBOARD for each in self.offboard)) or not may_go():
             # Set-points go out all the while: PX4 accepts offboard mode only as long as they come.
             self.tick(world, stay)
             world.step(world.thrust, steps)
-            if self.time > _SETTLE and self._is_due(HEARTBEAT_RATE):
+            on_tick()
+            if self.settled and self._is_due(HEARTBEAT_RATE):
                 for autopilot in self.offboard:
                     # First the mode: armed in another one, PX4 would not follow the set-points.
                     if autopilot.mode != OFFBOARD:
                         autopilot.set_mode(OFFBOARD)
                     elif not autopilot.armed:
                         autopilot.arm()
-            if self.time > READY_WITHIN:
+            if self.time > READY_WITHIN and not ready:
                 late = next(each for each in self.offboard if not (each.armed and each.mode == OFFBOARD))
                 said = "; ".join(late.said) or "it said nothing"
                 raise FlightError(f"PX4 {late.index} was not armed within {READY_WITHIN:g} s: {said}")
@@ -209,13 +222,28 @@ class AutopilotTeam:
         """
         position, velocity, acceleration = motion
         thrust = self._feedforward.acceleration(i, velocity, acceleration, cable_force, yaw)
-        vectors, north = swap_enu_ned(np.stack([velocity, thrust])), float(swap_yaw(yaw))
         if place:
-            # By way of latitude and longitude: PX4's local frame begins elsewhere, and has a projection of its own.
-            local = project_local(self.settings.site.to_geodetic(position), self.offboard[i].origin)
-            self.offboard[i].send_position(self._time_us, local, vectors[0], vectors[1], north)
+            self.send_motion(i, position, velocity, thrust, yaw)
         else:
-            self.offboard[i].send_acceleration(self._time_us, vectors[1], north)
+            self.offboard[i].send_acceleration(self._time_us, swap_enu_ned(thrust), float(swap_yaw(yaw)))
+
+    def send_motion(
+        self, i: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float
+    ) -> None:
+        """Send position, velocity, acceleration (3,) as PX4 is to have them, and a heading from east, to drone i.
+
+        NaN is not controlled.
+        """
+        # By way of latitude and longitude: PX4's local frame begins elsewhere, and has a projection of its own.
+        local = project_local(self.settings.site.to_geodetic(np.nan_to_num(position)), self.offboard[i].origin)
+        local = np.where(np.isfinite(swap_enu_ned(position)), local, np.nan)
+        vectors = swap_enu_ned(np.stack([velocity, acceleration]))
+        self.offboard[i].send_position(self._time_us, local, vectors[0], vectors[1], float(swap_yaw(yaw)))
+
+    def send_attitude(self, i: int, attitude: np.ndarray, thrust: float, yaw_rate: float) -> None:
+        """Send an attitude (3, 3), a thrust as a share of the largest, and a yaw rate [rad/s] to drone i."""
+        turning = -yaw_rate if np.isfinite(yaw_rate) else 0.0
+        self.offboard[i].send_attitude(self._time_us, swap_attitude(attitude), turning, thrust)
 
     def send_rates(self, i: int, rates: np.ndarray, thrust: float) -> None:
         """Send body rates [rad/s] and a total thrust [N] to drone i."""

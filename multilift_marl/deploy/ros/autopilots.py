@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,9 +11,10 @@ import numpy as np
 from multilift_marl.config.config import Config
 from multilift_marl.control.action_interface import Call
 from multilift_marl.control.controller import Controller
-from multilift_marl.control.formation import Goal
+from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.geometric import fly
-from multilift_marl.deploy.ros.dds import Node, Take
+from multilift_marl.deploy.ros.answers import Answers, Take, Waiting
+from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, is_landing, sink
 from multilift_marl.deploy.ros.messages import Topic
 from multilift_marl.deploy.ros.types import (
@@ -25,7 +26,63 @@ from multilift_marl.deploy.ros.types import (
     read_trajectory,
 )
 from multilift_marl.kernels.jit import bind
+from multilift_marl.rig.system import System
+from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
+
+
+def subscribe_px4(node: Node, system: System) -> list[Take]:
+    """Return for each drone what takes the set-points of either kind, with their stamps, in order."""
+    return [_subscribe(node, i, 4 * each.rotor_thrust_max / each.mass) for i, each in enumerate(system.vehicles)]
+
+
+def _subscribe(node: Node, drone: int, full_acceleration: float) -> Take:
+    reads: dict[tuple[str, str], Callable[[Any], PX4Setpoint]] = {
+        ("trajectory_setpoint", TRAJECTORY): read_trajectory,
+        ("vehicle_attitude_setpoint_v1", ATTITUDE): partial(read_attitude, full_acceleration=full_acceleration),
+    }
+    sources = [
+        node.subscription(Topic(f"{px4_namespace(drone)}/in/{name}", kind, False), partial(read_stamped, read))
+        for (name, kind), read in reads.items()
+    ]
+
+    def take() -> list[tuple[int, PX4Setpoint]]:
+        found = [each for source in sources for each in source()]
+        # What asks for nothing does not count.
+        return sorted((each for each in found if np.isfinite(each[1][:3]).any()), key=lambda pair: pair[0])
+
+    return take
+
+
+def read_stamped(read: Callable[[Any], PX4Setpoint], message: Any) -> tuple[int, PX4Setpoint]:
+    """Return the stamp [ns] of a set-point of PX4, and what `read` returns of it."""
+    return 1000 * int(message.timestamp), read(message)
+
+
+def write_reference(
+    i: int, setpoint: PX4Setpoint, carried: np.ndarray, state: SystemState, reference: Reference, dt: float
+) -> None:
+    """Write the reference of drone i, and let the place of a moving set-point move on by `dt` [s].
+
+    Args:
+        i: the drone, in environment 0.
+        setpoint: NaN for what is not to be controlled; its position is written.
+        carried: acceleration (3,) where none is asked for [m/s²].
+        state: of the drones.
+        reference: written.
+        dt: until the next call.
+    """
+    position, velocity, acceleration, yaw, yaw_rate, *_ = setpoint
+    placed, moving = np.isfinite(position), np.isfinite(velocity)
+    reference.acceleration[0, i] = np.where(np.isfinite(acceleration), acceleration, carried)
+    still = np.where(placed, 0.0, state.drone_velocity[0, i])
+    reference.velocity[0, i] = np.where(moving, velocity, still)
+    reference.position[0, i] = np.where(placed, position, state.drone_position[0, i])
+    position += dt * np.where(moving, velocity, 0.0)  # NaN stays NaN
+    if np.isfinite(yaw):
+        reference.yaw[0, i] = yaw
+    reference.yaw_rate[0, i] = yaw_rate if np.isfinite(yaw_rate) else 0.0
+    reference.jerk[0, i] = 0.0
 
 
 class TopicAutopilots(Controller):
@@ -39,35 +96,21 @@ class TopicAutopilots(Controller):
     Args:
         config: `control` has the gains.
         world: of one environment.
-        node: to subscribe with.
+        take: the set-points of each drone, see `subscribe_px4`.
+        waiting: how steps wait for others; None: not at all.
 
     Attributes:
-        age: of each drone's last set-point (N,) [s], infinite before the first.
-        late: policy steps in which a drone had none that was fresh (N,).
+        answers: how old the set-points are.
     """
 
-    def __init__(self, config: Config, world: World, node: Node):
+    def __init__(self, config: Config, world: World, take: Sequence[Take], waiting: Waiting | None = None):
         super().__init__(config, world)
-        system, drones = world.system, range(world.num_drones)
-        self._full = [4 * each.rotor_thrust_max / each.mass for each in system.vehicles]
-        self._sources = [self._subscribe(node, i) for i in drones]
+        self.answers = Answers(take, 1.0 / config.env.policy_hz, waiting)
         alone = {name: np.zeros_like(getattr(self.gains, name)) for name in ("load_share", "drag")}
         self._drone_gains = self.gains._replace(**alone)
         self._setpoints: list[PX4Setpoint] = []
-        self._cable_force = np.zeros((1, len(drones), 3))  # of the task, live
+        self._cable_force = np.zeros((1, world.num_drones, 3))  # of the task, live
         self._dt, self._step = 1.0 / config.sim.control_hz, 1.0 / config.env.policy_hz
-        self.age, self.late = np.full(len(drones), np.inf), np.zeros(len(drones), int)
-
-    def _subscribe(self, node: Node, drone: int) -> list[Take]:
-        """Return what takes the set-points of either kind, each with its time [us]."""
-        reads: dict[tuple[str, str], Callable[[Any], PX4Setpoint]] = {
-            ("trajectory_setpoint", TRAJECTORY): read_trajectory,
-            ("vehicle_attitude_setpoint_v1", ATTITUDE): partial(read_attitude, full_acceleration=self._full[drone]),
-        }
-        return [
-            node.subscription(Topic(f"{px4_namespace(drone)}/in/{name}", kind, False), partial(_read_at, read))
-            for (name, kind), read in reads.items()
-        ]
 
     def bind(
         self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
@@ -81,16 +124,16 @@ class TopicAutopilots(Controller):
     def start(self, e: int) -> None:
         """Hold the places where the drones are, until they hear otherwise."""
         super().start(e)
-        self.age[:] = np.inf
-        self._setpoints = [self._stay(i) for i in range(len(self.age))]
+        self.answers.begin()
+        self._setpoints = [self._stay(i) for i in range(self.world.num_drones)]
 
     def _stay(self, drone: int) -> PX4Setpoint:
         place, yaw = self.world.state.drone_position[0, drone].copy(), float(self.reference.yaw[0, drone])
-        return PX4Setpoint(place, np.zeros(3), self._carried(drone), yaw)
+        return PX4Setpoint(place, np.zeros(3), self._carried(drone), yaw, 0.0)
 
     def _hold(self, drone: int) -> PX4Setpoint:
         """Return the last place to hold, where the drone is on axes that none was asked for."""
-        place, _, _, yaw = self._setpoints[drone]
+        place, yaw = self._setpoints[drone].position, self._setpoints[drone].yaw
         here = self._stay(drone)
         return here._replace(position=np.where(np.isfinite(place), place, here.position), yaw=yaw)
 
@@ -100,32 +143,14 @@ class TopicAutopilots(Controller):
 
     def _hear(self) -> None:
         """Take the newest set-points, once for each policy step; hold or land what hears none."""
-        for i, sources in enumerate(self._sources):
-            self.age[i] += self._step
-            found = [each for take in sources for each in take()]
-            for _, setpoint in sorted(found, key=lambda pair: pair[0]):
-                if np.isfinite(setpoint[:3]).any():
-                    self._setpoints[i], self.age[i] = setpoint, 0.0
-            if self.age[i] > HOLD_AFTER:
-                self.late[i] += 1
+        for i, newest in enumerate(self.answers.hear()):
+            if newest is not None:
+                self._setpoints[i] = newest
+            if self.answers.age[i] > HOLD_AFTER:
                 self._setpoints[i] = self._hold(i)
-            sink(self._setpoints[i].position[None], is_landing(self.age[i]), self._step)
+            sink(self._setpoints[i].position[None], is_landing(self.answers.age[i]), self._step)
 
     def _follow(self) -> None:
         """Write the references of a control tick, and let the places of moving set-points move on."""
-        state, own = self.world.state, self.reference
-        for i, (position, velocity, acceleration, yaw) in enumerate(self._setpoints):
-            placed, moving = np.isfinite(position), np.isfinite(velocity)
-            own.acceleration[0, i] = np.where(np.isfinite(acceleration), acceleration, self._carried(i))
-            still = np.where(placed, 0.0, state.drone_velocity[0, i])
-            own.velocity[0, i] = np.where(moving, velocity, still)
-            own.position[0, i] = np.where(placed, position, state.drone_position[0, i])
-            position += self._dt * np.where(moving, velocity, 0.0)  # NaN stays NaN
-            if np.isfinite(yaw):
-                own.yaw[0, i] = yaw
-        own.jerk[:] = own.yaw_rate[:] = 0.0
-
-
-def _read_at(read: Callable[[Any], PX4Setpoint], message: Any) -> tuple[int, PX4Setpoint]:
-    """Return the time [us] of a set-point and what `read` returns of it."""
-    return message.timestamp, read(message)
+        for i, setpoint in enumerate(self._setpoints):
+            write_reference(i, setpoint, self._carried(i), self.state, self.reference, self._dt)

@@ -5,14 +5,16 @@ The world is `world` (ENU, REP 103), bodies are FLU. Twists are in the body's fr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.typesys.store import Typestore
 
 from multilift_marl.deploy.ros.markers import MARKERS, Scene
+from multilift_marl.deploy.ros.stages import Stage
 from multilift_marl.deploy.ros.types import (
+    ATTITUDE,
     CONTROL_MODE,
     EXACT,
     LOCAL_POSITION,
@@ -26,9 +28,11 @@ from multilift_marl.deploy.ros.types import (
 )
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.math3d import mat_to_quat
+from multilift_marl.sim.state import SystemState
 
 ODOMETRY, POSE, BOOL = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "std_msgs/msg/Bool"
-ACTION = "std_msgs/msg/Float32MultiArray"
+PATH, INT64 = "nav_msgs/msg/Path", "std_msgs/msg/Int64"
+ACTION, INT32 = "std_msgs/msg/Float32MultiArray", "std_msgs/msg/Int32"
 SYNC_EVERY = 0.05  # [s] of the report's clock
 _COVARIANCE = np.diag(np.full(6, EXACT)).ravel()
 Sent = tuple[str, Any]
@@ -44,6 +48,9 @@ class Topic(NamedTuple):
     reliable: bool = True
     latched: bool = False
     """Whether late subscribers get the last one."""
+
+
+SYNC = Topic("/sync_time", INT64, False, True)
 
 
 class Names(NamedTuple):
@@ -62,7 +69,8 @@ NAMES = {
     "report": Names("/payload_odom", "/simulation/position_drone_{}", 1, True),
 }
 """Ours, and those of the report's workspace (see docs/ros.md)."""
-FLYING, LANDING = 5, 7  # states of a drone in the report's state machine, there called trajectory and land
+Report = Callable[[SystemState], None]
+"""Writes what autopilots know of their drones to a state of one environment."""
 
 
 def setpoint_topics(names: Names, drone: int) -> list[Topic]:
@@ -71,6 +79,15 @@ def setpoint_topics(names: Names, drone: int) -> list[Topic]:
         return [Topic(f"/drone_{drone}/setpoint", POSE)]
     topics = {"offboard_control_mode": CONTROL_MODE, "trajectory_setpoint": TRAJECTORY}
     return [Topic(f"{px4_namespace(drone)}/in/{name}", kind) for name, kind in topics.items()]
+
+
+def control_topics(names: Names, drone: int) -> list[Topic]:
+    """Return what a geometric-control node hears for a drone, then what it says: its attitude, PX4's mode."""
+    return [
+        Topic(f"/drone_{names.first + drone}/trajectory_setpoint", TRAJECTORY),
+        Topic(f"{px4_namespace(drone)}/in/vehicle_attitude_setpoint_v1", ATTITUDE),
+        Topic(f"{px4_namespace(drone)}/in/offboard_control_mode", CONTROL_MODE),
+    ]
 
 
 def level(yaw: float) -> np.ndarray:
@@ -94,6 +111,12 @@ def pose_stamped(store: Typestore, time_ns: int, position: np.ndarray, rotation:
     return store.types[POSE](header=make_header(store, time_ns), pose=make_pose(store, position, rotation))
 
 
+def path(store: Typestore, time_ns: int, places: np.ndarray) -> Any:
+    """Return a path of places (P, 3) [m] in the world."""
+    poses = [pose_stamped(store, time_ns, place, np.eye(3)) for place in places]
+    return store.types[PATH](header=make_header(store, time_ns), poses=poses)
+
+
 class FlightMessages:
     """The messages of environment 0.
 
@@ -102,19 +125,27 @@ class FlightMessages:
         store: types of a ROS distribution.
         names: a key of `NAMES`.
         acts: whether actions fly the drones, and are published.
+        report: writes what autopilots say of themselves, with the report's names; None: the truth.
+        syncs: whether the report's clock is published, which a clock node does otherwise.
 
     Attributes:
         frames: of the drones.
-        landing: drones (N,) whose set-points have been lost for long; of the report's names.
+        stages: of the drones (N,), see `Stage`; of the report's names.
     """
 
-    def __init__(self, vec: MultiliftVec, store: Typestore, names: str = "multilift", acts: bool = True):
+    def __init__(
+        self, vec: MultiliftVec, store: Typestore, names: str = "multilift", acts: bool = True,
+        report: Report | None = None, syncs: bool = True,
+    ):  # fmt: skip
         self._vec, self._store, self._types, self._names = vec, store, store.types, NAMES[names]
         drones = range(self._names.first, self._names.first + vec.num_drones)
         self._drones = [self._names.drone.format(i) for i in drones]
         self.frames = [f"drone_{i}" for i in drones]
         self._px4 = [px4_namespace(i) for i in range(vec.num_drones)]
-        self.landing = np.zeros(vec.num_drones, bool)
+        self.syncs = syncs
+        self.stages = np.full(vec.num_drones, Stage.TRAJECTORY)
+        self._autopilots = report
+        self._known = SystemState(*(array.copy() for array in vec.world.state))
         self._synced, self._acts = -1, acts
         self._scene = Scene(vec, store, self.frames)
 
@@ -137,8 +168,9 @@ class FlightMessages:
             for i, px4 in enumerate(self._px4):
                 topics.append(Topic(f"{px4}/out/vehicle_odometry", VEHICLE_ODOMETRY, False, True))  # as PX4 does
                 topics.append(Topic(f"{px4}/out/vehicle_local_position", LOCAL_POSITION, False, True))
-                topics.append(Topic(f"/state/state_drone_{i}", "std_msgs/msg/Int32"))
-            topics.append(Topic("/sync_time", "std_msgs/msg/Int64", False, True))
+                topics.append(Topic(f"/state/state_drone_{i}", INT32))
+            if self.syncs:
+                topics.append(SYNC)
         return topics
 
     def messages(self, time_ns: int) -> Iterator[Sent]:
@@ -148,8 +180,7 @@ class FlightMessages:
         yield "/clock", self._new("rosgraph_msgs/msg/Clock", clock=header.stamp)
         yield "/target", pose_stamped(store, time_ns, goal.position[0], goal.rotation[0])
         payload: Motion = tuple(array[0] for array in state[:4])
-        rows = (state.drone_position, state.drone_rotation, state.drone_velocity, state.drone_body_rates)
-        drones: list[Motion] = [tuple(array[0, i] for array in rows) for i in range(len(self.frames))]
+        drones = self._drone_motions(state)
         frames = {"payload": payload} | dict(zip(self.frames, drones, strict=True))
         transforms = [self._transform(header, *pair) for pair in frames.items()]
         yield "/tf", self._new("tf2_msgs/msg/TFMessage", transforms=transforms)
@@ -172,16 +203,22 @@ class FlightMessages:
         if self._names.is_report:
             yield from self._report(time_ns, drones)
 
+    def _drone_motions(self, state: SystemState) -> list[Motion]:
+        rows = (state.drone_position, state.drone_rotation, state.drone_velocity, state.drone_body_rates)
+        return [tuple(array[0, i] for array in rows) for i in range(len(self.frames))]
+
     def _report(self, time_ns: int, drones: list[Motion]) -> Iterator[Sent]:
         """Return what PX4s, the state machine and the clock of the report's workspace say."""
+        if self._autopilots is not None:
+            self._autopilots(self._known)
+            drones = self._drone_motions(self._known)
         for i, (px4, motion) in enumerate(zip(self._px4, drones, strict=True)):
-            yield f"{px4}/out/vehicle_odometry", vehicle_odometry(self._store, time_ns, motion)
+            yield f"/state/state_drone_{i}", self._new(INT32, data=int(self.stages[i]))
             yield f"{px4}/out/vehicle_local_position", local_position(self._store, time_ns, motion)
-            stage = LANDING if self.landing[i] else FLYING
-            yield f"/state/state_drone_{i}", self._new("std_msgs/msg/Int32", data=stage)
-        if time_ns // int(SYNC_EVERY * 1e9) > self._synced:
+            yield f"{px4}/out/vehicle_odometry", vehicle_odometry(self._store, time_ns, motion)
+        if self.syncs and time_ns // int(SYNC_EVERY * 1e9) > self._synced:
             self._synced = time_ns // int(SYNC_EVERY * 1e9)
-            yield "/sync_time", self._new("std_msgs/msg/Int64", data=time_ns // 1000)
+            yield SYNC.name, self._new(INT64, data=time_ns // 1000)
 
     def _new(self, kind: str, **fields: Any) -> Any:
         return self._types[kind](**fields)

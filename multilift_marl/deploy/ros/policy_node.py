@@ -19,14 +19,19 @@ from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER, sink
 from multilift_marl.deploy.ros.messages import (
     BOOL,
+    INT32,
     NAMES,
     ODOMETRY,
+    PATH,
     POSE,
     Topic,
+    control_topics,
     level,
+    path,
     pose_stamped,
     setpoint_topics,
 )
+from multilift_marl.deploy.ros.stages import Stage
 from multilift_marl.deploy.ros.types import (
     VEHICLE_ODOMETRY,
     control_mode,
@@ -42,6 +47,8 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.mdp.failures import MAX_DISTANCE
 from multilift_marl.policies.policy import Policy
 
+PX4 = "px4"
+AT_ONCE, TOPIC, STAGE = "at_once", "topic", "stage"
 WAITING, READY, FLYING, HOLDING, LANDING = "waiting", "ready", "flying", "holding", "landing"
 _LEAP, _LEAP_ACCELERATION = 0.1, 20.0  # [m], [m/s²]: what is farther off than these was put elsewhere
 _LEAPS = 5  # steps in a row of that, after which the task begins anew
@@ -64,8 +71,10 @@ class PolicyNode:
         node: publishes and subscribes.
         names: of the topics, a key of `messages.NAMES`; the report's drones are PX4s.
         seed: of the episode, which a task that plans its target draws it from.
-        at_once: whether to fly as soon as all is heard; else when `true` comes on /fly.
+        start: AT_ONCE, as soon as all is heard; TOPIC, when `true` comes on /fly; STAGE, while all drones are in stage
+            5 of the report's state machine.
         say: called with what happens.
+        receiver: of set-points with the report's names, PX4 itself or a geometric-control node.
 
     Attributes:
         team: the task as measured.
@@ -79,12 +88,12 @@ class PolicyNode:
 
     def __init__(
         self, config: Config, make_policy: Callable[[MeasuredTeam], Policy], node: Node, names: str = "multilift",
-        seed: int = 1000, at_once: bool = True, say: Say = print,
+        seed: int = 1000, start: str = AT_ONCE, say: Say = print, receiver: str = PX4,
     ):  # fmt: skip
-        check_flyable(config)
+        check_flyable(config, names, receiver)
         self.team = MeasuredTeam(config)
         self._policy, self._seed, self._say = make_policy(self.team), seed, say
-        self._node, self._names, self._wanted = node, NAMES[names], at_once
+        self._node, self._names, self._wanted, self._start = node, NAMES[names], start == AT_ONCE, start
         self.mode, self.steps, self.latency = WAITING, 0, deque[float](maxlen=_REMEMBERED)
         self._plans = self.team.task.KERNELS.plan is not None
         self._target: tuple[np.ndarray, np.ndarray] | None = None
@@ -93,7 +102,7 @@ class PolicyNode:
         self._leaps, self._why = 0, ""
         drones = self.team.num_drones
         self._setpoints = np.zeros((drones, 3)), np.zeros(drones)  # the last places [m] and headings [rad]
-        self._feedforward = LoadFeedforward(config.system)
+        self._feedforward, self._receiver = LoadFeedforward(config.system), receiver
         self._subscribe()
         self._warm_up()
 
@@ -115,7 +124,15 @@ class PolicyNode:
         self._bodies = Bodies(sources, self.team.task.dt)
         self._take_target = node.subscription(Topic("/target", POSE, False), read_place)
         self._take_wish = node.subscription(Topic("/fly", BOOL, False))
-        self._publishers = [[node.publisher(topic) for topic in setpoint_topics(names, drone)] for drone in drones]
+        states = drones if self._start == STAGE else []
+        self._take_stages = [node.subscription(Topic(f"/state/state_drone_{i}", INT32, False)) for i in states]
+        self._stages = np.zeros(len(states), int)
+        asked = [
+            setpoint_topics(names, drone) if self._receiver == PX4 else control_topics(names, drone)[:1]
+            for drone in drones
+        ]
+        self._publishers = [[node.publisher(topic) for topic in topics] for topics in asked]
+        self._publish_path = node.publisher(Topic("/path", PATH, latched=True))
 
     def _warm_up(self) -> None:
         """Make a step in the task's own start, so that no step in flight is the first."""
@@ -123,6 +140,11 @@ class PolicyNode:
         self.team.advance()
         self.team.observe({})
         self._policy.reset()
+
+    @property
+    def _awaited(self) -> str:
+        """What lets it fly, in words."""
+        return "stage 5 of all drones" if self._start == STAGE else "true on /fly"
 
     @property
     def landed(self) -> bool:
@@ -178,7 +200,7 @@ class PolicyNode:
         elif self._target is None and not self._plans:
             self._say(f"{self.mode}: no /target is heard")
         else:
-            self._say(f"{self.mode}: {self._why or 'true on /fly lets it fly'}")
+            self._say(f"{self.mode}: {self._why or f'{self._awaited} lets it fly'}")
 
     def _hear_wishes(self) -> None:
         """Take in targets, unless the task plans its own, and whether to fly."""
@@ -195,6 +217,19 @@ class PolicyNode:
             self._wanted = bool(message.data)
             if not self._wanted:
                 self.land("false on /fly")
+        self._hear_stages()
+
+    def _hear_stages(self) -> None:
+        """Take in the stages of the drones' flights, and begin and end with the trajectory."""
+        for i, take in enumerate(self._take_stages):
+            for message in take():
+                self._stages[i] = message.data
+        if self._start != STAGE:
+            return
+        self._wanted = bool((self._stages == Stage.TRAJECTORY).all())
+        if not self._wanted and self.mode in (FLYING, HOLDING):
+            self._change(READY, f"the stages of the drones are {self._stages.tolist()}")
+            self._before = None
 
     def _refuse_target(self, away: float) -> None:
         """Say that a target is too far away [m], not for every one that comes."""
@@ -241,7 +276,13 @@ class PolicyNode:
         if self._why or not self._wanted:
             return None
         self._policy.reset()
+        self._publish_path(path(self._node.store, int(self._bodies.stamps[-1]), self._planned_path()))
         return observation
+
+    def _planned_path(self) -> np.ndarray:
+        """Return the places (P, 3) [m] on the payload's way, the target alone where it stays."""
+        points = self.team.task.target_path(0)
+        return points if len(points) else self.team.task.goal.position.copy()
 
     def _observe(self) -> np.ndarray | None:
         """Return the observation; None where the task has failed."""
@@ -268,7 +309,8 @@ class PolicyNode:
             self._publish(reference.command[0], reference.command_yaw[0])
             return True
         self.team.advance()
-        self._publish(reference.position[0], reference.yaw[0], reference.velocity[0], reference.acceleration[0])
+        motion = reference.velocity[0], reference.acceleration[0], reference.yaw_rate[0]
+        self._publish(reference.position[0], reference.yaw[0], *motion)
         return True
 
     def _hold(self, now: float) -> None:
@@ -282,20 +324,24 @@ class PolicyNode:
 
     def _publish(
         self, places: np.ndarray, yaws: np.ndarray, velocities: np.ndarray | None = None,
-        accelerations: np.ndarray | None = None,
+        accelerations: np.ndarray | None = None, yaw_rates: np.ndarray | None = None,
     ) -> None:  # fmt: skip
         """Publish set-points; of PX4s with what the drones carry added to their accelerations."""
-        still = np.zeros_like(places)
+        still, store = np.zeros_like(places), self._node.store
+        # A plan knows the force on each cable, its drag included; else it is the formation's.
+        planned = velocities is not None and self.team.controller.interface.commands_force
+        force = (self.team.controller.commanded_force if planned else self.team.task.planned.cable_force)[0]
         velocities, accelerations = (still if each is None else each for each in (velocities, accelerations))
-        store, force = self._node.store, self.team.task.goal.cable_force[0]
+        yaw_rates = np.zeros(len(places)) if yaw_rates is None else yaw_rates
         newest = int(self._bodies.arrivals.argmax())
         # By the clock of the measurements, carried on by this machine's since the newest came.
         now = int(self._bodies.stamps[newest] + 1e9 * (self._woken - self._bodies.arrivals[newest]))
         for i, publishers in enumerate(self._publishers):
             if self._names.is_report:
-                rise = self._feedforward.acceleration(i, velocities[i], accelerations[i], force[i], yaws[i])
-                setpoint = trajectory_setpoint(store, now, places[i], velocities[i], rise, yaws[i])
-                messages = [control_mode(store, now), setpoint]
+                through = still[i] if planned else velocities[i]
+                rise = self._feedforward.acceleration(i, through, accelerations[i], force[i], yaws[i])
+                setpoint = trajectory_setpoint(store, now, places[i], velocities[i], rise, yaws[i], yaw_rates[i])
+                messages = [control_mode(store, now), setpoint] if self._receiver == PX4 else [setpoint]
             else:
                 messages = [pose_stamped(store, now, places[i], level(yaws[i]))]
             for publish, message in zip(publishers, messages, strict=True):
@@ -308,12 +354,17 @@ class PolicyNode:
             self.mode = mode
 
 
-def check_flyable(config: Config) -> None:
+def check_flyable(config: Config, names: str = "multilift", receiver: str = PX4) -> None:
     """Refuse, by a ConfigError, what the node cannot fly."""
-    if config.control.action != "reference":
+    is_report = NAMES[names].is_report
+    able = ("reference", "full_state") if is_report else ("reference",)
+    if config.control.action not in able:
         raise ConfigError(
-            f"set-points are places, of control.action=reference, not of {config.control.action}; take a policy of that"
+            f"set-points of names={names} are those of control.action={' or '.join(able)}, not of "
+            f"{config.control.action}; take a policy of that"
         )
+    if receiver != PX4 and not is_report:
+        raise ConfigError(f"receiver={receiver} takes set-points of PX4; set names=report")
     if config.env.sensing == "onboard":
         raise ConfigError("role=policy cannot fly policies of env.sensing=onboard: nobody measures the cables' tension")
     if config.task == "loss":

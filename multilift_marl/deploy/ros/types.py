@@ -187,13 +187,14 @@ def local_position(store: Typestore, time_ns: int, motion: Motion) -> Any:
 
 
 def trajectory_setpoint(
-    store: Typestore, time_ns: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float
-) -> Any:
-    """Return PX4's `TrajectorySetpoint` of a motion in ENU and a heading from east."""
+    store: Typestore, time_ns: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float,
+    yaw_rate: float = np.nan,
+) -> Any:  # fmt: skip
+    """Return PX4's `TrajectorySetpoint` of a motion in ENU, a heading from east, and how fast it turns."""
     place, speed, rise = (_single(swap_enu_ned(vector)) for vector in (position, velocity, acceleration))
     return store.types[TRAJECTORY](
         timestamp=time_ns // 1000, position=place, velocity=speed, acceleration=rise,
-        jerk=np.full(3, np.nan, np.float32), yaw=float(swap_yaw(yaw)), yawspeed=float("nan"),
+        jerk=np.full(3, np.nan, np.float32), yaw=float(swap_yaw(yaw)), yawspeed=-float(yaw_rate),
     )  # fmt: skip
 
 
@@ -208,14 +209,20 @@ class PX4Setpoint(NamedTuple):
     """(3,) [m/s²]."""
     yaw: float
     """From east [rad]."""
+    yaw_rate: float = np.nan
+    """[rad/s]."""
+    attitude: np.ndarray | None = None
+    """(3, 3) of one of attitude and thrust, of which the acceleration follows."""
+    thrust: float = np.nan
+    """Of that one, 0 to 1 of the largest."""
 
 
 def read_trajectory(message: Any) -> PX4Setpoint:
     """Return what a `TrajectorySetpoint` asks for, a ValueError where numbers are none."""
     vectors = np.stack([message.position, message.velocity, message.acceleration])
-    check_numbers(vectors, message.yaw, missing=True)
+    check_numbers(vectors, message.yaw, message.yawspeed, missing=True)
     position, velocity, acceleration = swap_enu_ned(vectors)
-    return PX4Setpoint(position, velocity, acceleration, float(swap_yaw(message.yaw)))
+    return PX4Setpoint(position, velocity, acceleration, float(swap_yaw(message.yaw)), -float(message.yawspeed))
 
 
 def read_attitude(message: Any, full_acceleration: float) -> PX4Setpoint:
@@ -230,17 +237,27 @@ def read_attitude(message: Any, full_acceleration: float) -> PX4Setpoint:
     """
     rotation, none = swap_attitude(_rotation(*(float(number) for number in message.q_d))), np.full(3, np.nan)
     check_numbers(rotation, message.thrust_body[2])
+    check_numbers(message.yaw_sp_move_rate, missing=True)
     # FRD: a thrust upward is negative.
-    thrust = np.clip(-float(message.thrust_body[2]), 0.0, 1.0)
+    thrust = float(np.clip(-float(message.thrust_body[2]), 0.0, 1.0))
     acceleration = thrust * full_acceleration * rotation[:, 2] - [0.0, 0.0, GRAVITY]
-    return PX4Setpoint(none, none, acceleration, _yaw(rotation))
+    turning = -float(message.yaw_sp_move_rate)
+    return PX4Setpoint(none, none, acceleration, _yaw(rotation), turning, rotation, thrust)
 
 
-def control_mode(store: Typestore, time_ns: int) -> Any:
-    """Return PX4's `OffboardControlMode` that goes with positions, velocities and accelerations."""
+def attitude_setpoint(store: Typestore, time_ns: int, rotation: np.ndarray, thrust: float, yaw_rate: float) -> Any:
+    """Return PX4's `VehicleAttitudeSetpoint` of an attitude (3, 3), a share of the largest thrust, and a yaw rate."""
+    return store.types[ATTITUDE](
+        timestamp=time_ns // 1000, yaw_sp_move_rate=-yaw_rate, q_d=_single(_quaternion(swap_attitude(rotation))),
+        thrust_body=_single([0.0, 0.0, -thrust]),
+    )  # fmt: skip
+
+
+def control_mode(store: Typestore, time_ns: int, attitude: bool = False) -> Any:
+    """Return PX4's `OffboardControlMode` that goes with positions, velocities and accelerations, or with attitudes."""
     return store.types[CONTROL_MODE](
-        timestamp=time_ns // 1000, position=True, velocity=True, acceleration=True, attitude=False, body_rate=False,
-        thrust_and_torque=False, direct_actuator=False,
+        timestamp=time_ns // 1000, position=not attitude, velocity=not attitude, acceleration=not attitude,
+        attitude=attitude, body_rate=False, thrust_and_torque=False, direct_actuator=False,
     )  # fmt: skip
 
 

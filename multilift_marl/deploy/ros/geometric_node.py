@@ -1,0 +1,259 @@
+"""A node that hears odometry and trajectory set-points of drones, and asks for attitudes and thrusts: eqs 25-28."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+
+from multilift_marl.config.config import Config
+from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
+from multilift_marl.control.formation import Reference
+from multilift_marl.control.gains import make_gains
+from multilift_marl.control.geometric import command_attitude
+from multilift_marl.deploy.ros.autopilots import read_stamped, write_reference
+from multilift_marl.deploy.ros.dds import Node
+from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER
+from multilift_marl.deploy.ros.messages import NAMES, Topic, control_topics
+from multilift_marl.deploy.ros.types import (
+    VEHICLE_ODOMETRY,
+    Motion,
+    PX4Setpoint,
+    attitude_setpoint,
+    control_mode,
+    px4_namespace,
+    read_measurement,
+    read_trajectory,
+    read_vehicle_odometry,
+)
+from multilift_marl.errors import ConfigError
+from multilift_marl.sim.state import SystemState
+
+Say = Callable[[str], None]
+Numbers = TypeVar("Numbers", bound=tuple[Any, ...])
+FOLLOWING, HOLDING, SILENT = "following", "holding", "silent"
+_STALE = 1.0  # [s] between odometries, above which the integral does not go on
+_REMEMBERED = 1_000_000  # answers of which the latency is known
+
+
+class DroneControl:
+    """Position and velocity control of one drone that is measured elsewhere.
+
+    Set-points are as PX4 gets them: their accelerations hold what the drone carries, so that the gains are those of
+    the drone alone.
+
+    Args:
+        config: `control` has the gains, and `control.disturbance` may be `integral`.
+        drone: its number.
+
+    Attributes:
+        desired: attitude (3, 3), of the last call.
+        share: of the largest thrust, of the last call.
+    """
+
+    def __init__(self, config: Config, drone: int):
+        system, control = config.system, config.control
+        self._vehicle = system.vehicles[drone]
+        gains = make_gains(control, system)
+        gains = gains._replace(load_share=np.zeros_like(gains.load_share), drag=np.zeros_like(gains.drag))
+        self._gains = _of(drone, gains)
+        self._reject = None
+        if control.disturbance != "none":
+            rejection = make_rejection(control, system, make_gains(control, system), 1.0 / config.env.policy_hz)
+            self._rejection = _of(drone, rejection._replace(gains=self._gains))
+            self._reject = REJECTIONS[control.disturbance]
+        self._state, self._reference = SystemState.zeros(1, 1), Reference.zeros(1, 1)
+        self._disturbance, self._nominal = Disturbance.zeros(1, 1), np.zeros((1, 1, 3))
+        self._desired, self._total = np.zeros((1, 1, 3, 3)), np.zeros((1, 1))
+        # What holds the load up, without the formation's pull to the side.
+        self.carried = np.array([0.0, 0.0, system.hook_force[drone, 2] / system.drone_mass[drone]])
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the integral."""
+        reset_estimate(0, self._state, self._disturbance)
+        self._disturbance.cable_force[:] = 0.0
+
+    def follow(self, motion: Motion, setpoint: PX4Setpoint, elapsed: float) -> None:
+        """Compute attitude and thrust.
+
+        Args:
+            motion: of the drone.
+            setpoint: where it is to be at that time.
+            elapsed: since the last call [s].
+        """
+        state = self._state
+        state.drone_position[0, 0], state.drone_rotation[0, 0], state.drone_velocity[0, 0], _ = motion
+        write_reference(0, setpoint, self.carried, state, self._reference, 0.0)
+        force = self._nominal
+        if self._reject is not None:
+            # Whether thrusts are at a limit is known of those that were asked for last.
+            each = np.clip(self._total / 4, 0.0, self._vehicle.rotor_thrust_max)
+            state.rotor_speed[:] = np.sqrt(each / self._vehicle.thrust_coefficient)[..., None]
+            paced = self._rejection._replace(dt=min(elapsed, _STALE))
+            self._reject(0, 1, state, self._reference, self._nominal, self._disturbance, paced)
+            force = self._disturbance.cable_force
+        command_attitude(0, 1, state, self._reference, force, self._desired, self._total, self._gains)
+
+    @property
+    def desired(self) -> np.ndarray:
+        """See above."""
+        return self._desired[0, 0]
+
+    @property
+    def share(self) -> float:
+        """See above."""
+        return float(min(self._total[0, 0] / (4 * self._vehicle.rotor_thrust_max), 1.0))
+
+
+class _Drone:
+    """What a node knows of one drone."""
+
+    def __init__(self, config: Config, drone: int, node: Node, names: str):
+        self.control = DroneControl(config, drone)
+        topic = Topic(f"{px4_namespace(drone)}/out/vehicle_odometry", VEHICLE_ODOMETRY, False)
+        self.take_odometry = node.subscription(topic, partial(read_measurement, read_vehicle_odometry))
+        asked = control_topics(NAMES[names], drone)[0]
+        self.take_setpoints = node.subscription(asked._replace(reliable=False), partial(read_stamped, read_trajectory))
+        attitude, mode = control_topics(NAMES[names], drone)[1:]
+        self.publish, self.publish_mode = node.publisher(attitude), node.publisher(mode)
+        self.mode = SILENT
+        self.measured: tuple[int, Motion] | None = None
+        self.arrived = 0.0
+        self.pending = False
+        self.setpoint: tuple[int, PX4Setpoint] | None = None
+        self.heard_at = self.answered = -1  # [ns] by the odometry's clock
+
+
+class GeometricControlNode:
+    """Controls drones of PX4 by attitude and thrust, one answer for each odometry.
+
+    Set-points move on by their velocities to the time of the odometry. A drone without a fresh one holds the last
+    place, and after 2 s nothing more is said of it: its autopilot has a fail-safe of its own.
+
+    Args:
+        config: the rig, its gains, and `control.disturbance`, none or integral.
+        node: publishes and subscribes.
+        names: of the topics, those of a workspace with PX4s.
+        drones: which; None: all.
+        patience: for the set-point that belongs to an odometry [s].
+        say: called with what happens.
+
+    Attributes:
+        latency: from each odometry to its answer [s].
+
+    Raises:
+        ConfigError: what it cannot do.
+    """
+
+    def __init__(
+        self, config: Config, node: Node, names: str = "report", drones: list[int] | None = None,
+        patience: float = 0.0, say: Say = print,
+    ):  # fmt: skip
+        if not NAMES[names].is_report:
+            raise ConfigError(f"role=geometric_control flies drones of PX4, of names=report, not of names={names}")
+        if config.control.disturbance not in ("none", "integral"):
+            raise ConfigError(
+                f"role=geometric_control knows no rotor speeds, which control.disturbance={config.control.disturbance} "
+                "needs; set integral or none"
+            )
+        count = config.env.num_drones
+        chosen = range(count) if drones is None else drones
+        if wrong := [drone for drone in chosen if not 0 <= drone < count]:
+            raise ConfigError(f"drones={wrong} are none of this team, which has 0 to {count - 1}")
+        self._drones = {i: _Drone(config, i, node, names) for i in chosen}
+        self._node, self._patience, self._say = node, patience, say
+        self.latency = deque[float](maxlen=_REMEMBERED)
+        self.steps = 0
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        still = PX4Setpoint(np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+        for drone in self._drones.values():
+            drone.control.follow((np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3)), still, 0.0)
+            drone.control.restart()
+
+    def spin(self, seconds: float) -> None:
+        """Hear and control for some seconds of real time."""
+        end = time.perf_counter() + seconds
+        while (left := end - time.perf_counter()) > 0:
+            self.spin_once(left)
+
+    def spin_once(self, seconds: float) -> None:
+        """Wait for something new, for some seconds at most, and do what is due."""
+        self._node.wait(min(seconds, self._rest()))
+        self._node.check_publishers()
+        now = time.perf_counter()
+        for i, drone in self._drones.items():
+            self._hear(drone, now)
+            if drone.pending and (self._is_answered(drone) or now >= drone.arrived + self._patience):
+                drone.pending = False
+                self._answer(i, drone)
+
+    def _rest(self) -> float:
+        """Return how long nothing is due [s]."""
+        due = [drone.arrived + self._patience for drone in self._drones.values() if drone.pending]
+        return max(min(due) - time.perf_counter(), 0.0) if due else 0.1
+
+    @staticmethod
+    def _hear(drone: _Drone, now: float) -> None:
+        for time_ns, motion in drone.take_odometry():
+            drone.measured, drone.arrived, drone.pending = (time_ns, motion), now, True
+        for stamped in drone.take_setpoints():
+            drone.setpoint = stamped
+            drone.heard_at = -1 if drone.measured is None else drone.measured[0]
+
+    @staticmethod
+    def _is_answered(drone: _Drone) -> bool:
+        """Whether the last set-point is that of the last odometry, or none is to be waited for."""
+        assert drone.measured is not None
+        return drone.mode != FOLLOWING or (drone.setpoint is not None and drone.setpoint[0] >= drone.measured[0])
+
+    def _answer(self, i: int, drone: _Drone) -> None:
+        assert drone.measured is not None
+        time_ns, motion = drone.measured
+        setpoint = self._present_setpoint(i, drone, time_ns)
+        elapsed, drone.answered = 1e-9 * (time_ns - drone.answered) if drone.answered >= 0 else 0.0, time_ns
+        if setpoint is None:
+            return
+        drone.control.follow(motion, setpoint, max(elapsed, 0.0))
+        turning = 0.0 if np.isnan(setpoint.yaw_rate) else setpoint.yaw_rate
+        store = self._node.store
+        drone.publish_mode(control_mode(store, time_ns, attitude=True))
+        drone.publish(attitude_setpoint(store, time_ns, drone.control.desired, drone.control.share, turning))
+        self.latency.append(time.perf_counter() - drone.arrived)
+        self.steps += 1
+
+    def _present_setpoint(self, i: int, drone: _Drone, time_ns: int) -> PX4Setpoint | None:
+        """Return where drone i is to be at the time of its odometry; None where nobody says so any more."""
+        if drone.setpoint is None:
+            return None
+        if drone.heard_at < 0 or drone.heard_at > time_ns:  # it came first, or the clock was set back
+            drone.heard_at = time_ns
+        age = 1e-9 * (time_ns - drone.heard_at)
+        stamp, setpoint = drone.setpoint
+        mode = FOLLOWING if age <= HOLD_AFTER else HOLDING if age <= LAND_AFTER else SILENT
+        if mode != drone.mode:
+            if mode != FOLLOWING or drone.mode == SILENT:
+                self._say(f"drone {i}: {mode}" + ("" if mode == FOLLOWING else f", no set-point for {age:.2f} s"))
+            if drone.mode == SILENT:
+                drone.control.restart()
+            drone.mode = mode
+        if mode == SILENT:
+            return None
+        if mode == HOLDING:
+            still = np.where(np.isfinite(setpoint.position), 0.0, setpoint.velocity)
+            return setpoint._replace(velocity=still, acceleration=drone.control.carried, yaw_rate=0.0)
+        ahead = 1e-9 * (time_ns - stamp) if stamp else 0.0
+        ahead = ahead if 0.0 <= ahead <= HOLD_AFTER else 0.0  # a clock of its own
+        moved = np.where(np.isfinite(setpoint.velocity), setpoint.velocity, 0.0)
+        return setpoint._replace(position=setpoint.position + ahead * moved)
+
+
+def _of(drone: int, numbers: Numbers) -> Numbers:
+    """Return a tuple of arrays whose first axis is that of the drones for one of them."""
+    return type(numbers)(*(each[drone : drone + 1] if isinstance(each, np.ndarray) else each for each in numbers))
