@@ -309,7 +309,7 @@ class PolicyNode:
             self._publish(reference.command[0], reference.command_yaw[0])
             return True
         self.team.advance()
-        motion = reference.velocity[0], reference.acceleration[0], reference.yaw_rate[0]
+        motion = reference.velocity[0], reference.acceleration[0], reference.yaw_rate[0], reference.jerk[0]
         self._publish(reference.position[0], reference.yaw[0], *motion)
         return True
 
@@ -324,14 +324,16 @@ class PolicyNode:
 
     def _publish(
         self, places: np.ndarray, yaws: np.ndarray, velocities: np.ndarray | None = None,
-        accelerations: np.ndarray | None = None, yaw_rates: np.ndarray | None = None,
+        accelerations: np.ndarray | None = None, yaw_rates: np.ndarray | None = None, jerks: np.ndarray | None = None,
     ) -> None:  # fmt: skip
         """Publish set-points; of PX4s with what the drones carry added to their accelerations."""
         still, store = np.zeros_like(places), self._node.store
         # A plan knows the force on each cable, its drag included; else it is the formation's.
         planned = velocities is not None and self.team.controller.interface.commands_force
         force = (self.team.controller.commanded_force if planned else self.team.task.planned.cable_force)[0]
-        velocities, accelerations = (still if each is None else each for each in (velocities, accelerations))
+        velocities, accelerations, jerks = (
+            still if each is None else each for each in (velocities, accelerations, jerks)
+        )
         yaw_rates = np.zeros(len(places)) if yaw_rates is None else yaw_rates
         newest = int(self._bodies.arrivals.argmax())
         # By the clock of the measurements, carried on by this machine's since the newest came.
@@ -340,7 +342,9 @@ class PolicyNode:
             if self._names.is_report:
                 through = still[i] if planned else velocities[i]
                 rise = self._feedforward.acceleration(i, through, accelerations[i], force[i], yaws[i])
-                setpoint = trajectory_setpoint(store, now, places[i], velocities[i], rise, yaws[i], yaw_rates[i])
+                jerk = self._feedforward.jerk(i, jerks[i])
+                motion = places[i], velocities[i], rise, yaws[i], yaw_rates[i], jerk
+                setpoint = trajectory_setpoint(store, now, *motion)
                 messages = [control_mode(store, now), setpoint] if self._receiver == PX4 else [setpoint]
             else:
                 messages = [pose_stamped(store, now, places[i], level(yaws[i]))]
