@@ -130,7 +130,7 @@ class Flight:
         except _LandNow as why:
             self._say(f"{why}: back, and landing")
             if way is self._task:
-                begin = self._here()
+                begin, self.stage = self._here(), Stage.HOVER
                 self._begin("stop", way)
                 self._rest(way, begin, 0.0, HOLD, "stop")
             self._end(self._return(way, begin))
