@@ -91,7 +91,7 @@ def full_state(
     """Return a `FullState`: position, velocity and acceleration in the world, a heading from east, its rate.
 
     The attitude is level and turns about the vertical, as Crazyswarm2's own scripts have it: of the attitude, the
-    firmware's controllers use the heading alone.
+    firmware's controllers use the heading alone. The radio carries each number as 16 bits of 1/1000, up to 32.767.
     """
     turning = _vector(store, np.array([0.0, 0.0, yaw_rate]))
     return store.types[FULL_STATE](
