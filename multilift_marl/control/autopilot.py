@@ -37,3 +37,12 @@ class LoadFeedforward:
         # Into the axes of a level drone of this heading, and back.
         drag = np.array(turn(c, s, tuple(self._drag[drone] * turn(c, -s, tuple(velocity)))))
         return acceleration + (self._load_share[drone] * acceleration + cable_force + drag) / self._mass[drone]
+
+    def jerk(self, drone: int, jerk: np.ndarray) -> np.ndarray:
+        """Return the jerk (3,) [m/s³] by which the acceleration asked for of a drone changes where cables keep theirs.
+
+        Args:
+            drone: its number.
+            jerk: of its reference (3,) [m/s³].
+        """
+        return np.asarray((1.0 + self._load_share[drone] / self._mass[drone]) * jerk)

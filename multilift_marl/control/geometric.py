@@ -58,6 +58,17 @@ def desired_rates(attitude, force, force_rate, yaw, yaw_rate):
 
 
 @kernel
+def attitude_error(attitude, desired, desired_rate):
+    """Return e_R of eq 31, and Ω_d in the body frame, Rᵀ R_d Ω_d; arguments are those of `attitude_torque`."""
+    # e_R = ½ (R_dᵀ R - Rᵀ R_d)^∨: the antisymmetric part of `error`, whose (2,1), (0,2), (1,0) entries less their
+    # mirror images are the three components.
+    error = matmul(transpose(desired), attitude)
+    e_r = (0.5 * (error[7] - error[5]), 0.5 * (error[2] - error[6]), 0.5 * (error[3] - error[1]))
+    # e_Ω = Ω - Rᵀ R_d Ω_d: Ω_d is in the desired frame and must be brought into the body's.
+    return e_r, mul(transpose(error), desired_rate)
+
+
+@kernel
 def attitude_torque(attitude, rates, desired, desired_rate, g):
     """Return the torque M of eqs 31-32 with Ω̇_d = 0 [N m].
 
@@ -66,12 +77,7 @@ def attitude_torque(attitude, rates, desired, desired_rate, g):
         rates, desired_rate: Ω and Ω_d in their own frames [rad/s].
         g: DroneGains.
     """
-    # e_R = ½ (R_dᵀ R - Rᵀ R_d)^∨ (eq 31): the antisymmetric part of `error`, whose (2,1), (0,2), (1,0) entries less
-    # their mirror images are the three components.
-    error = matmul(transpose(desired), attitude)
-    e_r = (0.5 * (error[7] - error[5]), 0.5 * (error[2] - error[6]), 0.5 * (error[3] - error[1]))
-    # e_Ω = Ω - Rᵀ R_d Ω_d: Ω_d is in the desired frame and must be brought into the body's.
-    rotated = mul(transpose(error), desired_rate)
+    e_r, rotated = attitude_error(attitude, desired, desired_rate)
     e_w = sub(rates, rotated)
     momentum = (g.inertia[0] * rates[0], g.inertia[1] * rates[1], g.inertia[2] * rates[2])
     gyroscopic = cross(rates, momentum)
@@ -166,22 +172,32 @@ def thrust_along(force, attitude):
 
 
 @kernel
-def command_attitude(lo, hi, state, reference, cable_force, desired, total, g):
-    """Compute attitudes and total thrusts with which drones follow their references, for autopilots that take these.
+def command_attitude(lo, hi, state, reference, cable_force, desired, rates, total, g):
+    """Compute attitudes, body rates and total thrusts by which drones follow their references, for autopilots.
+
+    The rates are those at which the torque of eq 32 vanishes but for the gyroscopic part: Rᵀ R_d Ω_d - k_R/k_Ω e_R.
 
     Args:
         lo, hi: the environments.
         state, reference, cable_force, g: see `fly`.
         desired: written, (E, N, 3, 3).
+        rates: written, (E, N, 3) body frame [rad/s].
         total: written, (E, N) [N].
     """
     for e in range(lo, hi):
         for n in range(total.shape[1]):
-            force = following_force(e, n, state, reference, vec(cable_force, e, n), drone_gains(g, n))
+            d = drone_gains(g, n)
+            attitude = mat(state.drone_rotation, e, n)
+            force = following_force(e, n, state, reference, vec(cable_force, e, n), d)
             frame = thrust_frame(force, reference.yaw[e, n])
+            force_rate = scale(d.mass + d.load_share, vec(reference.jerk, e, n))
+            turning = desired_rates(frame, force, force_rate, reference.yaw[e, n], reference.yaw_rate[e, n])
+            e_r, turning = attitude_error(attitude, frame, turning)
             for k in range(9):
                 desired[e, n, k // 3, k % 3] = frame[k]
-            total[e, n] = thrust_along(force, mat(state.drone_rotation, e, n))
+            for k in range(3):
+                rates[e, n, k] = turning[k] - d.k_R[k] / d.k_w[k] * e_r[k]
+            total[e, n] = thrust_along(force, attitude)
 
 
 @kernel

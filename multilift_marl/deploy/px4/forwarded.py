@@ -39,6 +39,9 @@ class ForwardedSetpoints(TopicAutopilots):
 
     def _send(self, i: int) -> None:
         setpoint = self._setpoints[i]
+        if setpoint.rates is not None:
+            self._team.send_rates(i, setpoint.rates, setpoint.thrust * self._full_thrust[i])
+            return
         if setpoint.attitude is not None:
             self._team.send_attitude(i, setpoint.attitude, setpoint.thrust, setpoint.yaw_rate)
             return

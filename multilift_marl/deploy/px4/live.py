@@ -13,7 +13,7 @@ from multilift_marl.deploy.px4.team import AutopilotTeam
 from multilift_marl.deploy.ros.answers import Answers, Waiting
 from multilift_marl.deploy.ros.autopilots import subscribe_px4
 from multilift_marl.deploy.ros.dds import Node
-from multilift_marl.deploy.ros.failsafe import is_landing
+from multilift_marl.deploy.ros.failsafe import LAND_AFTER
 from multilift_marl.deploy.ros.live import LivePublisher, SetPoints, subscribe_setpoints
 from multilift_marl.deploy.ros.messages import INT32, NAMES, Topic
 from multilift_marl.deploy.ros.stages import Orders, Stage
@@ -81,9 +81,11 @@ class LiveTeam(Orders):
         self._hear_orders()
         if (ended := np.flatnonzero(self._ordered_stages >= Stage.END)).size:
             return f"/state/command_drone_{ended[0]} orders {int(self._ordered_stages[ended[0]])}"
-        if self.answers is not None and (lost := np.flatnonzero(is_landing(self.answers.age))).size:
+        # The first ones have been waited for.
+        if self.answers is not None and (lost := np.flatnonzero(self.answers.age > LAND_AFTER)).size:
             age = float(self.answers.age[lost[0]])
-            return f"no set-point of drone {lost[0]} has come for {age:.1f} s"
+            since = f" for {age:.1f} s" if np.isfinite(age) else ""
+            return f"no set-point of drone {lost[0]} has come{since}"
         return ""
 
     def _hear_orders(self) -> None:

@@ -69,6 +69,9 @@ class Options(CommandOptions):
     receiver: Literal["px4", "geometric_control"] = Field(
         "px4", description="of a planner's set-points with names=report: PX4 itself, or a geometric-control node"
     )
+    output: Literal["attitude", "rates"] = Field(
+        "attitude", description="of geometric control, with thrust: attitudes, or body rates"
+    )
     drones: list[Int] | None = Field(None, description="with role=geometric_control: which it controls; None: all")
     patience: Annotated[Float, Between(0, 600, "s")] = Field(
         0.0,
@@ -182,7 +185,8 @@ def _control(options: Options, config: Config, node: Node, ending: str) -> None:
     from multilift_marl.deploy.ros.geometric_node import GeometricControlNode
 
     say = partial(print, flush=True)
-    control = GeometricControlNode(config, node, str(options.names), options.drones, options.patience, say)
+    by_rates = options.output == "rates"
+    control = GeometricControlNode(config, node, str(options.names), options.drones, options.patience, by_rates, say)
     print(f"listening {ending}", flush=True)
     with suppress(KeyboardInterrupt):
         control.spin(options.seconds or float("inf"))

@@ -12,17 +12,19 @@ from multilift_marl.config.config import Config
 from multilift_marl.control.action_interface import Call
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.formation import Goal, Reference
-from multilift_marl.control.geometric import fly
+from multilift_marl.control.geometric import fly, fly_rates
 from multilift_marl.deploy.ros.answers import Answers, Take, Waiting
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, is_landing, sink
 from multilift_marl.deploy.ros.messages import Topic
 from multilift_marl.deploy.ros.types import (
     ATTITUDE,
+    RATES,
     TRAJECTORY,
     PX4Setpoint,
     px4_namespace,
     read_attitude,
+    read_rates,
     read_trajectory,
 )
 from multilift_marl.kernels.jit import bind
@@ -32,7 +34,7 @@ from multilift_marl.sim.world import World
 
 
 def subscribe_px4(node: Node, system: System) -> list[Take]:
-    """Return for each drone what takes the set-points of either kind, with their stamps, in order."""
+    """Return for each drone what takes the set-points of all kinds, with their stamps, in order."""
     return [_subscribe(node, i, 4 * each.rotor_thrust_max / each.mass) for i, each in enumerate(system.vehicles)]
 
 
@@ -40,6 +42,7 @@ def _subscribe(node: Node, drone: int, full_acceleration: float) -> Take:
     reads: dict[tuple[str, str], Callable[[Any], PX4Setpoint]] = {
         ("trajectory_setpoint", TRAJECTORY): read_trajectory,
         ("vehicle_attitude_setpoint_v1", ATTITUDE): partial(read_attitude, full_acceleration=full_acceleration),
+        ("vehicle_rates_setpoint", RATES): read_rates,
     }
     sources = [
         node.subscription(Topic(f"{px4_namespace(drone)}/in/{name}", kind, False), partial(read_stamped, read))
@@ -49,7 +52,8 @@ def _subscribe(node: Node, drone: int, full_acceleration: float) -> Take:
     def take() -> list[tuple[int, PX4Setpoint]]:
         found = [each for source in sources for each in source()]
         # What asks for nothing does not count.
-        return sorted((each for each in found if np.isfinite(each[1][:3]).any()), key=lambda pair: pair[0])
+        asking = [each for each in found if each[1].rates is not None or np.isfinite(each[1][:3]).any()]
+        return sorted(asking, key=lambda pair: pair[0])
 
     return take
 
@@ -72,7 +76,7 @@ def write_reference(
         reference: written.
         dt: until the next call.
     """
-    position, velocity, acceleration, yaw, yaw_rate, *_ = setpoint
+    position, velocity, acceleration, yaw, yaw_rate = setpoint[:5]
     placed, moving = np.isfinite(position), np.isfinite(velocity)
     reference.acceleration[0, i] = np.where(np.isfinite(acceleration), acceleration, carried)
     still = np.where(placed, 0.0, state.drone_velocity[0, i])
@@ -82,7 +86,7 @@ def write_reference(
     if np.isfinite(yaw):
         reference.yaw[0, i] = yaw
     reference.yaw_rate[0, i] = yaw_rate if np.isfinite(yaw_rate) else 0.0
-    reference.jerk[0, i] = 0.0
+    reference.jerk[0, i] = np.where(np.isfinite(setpoint.jerk), setpoint.jerk, 0.0)
 
 
 class TopicAutopilots(Controller):
@@ -109,6 +113,8 @@ class TopicAutopilots(Controller):
         alone = {name: np.zeros_like(getattr(self.gains, name)) for name in ("load_share", "drag")}
         self._drone_gains = self.gains._replace(**alone)
         self._setpoints: list[PX4Setpoint] = []
+        self._thrust_by_rates = np.zeros_like(world.thrust)
+        self._full_thrust = np.array([4 * vehicle.rotor_thrust_max for vehicle in world.system.vehicles])
         self._cable_force = np.zeros((1, world.num_drones, 3))  # of the task, live
         self._dt, self._step = 1.0 / config.sim.control_hz, 1.0 / config.env.policy_hz
 
@@ -117,9 +123,11 @@ class TopicAutopilots(Controller):
     ) -> tuple[Call, tuple[Call, ...]]:
         """See `Controller.bind`; actions do not count."""
         self._cable_force = goal.cable_force
-        own = self.world.state, self.reference, np.zeros_like(goal.cable_force), self.world.thrust
-        fly_alone = bind(fly, lo, hi, *own, self._drone_gains, None)
-        return self._hear, (*(() if plan is None else (plan,)), self._follow, fly_alone)
+        state, none, thrust = self.world.state, np.zeros_like(goal.cable_force), self.world.thrust
+        self._fly = bind(fly, lo, hi, state, self.reference, none, thrust, self._drone_gains, None)
+        by_rates = state, self._setpoint, none, self._thrust_by_rates
+        self._fly_rates = bind(fly_rates, lo, hi, *by_rates, self._drone_gains)
+        return self._hear, (*(() if plan is None else (plan,)), self._follow, self._control)
 
     def start(self, e: int) -> None:
         """Hold the places where the drones are, until they hear otherwise."""
@@ -154,3 +162,14 @@ class TopicAutopilots(Controller):
         """Write the references of a control tick, and let the places of moving set-points move on."""
         for i, setpoint in enumerate(self._setpoints):
             write_reference(i, setpoint, self._carried(i), self.state, self.reference, self._dt)
+
+    def _control(self) -> None:
+        """Write the thrusts of a control tick."""
+        self._fly()
+        asked = {i: each for i, each in enumerate(self._setpoints) if each.rates is not None}
+        for i, setpoint in asked.items():
+            self._setpoint.rates[0, i] = setpoint.rates
+            self._setpoint.thrust[0, i] = setpoint.thrust * self._full_thrust[i]
+        if asked:
+            self._fly_rates()
+            self.world.thrust[0, list(asked)] = self._thrust_by_rates[0, list(asked)]

@@ -1,4 +1,4 @@
-"""A node that hears odometry and trajectory set-points of drones, and asks for attitudes and thrusts: eqs 25-28."""
+"""A node from odometry and trajectory set-points of drones to attitudes, or body rates, and thrusts: eqs 25-32."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER
 from multilift_marl.deploy.ros.messages import NAMES, Topic, control_topics
 from multilift_marl.deploy.ros.types import (
+    ATTITUDE,
+    RATES,
     VEHICLE_ODOMETRY,
     Motion,
     PX4Setpoint,
     attitude_setpoint,
     control_mode,
     px4_namespace,
+    rates_setpoint,
     read_measurement,
     read_trajectory,
     read_vehicle_odometry,
@@ -52,6 +55,7 @@ class DroneControl:
 
     Attributes:
         desired: attitude (3, 3), of the last call.
+        rates: (3,) at which to turn to it [rad/s].
         share: of the largest thrust, of the last call.
     """
 
@@ -68,7 +72,7 @@ class DroneControl:
             self._reject = REJECTIONS[control.disturbance]
         self._state, self._reference = SystemState.zeros(1, 1), Reference.zeros(1, 1)
         self._disturbance, self._nominal = Disturbance.zeros(1, 1), np.zeros((1, 1, 3))
-        self._desired, self._total = np.zeros((1, 1, 3, 3)), np.zeros((1, 1))
+        self._desired, self._rates, self._total = np.zeros((1, 1, 3, 3)), np.zeros((1, 1, 3)), np.zeros((1, 1))
         # What holds the load up, without the formation's pull to the side.
         self.carried = np.array([0.0, 0.0, system.hook_force[drone, 2] / system.drone_mass[drone]])
         self.restart()
@@ -87,7 +91,7 @@ class DroneControl:
             elapsed: since the last call [s].
         """
         state = self._state
-        state.drone_position[0, 0], state.drone_rotation[0, 0], state.drone_velocity[0, 0], _ = motion
+        state.drone_position[0, 0], state.drone_rotation[0, 0], state.drone_velocity[0, 0] = motion[:3]
         write_reference(0, setpoint, self.carried, state, self._reference, 0.0)
         force = self._nominal
         if self._reject is not None:
@@ -97,12 +101,17 @@ class DroneControl:
             paced = self._rejection._replace(dt=min(elapsed, _STALE))
             self._reject(0, 1, state, self._reference, self._nominal, self._disturbance, paced)
             force = self._disturbance.cable_force
-        command_attitude(0, 1, state, self._reference, force, self._desired, self._total, self._gains)
+        command_attitude(0, 1, state, self._reference, force, self._desired, self._rates, self._total, self._gains)
 
     @property
     def desired(self) -> np.ndarray:
         """See above."""
         return self._desired[0, 0]
+
+    @property
+    def rates(self) -> np.ndarray:
+        """See above."""
+        return self._rates[0, 0]
 
     @property
     def share(self) -> float:
@@ -113,14 +122,14 @@ class DroneControl:
 class _Drone:
     """What a node knows of one drone."""
 
-    def __init__(self, config: Config, drone: int, node: Node, names: str):
+    def __init__(self, config: Config, drone: int, node: Node, names: str, by_rates: bool):
         self.control = DroneControl(config, drone)
         topic = Topic(f"{px4_namespace(drone)}/out/vehicle_odometry", VEHICLE_ODOMETRY, False)
         self.take_odometry = node.subscription(topic, partial(read_measurement, read_vehicle_odometry))
         asked = control_topics(NAMES[names], drone)[0]
         self.take_setpoints = node.subscription(asked._replace(reliable=False), partial(read_stamped, read_trajectory))
-        attitude, mode = control_topics(NAMES[names], drone)[1:]
-        self.publish, self.publish_mode = node.publisher(attitude), node.publisher(mode)
+        command, mode = control_topics(NAMES[names], drone, by_rates)[1:]
+        self.publish, self.publish_mode = node.publisher(command), node.publisher(mode)
         self.mode = SILENT
         self.measured: tuple[int, Motion] | None = None
         self.arrived = 0.0
@@ -130,7 +139,7 @@ class _Drone:
 
 
 class GeometricControlNode:
-    """Controls drones of PX4 by attitude and thrust, one answer for each odometry.
+    """Controls drones of PX4 by attitude or body rates, and thrust, one answer for each odometry.
 
     Set-points move on by their velocities to the time of the odometry. A drone without a fresh one holds the last
     place, and after 2 s nothing more is said of it: its autopilot has a fail-safe of its own.
@@ -141,6 +150,7 @@ class GeometricControlNode:
         names: of the topics, those of a workspace with PX4s.
         drones: which; None: all.
         patience: for the set-point that belongs to an odometry [s].
+        by_rates: whether body rates are asked for in place of attitudes.
         say: called with what happens.
 
     Attributes:
@@ -152,7 +162,7 @@ class GeometricControlNode:
 
     def __init__(
         self, config: Config, node: Node, names: str = "report", drones: list[int] | None = None,
-        patience: float = 0.0, say: Say = print,
+        patience: float = 0.0, by_rates: bool = False, say: Say = print,
     ):  # fmt: skip
         if not NAMES[names].is_report:
             raise ConfigError(f"role=geometric_control flies drones of PX4, of names=report, not of names={names}")
@@ -165,8 +175,8 @@ class GeometricControlNode:
         chosen = range(count) if drones is None else drones
         if wrong := [drone for drone in chosen if not 0 <= drone < count]:
             raise ConfigError(f"drones={wrong} are none of this team, which has 0 to {count - 1}")
-        self._drones = {i: _Drone(config, i, node, names) for i in chosen}
-        self._node, self._patience, self._say = node, patience, say
+        self._drones = {i: _Drone(config, i, node, names, by_rates) for i in chosen}
+        self._node, self._patience, self._by_rates, self._say = node, patience, by_rates, say
         self.latency = deque[float](maxlen=_REMEMBERED)
         self.steps = 0
         self._warm_up()
@@ -221,10 +231,13 @@ class GeometricControlNode:
         if setpoint is None:
             return
         drone.control.follow(motion, setpoint, max(elapsed, 0.0))
-        turning = 0.0 if np.isnan(setpoint.yaw_rate) else setpoint.yaw_rate
-        store = self._node.store
-        drone.publish_mode(control_mode(store, time_ns, attitude=True))
-        drone.publish(attitude_setpoint(store, time_ns, drone.control.desired, drone.control.share, turning))
+        store, control = self._node.store, drone.control
+        drone.publish_mode(control_mode(store, time_ns, RATES if self._by_rates else ATTITUDE))
+        if self._by_rates:
+            drone.publish(rates_setpoint(store, time_ns, control.rates, control.share))
+        else:
+            turning = 0.0 if np.isnan(setpoint.yaw_rate) else setpoint.yaw_rate
+            drone.publish(attitude_setpoint(store, time_ns, control.desired, control.share, turning))
         self.latency.append(time.perf_counter() - drone.arrived)
         self.steps += 1
 
@@ -247,7 +260,7 @@ class GeometricControlNode:
             return None
         if mode == HOLDING:
             still = np.where(np.isfinite(setpoint.position), 0.0, setpoint.velocity)
-            return setpoint._replace(velocity=still, acceleration=drone.control.carried, yaw_rate=0.0)
+            return setpoint._replace(velocity=still, acceleration=drone.control.carried, yaw_rate=0.0, jerk=np.zeros(3))
         ahead = 1e-9 * (time_ns - stamp) if stamp else 0.0
         ahead = ahead if 0.0 <= ahead <= HOLD_AFTER else 0.0  # a clock of its own
         moved = np.where(np.isfinite(setpoint.velocity), setpoint.velocity, 0.0)

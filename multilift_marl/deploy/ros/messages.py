@@ -22,6 +22,7 @@ from multilift_marl.deploy.ros.types import (
     FULL_STATE,
     LOCAL_POSITION,
     NAMED_POSES,
+    RATES,
     TRAJECTORY,
     VEHICLE_ODOMETRY,
     Motion,
@@ -97,11 +98,12 @@ def setpoint_topics(names: Names, drone: int) -> list[Topic]:
     return [Topic(f"{px4_namespace(drone)}/in/{name}", kind) for name, kind in topics.items()]
 
 
-def control_topics(names: Names, drone: int) -> list[Topic]:
-    """Return what a geometric-control node hears for a drone, then what it says: its attitude, PX4's mode."""
+def control_topics(names: Names, drone: int, by_rates: bool = False) -> list[Topic]:
+    """Return what a geometric-control node hears for a drone, then what it says: attitude or rates, PX4's mode."""
+    name, kind = ("vehicle_rates_setpoint", RATES) if by_rates else ("vehicle_attitude_setpoint_v1", ATTITUDE)
     return [
         Topic(f"/drone_{names.first + drone}/trajectory_setpoint", TRAJECTORY),
-        Topic(f"{px4_namespace(drone)}/in/vehicle_attitude_setpoint_v1", ATTITUDE),
+        Topic(f"{px4_namespace(drone)}/in/{name}", kind),
         Topic(f"{px4_namespace(drone)}/in/offboard_control_mode", CONTROL_MODE),
     ]
 

@@ -316,7 +316,7 @@ class PolicyNode:
             self._publish(reference.command[0], reference.command_yaw[0])
             return True
         self.team.advance()
-        motion = reference.velocity[0], reference.acceleration[0], reference.yaw_rate[0]
+        motion = reference.velocity[0], reference.acceleration[0], reference.yaw_rate[0], reference.jerk[0]
         self._publish(reference.position[0], reference.yaw[0], *motion)
         return True
 
@@ -331,14 +331,16 @@ class PolicyNode:
 
     def _publish(
         self, places: np.ndarray, yaws: np.ndarray, velocities: np.ndarray | None = None,
-        accelerations: np.ndarray | None = None, yaw_rates: np.ndarray | None = None,
+        accelerations: np.ndarray | None = None, yaw_rates: np.ndarray | None = None, jerks: np.ndarray | None = None,
     ) -> None:  # fmt: skip
         """Publish set-points; those with accelerations have what the drones carry added to them."""
         still, store = np.zeros_like(places), self._node.store
         # A plan knows the force on each cable, its drag included; else it is the formation's.
         planned = velocities is not None and self.team.controller.interface.commands_force
         force = (self.team.controller.commanded_force if planned else self.team.task.planned.cable_force)[0]
-        velocities, accelerations = (still if each is None else each for each in (velocities, accelerations))
+        velocities, accelerations, jerks = (
+            still if each is None else each for each in (velocities, accelerations, jerks)
+        )
         yaw_rates = np.zeros(len(places)) if yaw_rates is None else yaw_rates
         newest = int(self._bodies.arrivals.argmax())
         # By the clock of the measurements, carried on by this machine's since the newest came.
@@ -349,10 +351,13 @@ class PolicyNode:
             else:
                 through = still[i] if planned else velocities[i]
                 rise = self._feedforward.acceleration(i, through, accelerations[i], force[i], yaws[i])
-                make = trajectory_setpoint if self._names.is_report else full_state
-                messages = [make(store, now, places[i], velocities[i], rise, yaws[i], yaw_rates[i])]
-                if self._names.is_report and self._receiver == PX4:
-                    messages.insert(0, control_mode(store, now))
+                motion = places[i], velocities[i], rise, yaws[i], yaw_rates[i]
+                if self._names.is_report:
+                    jerk = self._feedforward.jerk(i, jerks[i])
+                    setpoint = trajectory_setpoint(store, now, *motion, jerk)
+                    messages = [control_mode(store, now), setpoint] if self._receiver == PX4 else [setpoint]
+                else:
+                    messages = [full_state(store, now, *motion)]
             for publish, message in zip(publishers, messages, strict=True):
                 publish(message)
         self._setpoints, self._sent = (places.copy(), yaws.copy()), self._woken

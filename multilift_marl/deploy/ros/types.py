@@ -19,7 +19,7 @@ from multilift_marl.sim.earth import swap_attitude, swap_enu_ned, swap_flu_frd, 
 
 VEHICLE_ODOMETRY, LOCAL_POSITION = "px4_msgs/msg/VehicleOdometry", "px4_msgs/msg/VehicleLocalPosition"
 TRAJECTORY, ATTITUDE = "px4_msgs/msg/TrajectorySetpoint", "px4_msgs/msg/VehicleAttitudeSetpoint"
-CONTROL_MODE = "px4_msgs/msg/OffboardControlMode"
+RATES, CONTROL_MODE = "px4_msgs/msg/VehicleRatesSetpoint", "px4_msgs/msg/OffboardControlMode"
 FULL_STATE = "crazyflie_interfaces/msg/FullState"
 NAMED_POSE, NAMED_POSES = (f"motion_capture_tracking_interfaces/msg/{name}" for name in ("NamedPose", "NamedPoseArray"))
 WORLD = "world"
@@ -66,6 +66,12 @@ _FIELDS = {
         float32 yaw_sp_move_rate
         float32[4] q_d
         float32[3] thrust_body""",
+    RATES: """uint64 timestamp
+        float32 roll
+        float32 pitch
+        float32 yaw
+        float32[3] thrust_body
+        bool reset_integral""",
     CONTROL_MODE: """uint64 timestamp
         bool position
         bool velocity
@@ -214,14 +220,17 @@ def local_position(store: Typestore, time_ns: int, motion: Motion) -> Any:
 
 def trajectory_setpoint(
     store: Typestore, time_ns: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float,
-    yaw_rate: float = np.nan,
+    yaw_rate: float = np.nan, jerk: np.ndarray | None = None,
 ) -> Any:  # fmt: skip
-    """Return PX4's `TrajectorySetpoint` of a motion in ENU, a heading from east, and how fast it turns."""
+    """Return PX4's `TrajectorySetpoint` of a motion in ENU, a heading from east, how fast it turns, and its jerk."""
     place, speed, rise = (_single(swap_enu_ned(vector)) for vector in (position, velocity, acceleration))
     return store.types[TRAJECTORY](
         timestamp=time_ns // 1000, position=place, velocity=speed, acceleration=rise,
-        jerk=np.full(3, np.nan, np.float32), yaw=float(swap_yaw(yaw)), yawspeed=-float(yaw_rate),
+        jerk=_single(NONE if jerk is None else swap_enu_ned(jerk)), yaw=float(swap_yaw(yaw)), yawspeed=-float(yaw_rate),
     )  # fmt: skip
+
+
+NONE = np.full(3, np.nan)
 
 
 class PX4Setpoint(NamedTuple):
@@ -240,15 +249,20 @@ class PX4Setpoint(NamedTuple):
     attitude: np.ndarray | None = None
     """(3, 3) of one of attitude and thrust, of which the acceleration follows."""
     thrust: float = np.nan
-    """Of that one, 0 to 1 of the largest."""
+    """Of that one, or of one of body rates, 0 to 1 of the largest."""
+    jerk: np.ndarray = NONE
+    """(3,) [m/s³]."""
+    rates: np.ndarray | None = None
+    """(3,) of one of body rates and thrust, FLU [rad/s]."""
 
 
 def read_trajectory(message: Any) -> PX4Setpoint:
     """Return what a `TrajectorySetpoint` asks for, a ValueError where numbers are none."""
-    vectors = np.stack([message.position, message.velocity, message.acceleration])
+    vectors = np.stack([message.position, message.velocity, message.acceleration, message.jerk])
     check_numbers(vectors, message.yaw, message.yawspeed, missing=True)
-    position, velocity, acceleration = swap_enu_ned(vectors)
-    return PX4Setpoint(position, velocity, acceleration, float(swap_yaw(message.yaw)), -float(message.yawspeed))
+    position, velocity, acceleration, jerk = swap_enu_ned(vectors)
+    yaw, turning = float(swap_yaw(message.yaw)), -float(message.yawspeed)
+    return PX4Setpoint(position, velocity, acceleration, yaw, turning, jerk=jerk)
 
 
 def read_attitude(message: Any, full_acceleration: float) -> PX4Setpoint:
@@ -271,6 +285,23 @@ def read_attitude(message: Any, full_acceleration: float) -> PX4Setpoint:
     return PX4Setpoint(none, none, acceleration, _yaw(rotation), turning, rotation, thrust)
 
 
+def read_rates(message: Any) -> PX4Setpoint:
+    """Return what a `VehicleRatesSetpoint` asks for, a ValueError where numbers are none."""
+    rates = np.array([message.roll, message.pitch, message.yaw], float)
+    check_numbers(rates, message.thrust_body[2])
+    thrust = float(np.clip(-float(message.thrust_body[2]), 0.0, 1.0))
+    return PX4Setpoint(NONE.copy(), NONE, NONE, np.nan, thrust=thrust, rates=swap_flu_frd(rates))
+
+
+def rates_setpoint(store: Typestore, time_ns: int, rates: np.ndarray, thrust: float) -> Any:
+    """Return PX4's `VehicleRatesSetpoint` of body rates (3,) FLU [rad/s], and a share of the largest thrust."""
+    roll, pitch, yaw = swap_flu_frd(rates).tolist()
+    return store.types[RATES](
+        timestamp=time_ns // 1000, roll=roll, pitch=pitch, yaw=yaw, thrust_body=_single([0.0, 0.0, -thrust]),
+        reset_integral=False,
+    )  # fmt: skip
+
+
 def attitude_setpoint(store: Typestore, time_ns: int, rotation: np.ndarray, thrust: float, yaw_rate: float) -> Any:
     """Return PX4's `VehicleAttitudeSetpoint` of an attitude (3, 3), a share of the largest thrust, and a yaw rate."""
     return store.types[ATTITUDE](
@@ -279,11 +310,12 @@ def attitude_setpoint(store: Typestore, time_ns: int, rotation: np.ndarray, thru
     )  # fmt: skip
 
 
-def control_mode(store: Typestore, time_ns: int, attitude: bool = False) -> Any:
-    """Return PX4's `OffboardControlMode` that goes with positions, velocities and accelerations, or with attitudes."""
+def control_mode(store: Typestore, time_ns: int, kind: str = TRAJECTORY) -> Any:
+    """Return PX4's `OffboardControlMode` that goes with a kind of set-points: TRAJECTORY, ATTITUDE, RATES."""
+    moves = kind == TRAJECTORY
     return store.types[CONTROL_MODE](
-        timestamp=time_ns // 1000, position=not attitude, velocity=not attitude, acceleration=not attitude,
-        attitude=attitude, body_rate=False, thrust_and_torque=False, direct_actuator=False,
+        timestamp=time_ns // 1000, position=moves, velocity=moves, acceleration=moves, attitude=kind == ATTITUDE,
+        body_rate=kind == RATES, thrust_and_torque=False, direct_actuator=False,
     )  # fmt: skip
 
 
