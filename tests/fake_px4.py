@@ -16,6 +16,7 @@ import numpy as np
 from multilift_marl.deploy.px4.link import PORT
 from multilift_marl.deploy.px4.mavlink import MAVLink, Splitter, mavlink
 from multilift_marl.deploy.px4.offboard import OWN_PORT, PX4_PORT
+from multilift_marl.math3d import mat_to_quat, quat_to_mat
 from multilift_marl.sim.earth import project_local
 
 HOST = "127.0.0.1"
@@ -79,7 +80,7 @@ class FakePX4(threading.Thread):
         self.times: list[int] = []
         self.armed = self.offboard = False
         self._position = self._velocity = self._origin = None
-        self._attitude = np.eye(3)
+        self._attitude, self._rates = np.eye(3), np.zeros(3)
         self._sensed = 0
         self._end = threading.Event()
         self._mavlink = MAVLink(index + 1, 1)
@@ -155,6 +156,8 @@ class FakePX4(threading.Thread):
         self.answers += 1
         if self.answers % 25 == 0:
             self._report(sensors.time_usec)
+        if self.answers % 5 == 0 and self._origin is not None:
+            self._report_motion(sensors.time_usec)
         return True
 
     def _report(self, time_us: int) -> None:
@@ -168,7 +171,18 @@ class FakePX4(threading.Thread):
                     round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3), time_us
                 )
             )
-            messages.append(self._mavlink.local_position_ned_encode(time_us // 1000, *self._position, *self._velocity))
+        self._say(messages)
+
+    def _report_motion(self, time_us: int) -> None:
+        attitude = mat_to_quat(tuple(self._attitude.ravel()))
+        self._say(
+            [
+                self._mavlink.local_position_ned_encode(time_us // 1000, *self._position, *self._velocity),
+                self._mavlink.attitude_quaternion_encode(time_us // 1000, *attitude, *self._rates),
+            ]
+        )
+
+    def _say(self, messages: list) -> None:
         for message in messages:
             self._udp.sendto(message.pack(self._mavlink), (HOST, OWN_PORT + self.index))
 
@@ -243,6 +257,9 @@ class FakePX4(threading.Thread):
         if not self.setpoints or self._position is None:
             return np.full(4, 0.05)
         sp, p = self.setpoints[-1], self.parameters
+        if sp.get_type() == "SET_ATTITUDE_TARGET" and not sp.type_mask & 128:
+            desired = np.array(quat_to_mat(*sp.q)).reshape(3, 3)
+            return self._turn(desired, 4 * p["thrust"] * sp.thrust)
         if sp.get_type() == "SET_ATTITUDE_TARGET":
             wanted = np.array([sp.body_roll_rate, sp.body_pitch_rate, sp.body_yaw_rate])
             torque = np.array(p["inertia"]) * 22.0 * (wanted - self._rates)
@@ -258,9 +275,12 @@ class FakePX4(threading.Thread):
         right = np.cross(down, forward)
         right /= np.linalg.norm(right)
         desired = np.stack([np.cross(right, down), right, down], axis=1)
+        return self._turn(desired, max(-force @ self._attitude[:, 2], 0.0))
+
+    def _turn(self, desired: np.ndarray, lift: float) -> np.ndarray:
+        """Return the motors that turn the drone to an attitude, at a total thrust [N]."""
         error = 0.5 * (desired.T @ self._attitude - self._attitude.T @ desired)
         attitude = np.array([error[2, 1], error[0, 2], error[1, 0]])
-        inertia = np.array(p["inertia"])
+        inertia = np.array(self.parameters["inertia"])
         torque = inertia * (-150.0 * attitude - 22.0 * self._rates) * [1, 1, 0.3]
-        lift = max(-force @ self._attitude[:, 2], 0.0)
         return np.clip(self._mixer @ [lift, *torque], 0.0, 1.0)

@@ -24,10 +24,11 @@ class FullStateCommand:
         vec: environments with the interface `full_state`.
         model: of their teams.
         ahead: time from an observation to when actions are applied [s].
+        anchored: whether set-points begin where drones know themselves to be, rather than where plans do.
     """
 
-    def __init__(self, vec: MultiliftVec, model: TeamModel, ahead: float):
-        self._vec, self._model = vec, model
+    def __init__(self, vec: MultiliftVec, model: TeamModel, ahead: float, anchored: bool = True):
+        self._vec, self._model, self._anchored = vec, model, anchored
         # A goal that moves is a control step further on when the controllers read it.
         self._ahead = ahead + (vec.task.control_dt if vec.task.KERNELS.plan else 0.0)
         self._work = ModelWork.of(vec.num_drones)
@@ -51,11 +52,13 @@ class FullStateCommand:
         vec, goal, gains = self._vec, self._vec.task.planned, self._vec.controller.gains
         own = vec.task.view.estimated
         position, velocity, acceleration = self._drone_motion(states, loads)
-        # Set-points are for what drones know of themselves, which states that fit the whole team may not agree with.
-        was, moved, _ = self._drone_motion(present, loads)
-        off, faster = own.drone_position - was, own.drone_velocity - moved
-        position += np.where(np.isfinite(off), off, 0.0)  # a drone may know nothing for a moment
-        velocity += np.where(np.isfinite(faster), faster, 0.0)
+        if self._anchored:
+            # Set-points are for what drones know of themselves, which states that fit the whole team may not agree
+            # with.
+            was, moved, _ = self._drone_motion(present, loads)
+            off, faster = own.drone_position - was, own.drone_velocity - moved
+            position += np.where(np.isfinite(off), off, 0.0)  # a drone may know nothing for a moment
+            velocity += np.where(np.isfinite(faster), faster, 0.0)
         total = (gains.mass + gains.load_share)[:, None]
         rotors = thrust if vec.config.control.drag_feedforward else thrust + drag
         force = rotors - total * acceleration - gains.mass[:, None] * [0.0, 0.0, GRAVITY]
@@ -86,7 +89,7 @@ class FullStateCommand:
         model, n = self._model, self._vec.num_drones
         count, q = len(states), 6 + 2 * n
         write_tensions(states, model, loads, self._work, self._tension)
-        rotation = _rotations(states[:, 3:6])
+        rotation = rotations(states[:, 3:6])
         arm = np.einsum("eij,nj->eni", rotation, model.anchors)
         rates = np.einsum("eij,ej->ei", rotation, states[:, q + 3 : q + 6])
         level, swing = states[:, 6:q].reshape(count, n, 2), states[:, q + 6 : 2 * q].reshape(count, n, 2)
@@ -110,7 +113,7 @@ def write_tensions(states, model, loads, work, tension):
             tension[e, n] = work.tension[n]
 
 
-def _rotations(angles: np.ndarray) -> np.ndarray:
+def rotations(angles: np.ndarray) -> np.ndarray:
     """Return Rz(yaw) Ry(pitch) Rx(roll) (E, 3, 3) of roll, pitch and yaw (E, 3)."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(angles).T, np.cos(angles).T
     rows = [

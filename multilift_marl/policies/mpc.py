@@ -19,7 +19,7 @@ from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.hard_planner import HardPlanner
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
-from multilift_marl.policies.full_state_command import FullStateCommand
+from multilift_marl.policies.full_state_command import FullStateCommand, rotations
 from multilift_marl.policies.hold import HoldAccRates, HoldFullState
 from multilift_marl.policies.last_plan import LastPlan
 from multilift_marl.sensing.load_sensing import CAMERA_DELAY, CAMERAS
@@ -86,9 +86,14 @@ class TeamMpc:
             share = UNFILTERED if config.env.sensing == "ideal" else SHARE
             self._observer = TeamObserver(self.planner.model, vec.num_envs, share, late)
         lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)
-        self._full_state = None
+        self._full_state, self._feedback = None, settings.feedback
+        if self._feedback < 1.0 and config.control.action != "full_state":
+            raise ConfigError(
+                f"planner.feedback={self._feedback:g} gives drones plans to follow, which control.action="
+                f"{config.control.action} does not; set control.action=full_state, or planner.feedback=1"
+            )
         if config.control.action == "full_state":
-            self._full_state = FullStateCommand(vec, self.planner.model, settings.delay)
+            self._full_state = FullStateCommand(vec, self.planner.model, settings.delay, self._feedback == 1.0)
         self._lead = lag + 0.5 * self._dt if settings.lead is None else settings.lead
         self._drag = np.array([vehicle.drag for vehicle in system.vehicles], float)
         self._lift = np.array([vehicle.thrust_coefficient for vehicle in system.vehicles], float)
@@ -143,6 +148,8 @@ class TeamMpc:
         if self._estimator is not None:
             self._estimator.update(states, self._dt, ~unknown)
         unknown |= self._forget_unsound(states, loads, forces)
+        if self._feedback < 1.0:
+            self._trust_plans(states, payload_rotation, ~(self._fresh | unknown))
         now = vec.task.time[:, None]
         last = np.maximum(now - self._dt, 0.0)
         preview = vec.task.preview_targets
@@ -185,6 +192,14 @@ class TeamMpc:
         self._estimator.estimate.fresh[fresh] = True
         self._estimator.estimate.unknowns[fresh] = 0.0
         return self._estimator.loads, self._estimator.forces
+
+    def _trust_plans(self, states: np.ndarray, payload_rotation: np.ndarray, mask: np.ndarray) -> None:
+        """Let states (E, 12 + 7 N) of the teams in the mask (E,) be those of their last plans, corrected by a share."""
+        planned = self._last.states(self._dt)
+        off = states - planned
+        off[:, 3:6] = np.remainder(off[:, 3:6] + np.pi, 2 * np.pi) - np.pi
+        states[mask] = (planned + self._feedback * off)[mask]
+        payload_rotation[mask] = rotations(states[mask, 3:6])
 
     def _forget_unsound(self, states: np.ndarray, loads: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """Let estimates that are not finite begin anew from planned states; return whose they were (E,)."""

@@ -60,6 +60,11 @@ class PlannerConfig(Section):
         description="[-] of accelerations as measured for that, over gravity; larger: slower; None: 0.5 with "
         "env.sensing=ideal and no observation_noise, else 1",
     )
+    feedback: Annotated[Float, Between(0, 1)] = Field(
+        1.0,
+        description="[-] share of what is measured beside the last plan, by which the start of each plan is corrected; "
+        "below 1, with control.action=full_state, drones that answer late follow plans rather than measurements",
+    )
     delay: Annotated[Float, Between(0, 1, "s")] = Field(
         0.0, description="[s] by which actions and what is measured are late: the plan begins with the state then"
     )

@@ -57,6 +57,7 @@ WAITING, READY, FLYING, HOLDING, LANDING = "waiting", "ready", "flying", "holdin
 _LEAP, _LEAP_ACCELERATION = 0.1, 20.0  # [m], [m/s²]: what is farther off than these was put elsewhere
 _LEAPS = 5  # steps in a row of that, after which the task begins anew
 _SAME = 1e-9  # [m], and of a rotation's numbers, by which targets differ only in rounding
+_APART = 0.2  # [m] of two plans of one target, in which a step or two pass
 _REMIND = 2.0  # [s] between words about what is waited for
 _REMEMBERED = 1_000_000  # steps of which the latency is known
 Say = Callable[[str], None]
@@ -213,6 +214,7 @@ class PolicyNode:
         """Take in targets, unless the task plans its own, and whether to fly."""
         for position, rotation in self._take_target():
             if self._plans:
+                self._compare(position)
                 continue
             away = float(np.linalg.norm(position - self._bodies.measured["payload_position"]))
             # In the air the task would fail by such a target, and the team land; before, it is but a reason to wait.
@@ -237,6 +239,13 @@ class PolicyNode:
         if not self._wanted and self.mode in (FLYING, HOLDING):
             self._change(READY, f"the stages of the drones are {self._stages.tolist()}")
             self._before = None
+
+    def _compare(self, target: np.ndarray) -> None:
+        """Say, where this task plans its target, that others have another one."""
+        off = float(np.linalg.norm(target - self.team.task.goal.position[0]))
+        if self.mode == FLYING and off > _APART and self._woken > self._refused + _REMIND:
+            self._refused = self._woken
+            self._say(f"/target is {off:.1f} m from the target planned here: give both the same seed and task")
 
     def _refuse_target(self, away: float) -> None:
         """Say that a target is too far away [m], not for every one that comes."""
