@@ -72,8 +72,9 @@ def main() -> int:
 
 def _stamp_last_odometry(flight: LiveFlight, names: str, num_drones: int) -> list[float]:
     """Return a list whose number is the time at which the last drone's odometry was sent last."""
-    last = num_drones - 1
-    topic = f"{px4_namespace(last)}/out/vehicle_odometry" if names == "report" else NAMES[names].drone.format(last)
+    last, own = num_drones - 1, NAMES[names]
+    px4 = f"{px4_namespace(last)}/out/vehicle_odometry"
+    topic = px4 if names == "report" else own.drone.format(own.first + last)
     publish, sent = flight._publish[topic], [0.0]
 
     def stamped(message: object) -> None:

@@ -74,7 +74,9 @@ class Options(CommandOptions):
     )
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the first episode, see docs/ros.md")
     ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of that bag")
-    names: Literal["multilift", "report"] = Field("multilift", description="of its topics: ours or the report's")
+    names: Literal["multilift", "report", "crazyswarm2"] = Field(
+        "multilift", description="of its topics: ours, the report's or Crazyswarm2's"
+    )
     trajectories: bool = Field(
         False, description="also states, actions, rotor thrusts, references and tensions of all episodes, in out"
     )

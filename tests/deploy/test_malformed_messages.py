@@ -27,9 +27,11 @@ from multilift_marl.deploy.ros.messages import BOOL, NAMES, ODOMETRY, FlightMess
 from multilift_marl.deploy.ros.policy_node import FLYING, HOLDING, LANDING
 from multilift_marl.deploy.ros.types import (
     ATTITUDE,
+    FULL_STATE,
     px4_namespace,
     read_measurement,
     read_odometry,
+    read_pose,
     read_trajectory,
     trajectory_setpoint,
 )
@@ -198,7 +200,11 @@ def test_no_message_ends_the_policy_node(monkeypatch, names):
 
 def places_of(bench: Bench) -> np.ndarray:
     """Return the places of the last set-points of both drones."""
-    if not bench.node._names.is_report:
+    names = bench.node._names
+    if names.setpoints == FULL_STATE:
+        sent = [bench.wire.sent[f"/cf{n}/cmd_full_state"][-1] for n in (1, 2)]
+        return np.array([read_pose(message.pose)[0] for message in sent])
+    if not names.is_report:
         return bench.places()
     return np.array([bench.wire.sent[f"{px4_namespace(n)}/in/trajectory_setpoint"][-1].position for n in range(2)])
 

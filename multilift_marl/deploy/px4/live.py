@@ -14,7 +14,7 @@ from multilift_marl.deploy.ros.answers import Answers, Waiting
 from multilift_marl.deploy.ros.autopilots import subscribe_px4
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import LAND_AFTER
-from multilift_marl.deploy.ros.live import LivePublisher, SetPoints, subscribe_places
+from multilift_marl.deploy.ros.live import LivePublisher, SetPoints, subscribe_setpoints
 from multilift_marl.deploy.ros.messages import INT32, NAMES, Topic
 from multilift_marl.deploy.ros.stages import Orders, Stage
 from multilift_marl.envs.core import MultiliftVec
@@ -49,7 +49,7 @@ class LiveTeam(Orders):
         self._waiting = Waiting(node.wait, lambda: self._publisher.time_ns, *waiting)
         # Before the flight, so that peers are found by the time of its task.
         self._motions = subscribe_px4(node, config.system) if others and is_report else []
-        self._places = subscribe_places(node, names, count) if others and not is_report else []
+        self._places = subscribe_setpoints(node, names, count) if others and not is_report else []
         topics = [Topic(f"/state/command_drone_{i}", INT32) for i in range(count)]
         self._take_orders: list[Callable[[], list[Any]]] = [node.subscription(topic) for topic in topics]
         self._ordered_stages = np.full(count, Stage.INIT)

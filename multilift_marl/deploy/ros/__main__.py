@@ -90,8 +90,10 @@ class Options(CommandOptions):
         0.0, description="[s] of the simulation, of a policy by the clock; 0: until Ctrl-C"
     )
     ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="distribution of the peers")
-    names: Literal["multilift", "report"] | None = Field(
-        None, description="of the topics: ours or the report's; None: ours, of planners, control and clock the report's"
+    names: Literal["multilift", "report", "crazyswarm2"] | None = Field(
+        None,
+        description="of the topics: ours, the report's or Crazyswarm2's; None: ours, of planners, control and clock "
+        "the report's",
     )
     domain: Annotated[Int, Between(0, 232)] = Field(0, description="ROS_DOMAIN_ID of the peers")
     allow_network: bool = Field(False, description="whether other machines may hear and fly it, by multicast")

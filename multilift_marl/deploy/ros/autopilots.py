@@ -1,4 +1,4 @@
-"""Drones that others fly as if they were PX4s, by trajectory and attitude set-points; our controller in PX4's place."""
+"""Drones that others fly as if they were PX4s or Crazyflies, by motions or attitudes; our controller in their place."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def write_reference(
 
 
 class TopicAutopilots(Controller):
-    """Set-points of PX4 in place of actions, for one environment; the newest of any kind counts.
+    """Set-points of PX4 or a Crazyflie in place of actions, for one environment; the newest of any kind counts.
 
     As PX4 does, it knows the drone alone: an acceleration that is asked for is that of its mass, and what its cable
     needs is the business of who flies it. Where none is asked for, the nominal force on the cable is held, which PX4's
@@ -100,7 +100,7 @@ class TopicAutopilots(Controller):
     Args:
         config: `control` has the gains.
         world: of one environment.
-        take: the set-points of each drone, see `subscribe_px4`.
+        take: the set-points of each drone, see `subscribe_px4` and `crazyswarm.read_full_state`.
         waiting: how steps wait for others; None: not at all.
 
     Attributes:

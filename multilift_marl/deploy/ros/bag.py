@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores
@@ -85,12 +86,13 @@ def check_free(folder: Path) -> None:
 def _qos(topic: Topic) -> Qos:
     """Return the quality of service that a topic is offered with: the last message, as simulations publish."""
     forever = QosTime(2147483647, 4294967295)
+    deadline = QosTime(0, round(1e9 * topic.deadline)) if np.isfinite(topic.deadline) else forever
     return Qos(
         QosHistory.KEEP_LAST,
         1 if topic.latched or not topic.reliable else 10,
         QosReliability.RELIABLE if topic.reliable else QosReliability.BEST_EFFORT,
         QosDurability.TRANSIENT_LOCAL if topic.latched else QosDurability.VOLATILE,
-        forever,
+        deadline,
         forever,
         QosLiveliness.AUTOMATIC,
         forever,

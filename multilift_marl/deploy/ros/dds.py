@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import numpy as np
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
@@ -153,7 +154,9 @@ class Node:
     def _quality(self, topic: Topic) -> Qos:
         """Return the quality of service of a topic, with the hash of its type."""
         typehash = f"typehash={self.store.hash_rihs01(topic.kind)};".encode()
+        promise = [Policy.Deadline(duration(seconds=topic.deadline))] if np.isfinite(topic.deadline) else []
         return Qos(
+            *promise,
             Policy.Reliability.Reliable(duration(seconds=1)) if topic.reliable else Policy.Reliability.BestEffort,
             Policy.Durability.TransientLocal if topic.latched else Policy.Durability.Volatile,
             Policy.History.KeepLast(_QUEUE if topic.reliable and not topic.latched else 1),

@@ -9,9 +9,10 @@ import numpy as np
 
 from multilift_marl.deploy.ros.answers import Answers, Take, Waiting
 from multilift_marl.deploy.ros.autopilots import TopicAutopilots, subscribe_px4
+from multilift_marl.deploy.ros.crazyswarm import read_full_state
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import is_landing, sink
-from multilift_marl.deploy.ros.messages import NAMES, FlightMessages, Report, setpoint_topics
+from multilift_marl.deploy.ros.messages import NAMES, POSE, FlightMessages, Report, setpoint_topics
 from multilift_marl.deploy.ros.stages import Stage
 from multilift_marl.deploy.ros.types import read_place, stamp_ns
 from multilift_marl.envs.core import MultiliftVec
@@ -76,10 +77,10 @@ def read_stamped(message: Any) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
     return stamp_ns(message.header.stamp), read_place(message)
 
 
-def subscribe_places(node: Node, names: str, num_drones: int) -> list[Take]:
-    """Return for each drone what takes its set-points, see `SetPoints`."""
+def subscribe_setpoints(node: Node, names: str, num_drones: int) -> list[Take]:
+    """Return for each drone what takes its poses, see `SetPoints`, or full states, see `TopicAutopilots`."""
     topics = [setpoint_topics(NAMES[names], i)[0]._replace(reliable=False) for i in range(num_drones)]
-    return [node.subscription(topic, read_stamped) for topic in topics]
+    return [node.subscription(topic, read_stamped if topic.kind == POSE else read_full_state) for topic in topics]
 
 
 class LivePublisher:
@@ -125,7 +126,8 @@ class LiveFlight:
         vec: one environment.
         node: publishes and subscribes.
         names: of the topics, a key of `messages.NAMES`.
-        policy: of these environments; None: set-points of others, on /drone_<i>/setpoint or as PX4s hear them.
+        policy: of these environments; None: set-points of others, on /drone_<i>/setpoint, or as PX4s or
+            Crazyflies hear them.
         syncs: whether the report's clock is published.
 
     Attributes:
@@ -137,16 +139,18 @@ class LiveFlight:
         self, vec: MultiliftVec, node: Node, names: str = "multilift", policy: Policy | None = None, syncs: bool = True
     ):
         self._vec = vec
-        by_motion = policy is None and NAMES[names].is_report
+        by_motion = policy is None and NAMES[names].setpoints != POSE
         self._publisher = LivePublisher(node, names, acts=not by_motion, syncs=syncs)
         self.answers: Answers | None = None
         if by_motion:
-            autopilots = TopicAutopilots(vec.config, vec.world, subscribe_px4(node, vec.world.system))
+            is_px4 = NAMES[names].is_report
+            take = subscribe_px4(node, vec.world.system) if is_px4 else subscribe_setpoints(node, names, vec.num_drones)
+            autopilots = TopicAutopilots(vec.config, vec.world, take)
             vec.use_controller(autopilots)
             self.answers = autopilots.answers
             policy = make_scripted("formation", vec)  # whose actions do not count
         elif policy is None:
-            policy = SetPoints(vec, subscribe_places(node, names, vec.num_drones))
+            policy = SetPoints(vec, subscribe_setpoints(node, names, vec.num_drones))
             self.answers = policy.answers
         self._policy: Policy = policy
         self.time_ns = 0

@@ -1,6 +1,7 @@
 """A team's state as ROS 2 messages: what is published, under which names, and how it is filled in.
 
-The world is `world` (ENU, REP 103), bodies are FLU. Twists are in the body's frame, as `nav_msgs/Odometry` has them.
+The world is `world` (ENU, REP 103), bodies are FLU. Twists are in the body's frame, as `nav_msgs/Odometry` has them,
+but for those of Crazyswarm2.
 """
 
 from __future__ import annotations
@@ -11,24 +12,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from rosbags.typesys.store import Typestore
 
+from multilift_marl.deploy.ros.crazyswarm import POSES_DEADLINE, named_poses, server_odometry
 from multilift_marl.deploy.ros.markers import MARKERS, Scene
 from multilift_marl.deploy.ros.stages import Stage
 from multilift_marl.deploy.ros.types import (
     ATTITUDE,
     CONTROL_MODE,
     EXACT,
+    FULL_STATE,
     LOCAL_POSITION,
+    NAMED_POSES,
     RATES,
     TRAJECTORY,
     VEHICLE_ODOMETRY,
     Motion,
+    level,
     local_position,
     make_header,
+    make_pose,
     px4_namespace,
     vehicle_odometry,
 )
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.math3d import mat_to_quat
 from multilift_marl.sim.state import SystemState
 
 ODOMETRY, POSE, BOOL = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "std_msgs/msg/Bool"
@@ -49,6 +54,8 @@ class Topic(NamedTuple):
     reliable: bool = True
     latched: bool = False
     """Whether late subscribers get the last one."""
+    deadline: float = np.inf
+    """[s] to the next message, that publishers offer."""
 
 
 SYNC = Topic("/sync_time", INT64, False, True)
@@ -61,21 +68,30 @@ class Names(NamedTuple):
     drone: str
     first: int
     """Number of the first drone."""
-    is_report: bool
-    """Whether drones are as in the report's workspace: true poses beside the topics of a PX4."""
+    setpoints: str
+    """Type of the set-points: POSE, TRAJECTORY or FULL_STATE."""
+    frame: str = "drone_{}"
+
+    @property
+    def is_report(self) -> bool:
+        """Whether drones are as in the report's workspace: true poses beside the topics of a PX4."""
+        return self.setpoints == TRAJECTORY
 
 
 NAMES = {
-    "multilift": Names("/payload/odom", "/drone_{}/odom", 0, False),
-    "report": Names("/payload_odom", "/simulation/position_drone_{}", 1, True),
+    "multilift": Names("/payload/odom", "/drone_{}/odom", 0, POSE),
+    "report": Names("/payload_odom", "/simulation/position_drone_{}", 1, TRAJECTORY),
+    "crazyswarm2": Names("/payload/odom", "/cf{}/odom", 1, FULL_STATE, "cf{}"),
 }
-"""Ours, and those of the report's workspace (see docs/ros.md)."""
+"""Ours, those of the report's workspace, and Crazyswarm2's (see docs/ros.md)."""
 Report = Callable[[SystemState], None]
 """Writes what autopilots know of their drones to a state of one environment."""
 
 
 def setpoint_topics(names: Names, drone: int) -> list[Topic]:
     """Return the topics by which others fly a drone."""
+    if names.setpoints == FULL_STATE:
+        return [Topic(f"/{names.frame.format(names.first + drone)}/cmd_full_state", FULL_STATE)]
     if not names.is_report:
         return [Topic(f"/drone_{drone}/setpoint", POSE)]
     topics = {"offboard_control_mode": CONTROL_MODE, "trajectory_setpoint": TRAJECTORY}
@@ -90,22 +106,6 @@ def control_topics(names: Names, drone: int, by_rates: bool = False) -> list[Top
         Topic(f"{px4_namespace(drone)}/in/{name}", kind),
         Topic(f"{px4_namespace(drone)}/in/offboard_control_mode", CONTROL_MODE),
     ]
-
-
-def level(yaw: float) -> np.ndarray:
-    """Return the rotation (3, 3) of a level body with a heading from east [rad]."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def make_pose(store: Typestore, position: np.ndarray, rotation: np.ndarray) -> Any:
-    """Return a pose."""
-    # ROS has the real part last.
-    w, x, y, z = mat_to_quat(tuple(rotation.ravel()))
-    return store.types["geometry_msgs/msg/Pose"](
-        position=store.types["geometry_msgs/msg/Point"](*(float(number) for number in position)),
-        orientation=store.types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
-    )
 
 
 def pose_stamped(store: Typestore, time_ns: int, position: np.ndarray, rotation: np.ndarray) -> Any:
@@ -142,7 +142,7 @@ class FlightMessages:
         self._vec, self._store, self._types, self._names = vec, store, store.types, NAMES[names]
         drones = range(self._names.first, self._names.first + vec.num_drones)
         self._drones = [self._names.drone.format(i) for i in drones]
-        self.frames = [f"drone_{i}" for i in drones]
+        self.frames = [self._names.frame.format(i) for i in drones]
         self._px4 = [px4_namespace(i) for i in range(vec.num_drones)]
         self.syncs = syncs
         self.stages = np.full(vec.num_drones, Stage.TRAJECTORY)
@@ -166,6 +166,10 @@ class FlightMessages:
             Topic(self._names.payload, ODOMETRY, reliable=not report),
             *(Topic(name, POSE if report else ODOMETRY, reliable=not report) for name in self._drones),
         ]
+        if self._names.setpoints == FULL_STATE:
+            # As Crazyswarm2 sets motion_capture_tracking up.
+            topics.append(Topic("/poses", NAMED_POSES, False, deadline=POSES_DEADLINE))
+            topics += [Topic(f"/{frame}/pose", POSE) for frame in self.frames]
         if report:
             for i, px4 in enumerate(self._px4):
                 topics.append(Topic(f"{px4}/out/vehicle_odometry", VEHICLE_ODOMETRY, False, True))  # as PX4 does
@@ -196,10 +200,16 @@ class FlightMessages:
         if self._acts and self._vec.steps[0] > 0:
             for frame, action in zip(self.frames, self._vec.task.action[0], strict=True):
                 yield f"/{frame}/action", self._action(action)
+        if self._names.setpoints == FULL_STATE:
+            yield "/poses", named_poses(store, time_ns, frames)
+            for frame, motion in zip(self.frames, drones, strict=True):
+                yield f"/{frame}/pose", pose_stamped(store, time_ns, *motion[:2])
         yield self._names.payload, self._odometry(header, "payload", payload)
         for name, frame, motion in zip(self._drones, self.frames, drones, strict=True):
             if self._names.is_report:
                 yield name, pose_stamped(store, time_ns, *motion[:2])
+            elif self._names.setpoints == FULL_STATE:
+                yield name, server_odometry(store, time_ns, motion)
             else:
                 yield name, self._odometry(header, frame, motion)
         if self._names.is_report:

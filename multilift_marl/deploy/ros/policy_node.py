@@ -9,12 +9,14 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.control.autopilot import LoadFeedforward
 from multilift_marl.deploy.ros.bodies import Bodies, Source
+from multilift_marl.deploy.ros.crazyswarm import ServerOdometry, full_state
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER, sink
 from multilift_marl.deploy.ros.messages import (
@@ -26,15 +28,17 @@ from multilift_marl.deploy.ros.messages import (
     POSE,
     Topic,
     control_topics,
-    level,
     path,
     pose_stamped,
     setpoint_topics,
 )
 from multilift_marl.deploy.ros.stages import Stage
 from multilift_marl.deploy.ros.types import (
+    FULL_STATE,
     VEHICLE_ODOMETRY,
+    Motion,
     control_mode,
+    level,
     px4_namespace,
     read_measurement,
     read_odometry,
@@ -70,7 +74,8 @@ class PolicyNode:
         config: the task, its rig and control.
         make_policy: returns the policy for its environment.
         node: publishes and subscribes.
-        names: of the topics, a key of `messages.NAMES`; the report's drones are PX4s.
+        names: of the topics, a key of `messages.NAMES`; the report's drones are PX4s, Crazyswarm2's are
+            Crazyflies.
         seed: of the episode, which a task that plans its target draws it from.
         start: AT_ONCE, as soon as all is heard; TOPIC, when `true` comes on /fly; STAGE, while all drones are in stage
             5 of the report's state machine.
@@ -110,17 +115,19 @@ class PolicyNode:
     def _subscribe(self) -> None:
         names, drones, node = self._names, range(self.team.num_drones), self._node
         topics: list[Topic] = []
-        measured = partial(read_measurement, read_odometry)
+
+        def read(topic: Topic) -> Callable[[Any], Motion]:
+            if names.setpoints == FULL_STATE:
+                return ServerOdometry()
+            return read_vehicle_odometry if topic.kind == VEHICLE_ODOMETRY else read_odometry
+
         for drone in drones:
             if names.is_report:
                 topics.append(Topic(f"{px4_namespace(drone)}/out/vehicle_odometry", VEHICLE_ODOMETRY, False))
             else:
-                topics.append(Topic(names.drone.format(drone), ODOMETRY, False))
+                topics.append(Topic(names.drone.format(names.first + drone), ODOMETRY, False))
         topics.append(Topic(names.payload, ODOMETRY, False))
-        reported = partial(read_measurement, read_vehicle_odometry)
-        sources: list[Source] = [
-            node.subscription(topic, reported if topic.kind == VEHICLE_ODOMETRY else measured) for topic in topics
-        ]
+        sources: list[Source] = [node.subscription(topic, partial(read_measurement, read(topic))) for topic in topics]
         self._topics = [topic.name for topic in topics]  # of each body
         self._bodies = Bodies(sources, self.team.task.dt)
         self._take_target = node.subscription(Topic("/target", POSE, False), read_place)
@@ -313,8 +320,8 @@ class PolicyNode:
         except Exception as error:  # a policy of others may fail in any way, and drones are in the air
             self.land(f"the policy has failed ({type(error).__name__}: {error})")
             return False
-        # Receivers of poses smooth them and get the command; PX4 gets our smoothed reference with its derivatives.
-        if not self._names.is_report:
+        # Receivers of poses smooth them and get the command; others get our smoothed reference with its derivatives.
+        if self._names.setpoints == POSE:
             self._publish(reference.command[0], reference.command_yaw[0])
             return True
         self.team.advance()
@@ -335,7 +342,7 @@ class PolicyNode:
         self, places: np.ndarray, yaws: np.ndarray, velocities: np.ndarray | None = None,
         accelerations: np.ndarray | None = None, yaw_rates: np.ndarray | None = None, jerks: np.ndarray | None = None,
     ) -> None:  # fmt: skip
-        """Publish set-points; of PX4s with what the drones carry added to their accelerations."""
+        """Publish set-points; those with accelerations have what the drones carry added to them."""
         still, store = np.zeros_like(places), self._node.store
         # A plan knows the force on each cable, its drag included; else it is the formation's.
         planned = velocities is not None and self.team.controller.interface.commands_force
@@ -348,15 +355,18 @@ class PolicyNode:
         # By the clock of the measurements, carried on by this machine's since the newest came.
         now = int(self._bodies.stamps[newest] + 1e9 * (self._woken - self._bodies.arrivals[newest]))
         for i, publishers in enumerate(self._publishers):
-            if self._names.is_report:
+            if self._names.setpoints == POSE:
+                messages = [pose_stamped(store, now, places[i], level(yaws[i]))]
+            else:
                 through = still[i] if planned else velocities[i]
                 rise = self._feedforward.acceleration(i, through, accelerations[i], force[i], yaws[i])
-                jerk = self._feedforward.jerk(i, jerks[i])
-                motion = places[i], velocities[i], rise, yaws[i], yaw_rates[i], jerk
-                setpoint = trajectory_setpoint(store, now, *motion)
-                messages = [control_mode(store, now), setpoint] if self._receiver == PX4 else [setpoint]
-            else:
-                messages = [pose_stamped(store, now, places[i], level(yaws[i]))]
+                motion = places[i], velocities[i], rise, yaws[i], yaw_rates[i]
+                if self._names.is_report:
+                    jerk = self._feedforward.jerk(i, jerks[i])
+                    setpoint = trajectory_setpoint(store, now, *motion, jerk)
+                    messages = [control_mode(store, now), setpoint] if self._receiver == PX4 else [setpoint]
+                else:
+                    messages = [full_state(store, now, *motion)]
             for publish, message in zip(publishers, messages, strict=True):
                 publish(message)
         self._setpoints, self._sent = (places.copy(), yaws.copy()), self._woken
@@ -370,7 +380,7 @@ class PolicyNode:
 def check_flyable(config: Config, names: str = "multilift", receiver: str = PX4) -> None:
     """Refuse, by a ConfigError, what the node cannot fly."""
     is_report = NAMES[names].is_report
-    able = ("reference", "full_state") if is_report else ("reference",)
+    able = ("reference",) if NAMES[names].setpoints == POSE else ("reference", "full_state")
     if config.control.action not in able:
         raise ConfigError(
             f"set-points of names={names} are those of control.action={' or '.join(able)}, not of "

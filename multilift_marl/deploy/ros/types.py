@@ -1,4 +1,4 @@
-"""The message types of ROS distributions, those of PX4 (px4_msgs) among them.
+"""The message types of ROS distributions, those of PX4 (px4_msgs) and of Crazyflies (Crazyswarm2) among them.
 
 PX4's are those of v1.16: what a version adds or reorders, its own `px4_msgs` has, too, and both ends must agree.
 """
@@ -20,6 +20,8 @@ from multilift_marl.sim.earth import swap_attitude, swap_enu_ned, swap_flu_frd, 
 VEHICLE_ODOMETRY, LOCAL_POSITION = "px4_msgs/msg/VehicleOdometry", "px4_msgs/msg/VehicleLocalPosition"
 TRAJECTORY, ATTITUDE = "px4_msgs/msg/TrajectorySetpoint", "px4_msgs/msg/VehicleAttitudeSetpoint"
 RATES, CONTROL_MODE = "px4_msgs/msg/VehicleRatesSetpoint", "px4_msgs/msg/OffboardControlMode"
+FULL_STATE = "crazyflie_interfaces/msg/FullState"
+NAMED_POSE, NAMED_POSES = (f"motion_capture_tracking_interfaces/msg/{name}" for name in ("NamedPose", "NamedPoseArray"))
 WORLD = "world"
 EXACT = 1e-12  # variance of what is known exactly: of a micrometre, so that matrices have inverses
 _LARGEST = 1e6  # of numbers that are measured or asked for [m, m/s, m/s², rad/s]
@@ -78,12 +80,20 @@ _FIELDS = {
         bool body_rate
         bool thrust_and_torque
         bool direct_actuator""",
+    FULL_STATE: """std_msgs/Header header
+        geometry_msgs/Pose pose
+        geometry_msgs/Twist twist
+        geometry_msgs/Vector3 acc""",
+    NAMED_POSE: """string name
+        geometry_msgs/Pose pose""",
+    NAMED_POSES: """std_msgs/Header header
+        NamedPose[] poses""",
 }  # fmt: skip
 
 
 @cache
 def typestore(distribution: Stores) -> Typestore:
-    """Return the types of a ROS distribution, with those of PX4."""
+    """Return the types of a ROS distribution, with those of PX4 and of Crazyflies."""
     store = get_typestore(distribution)
     for kind, fields in _FIELDS.items():
         store.register(get_types_from_msg("\n".join(line.strip() for line in fields.splitlines()), kind))
@@ -99,6 +109,22 @@ def make_header(store: Typestore, time_ns: int) -> Any:
     """Return a header of a time, in the world."""
     stamp = store.types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
     return store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=WORLD)
+
+
+def level(yaw: float) -> np.ndarray:
+    """Return the rotation (3, 3) of a level body with a heading from east [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def make_pose(store: Typestore, position: np.ndarray, rotation: np.ndarray) -> Any:
+    """Return a pose."""
+    # ROS has the real part last.
+    w, x, y, z = mat_to_quat(tuple(rotation.ravel()))
+    return store.types["geometry_msgs/msg/Pose"](
+        position=store.types["geometry_msgs/msg/Point"](*(float(number) for number in position)),
+        orientation=store.types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
+    )
 
 
 def stamp_ns(stamp: Any) -> int:
