@@ -101,14 +101,15 @@ class MeasuredTeam(MultiliftVec):
         gap = np.sqrt(within / self._lift) - speed
         speed += np.where(gap > 0.0, *self._closing) * gap
 
-    def observe(self, measured: Measured) -> np.ndarray:
-        """Take what has been measured a policy step after the last command; return the observation (1, N, D)."""
+    def observe(self, measured: Measured, steps: int = 1) -> np.ndarray:
+        """Take what has been measured some policy steps after the last command; return the observation (1, N, D)."""
+        self._ticks_left += (steps - 1) * self.control_ticks
         while self._ticks_left:
             self.advance()
         self._put(measured)
         for call in self._pipelines[0].after:
             call()
-        self.steps += 1
+        self.steps += steps
         return self._stacked.copy()
 
     def _put(self, measured: Measured) -> None:

@@ -307,7 +307,11 @@ class PolicyNode:
             position, rotation = self._target
             if max(np.abs(goal.position[0] - position).max(), np.abs(goal.rotation[0] - rotation).max()) > _SAME:
                 self.team.task.place_goal(0, position, rotation)
-        observation = self.team.observe(self._bodies.measured)
+        # Targets that move are where they are by now, also where measurements were missed.
+        assert self._before is not None
+        missed = 1e-9 * (int(self._bodies.stamps[-1]) - self._before[2]) / self.team.task.dt
+        steps = int(np.clip(round(missed), 1, HOLD_AFTER / self.team.task.dt))
+        observation = self.team.observe(self._bodies.measured, steps)
         if self.team.failure:
             self.land(f"the task has failed, {self.team.failure}")
             return None
