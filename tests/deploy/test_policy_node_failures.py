@@ -31,7 +31,7 @@ class Bench:
     def __init__(self, monkeypatch, make_policy: Any = None, names: str = "multilift", **changes: Any):
         self.now, self.said, self.wire = 100.0, [], Wire()
         monkeypatch.setattr(policy_node.time, "perf_counter", lambda: self.now)
-        node = {key: changes.pop(key) for key in ("at_once",) if key in changes}
+        node = {key: changes.pop(key) for key in ("start",) if key in changes}
         values = {"env.num_envs": 1, "env.num_threads": 1, "env.num_drones": 2, "payload.mass": 0.7, **changes}
         config = ml.load_config("hover", values)
         self.vec = MultiliftVec(config, EVALUATION)

@@ -73,16 +73,30 @@ def test_ros_odometry_has_its_twist_in_the_bodys_frame():
 def test_px4s_set_points_are_read_from_north_east_down():
     types = pytest.importorskip("multilift_marl.deploy.ros.types", exc_type=ImportError)
     rise = np.array([0.6, -0.2, 1.7])
-    message = SimpleNamespace(position=NED @ POSITION, velocity=NED @ VELOCITY, acceleration=NED @ rise, yaw=0.3)
+    change = np.array([-0.4, 0.9, 2.2])
+    message = SimpleNamespace(
+        position=NED @ POSITION, velocity=NED @ VELOCITY, acceleration=NED @ rise, jerk=NED @ change, yaw=0.3,
+        yawspeed=0.7,
+    )  # fmt: skip
     found = types.read_trajectory(message)
+    np.testing.assert_allclose(found.jerk, change)
+    assert found.yaw_rate == -0.7
     for part, expected in zip(found[:3], (POSITION, VELOCITY, rise), strict=True):
         np.testing.assert_allclose(part, expected)
     assert found.yaw == pytest.approx(np.pi / 2 - 0.3)
-    attitude = SimpleNamespace(q_d=quaternion_of(NED @ ATTITUDE @ FRD), thrust_body=np.array([0.1, 0.2, -0.6]))
+    attitude = SimpleNamespace(
+        q_d=quaternion_of(NED @ ATTITUDE @ FRD), thrust_body=np.array([0.1, 0.2, -0.6]), yaw_sp_move_rate=0.5
+    )
     asked = types.read_attitude(attitude, 30.0)
     np.testing.assert_allclose(asked.acceleration, 18.0 * ATTITUDE[:, 2] - [0, 0, 9.81], atol=1e-12)
     assert asked.yaw == pytest.approx(np.arctan2(ATTITUDE[1, 0], ATTITUDE[0, 0]))
     assert np.isnan(asked.position).all() and np.isnan(asked.velocity).all()
+    assert asked.yaw_rate == -0.5 and asked.thrust == 0.6
+    np.testing.assert_allclose(asked.attitude, ATTITUDE, atol=1e-12)
+    turning = SimpleNamespace(roll=0.1, pitch=0.2, yaw=-0.3, thrust_body=np.array([0.0, 0.0, -0.7]))
+    asked = types.read_rates(turning)
+    np.testing.assert_allclose(asked.rates, [0.1, -0.2, 0.3])
+    assert asked.thrust == 0.7 and asked.attitude is None
 
 
 def test_what_is_said_to_px4_is_in_north_east_down():
