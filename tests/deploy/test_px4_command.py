@@ -53,7 +53,7 @@ DT = 0.004
         (["px4=/nowhere", "instance=12"], "instance"),
         (["px4=/nowhere", "policy=formations"], "unknown policy 'formations'"),
         (["px4=/nowhere", "policy=none"], "set live=true"),
-        (["px4=/nowhere", "policy=none", "live=true", "names=report"], "by topics of names=multilift"),
+        (["px4=/nowhere", "start=topic"], "waits for orders by topics; set live=true"),
         (["px4=/nowhere", "policy=none", "live=true", "control.action=ctbr"], "control.action=reference, not ctbr"),
         (["px4=/nowhere", "policy=none", "live=true"], "px4=/nowhere holds no PX4"),
     ],

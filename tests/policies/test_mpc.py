@@ -8,9 +8,11 @@ from conftest import refusal
 
 import multilift_marl as ml
 from multilift_marl.config.load import load_config
+from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.mpc import ENOUGH
 
 BY_RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
 FAST = {"task_options.speed": 2.0, "task_options.acceleration": 4.0, "task_options.rmse_from": 3.0}
@@ -123,9 +125,35 @@ def test_what_it_cannot_fly_is_refused(config, overrides, said):
     assert said in refusal(make_scripted, "mpc", vec)
 
 
-def test_a_team_whose_rotors_are_not_measured_is_refused():
-    vec = MeasuredTeam(load_config("hover", BY_RATES))
-    assert "rotor speeds" in refusal(make_scripted, "mpc", vec)
+WIDE = {f"control.{key}": wide for key, (_, wide) in ENOUGH["full_state"].items()}
+FULL_STATE = {"control.action": "full_state"} | WIDE
+PARTS = ("position", "rotation", "velocity", "body_rates")
+MEASURED = [f"{body}_{name}" for body in ("payload", "drone") for name in PARTS]
+
+
+@pytest.mark.parametrize(("feedback", "most"), [(1.0, 0.005), (0.0, 0.02)])
+def test_a_team_whose_rotors_are_not_measured_is_flown_as_well(feedback, most):
+    """Measurements of a simulated team, whose rotor speeds stay hidden, to the actions that it then flies by."""
+    own = {"env.num_envs": 1, "env.num_threads": 1, "planner.feedback": feedback, "planner.estimate": feedback == 1.0}
+    config = load_config("track_circle", FULL_STATE | own)
+    vec, team = MultiliftVec(config, EVALUATION), MeasuredTeam(config)
+    vec.reset(seed=3)
+    measured = lambda: {name: getattr(vec.world.state, name)[0].copy() for name in MEASURED}  # noqa: E731
+    observation, policy, errors, rotors = team.begin(measured(), 3), make_scripted("mpc", team), [], []
+    for _ in range(250):
+        action = policy.act(observation)
+        team.command(action)
+        vec.step(action)
+        observation = team.observe(measured())
+        errors.append(vec.task.errors.distance[0])
+        rotors.append(np.abs(team.world.state.rotor_speed / vec.world.state.rotor_speed - 1).max())
+    assert max(errors[50:]) < most, max(errors[50:])
+    assert np.median(rotors) < 0.02
+
+
+def test_plans_are_followed_only_as_whole_motions():
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1, **BY_RATES, **{"planner.feedback": 0.5})
+    assert "set control.action=full_state" in refusal(make_scripted, "mpc", vec)
 
 
 def test_observations_of_other_environments_are_refused():
