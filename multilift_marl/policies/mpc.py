@@ -99,6 +99,9 @@ class TeamMpc:
         self._lift = np.array([vehicle.thrust_coefficient for vehicle in system.vehicles], float)
         under_way = round(settings.delay / self._dt)
         self._sent = np.zeros((under_way + 1, vec.num_envs, 3 * n))
+        self._starts = [
+            np.zeros((vec.num_envs, 12 + 7 * n)) for _ in range(under_way + 1)
+        ]  # of the plans for now and later
         self._fresh = np.ones(vec.num_envs, bool)
         self._last = LastPlan(self.planner.plans, settings.step, self._dt)
         self._without_plan = HoldAccRates(vec) if self._full_state is None else HoldFullState(vec)
@@ -148,8 +151,9 @@ class TeamMpc:
         if self._estimator is not None:
             self._estimator.update(states, self._dt, ~unknown)
         unknown |= self._forget_unsound(states, loads, forces)
-        if self._feedback < 1.0:
-            self._trust_plans(states, payload_rotation, ~(self._fresh | unknown))
+        following = ~(self._fresh | unknown) if self._feedback < 1.0 else np.zeros(vec.num_envs, bool)
+        if following.any():
+            planned = self._correct_plans(states, payload_rotation, following)
         now = vec.task.time[:, None]
         last = np.maximum(now - self._dt, 0.0)
         preview = vec.task.preview_targets
@@ -167,6 +171,11 @@ class TeamMpc:
         self._fresh &= unknown
         present = states.copy()
         planner.predict(states, self._sent, self._dt, loads)
+        if following.any():
+            states[following] = planned[following]
+        for start in self._starts:
+            start[~following] = states[~following]  # they begin
+        self._starts = [*self._starts[1:], states.copy()]
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
         late = (perf_counter() - begin) / shape[0] > self._deadline
         self._last.keep(plans, late, plans.failed | unknown)
@@ -193,13 +202,19 @@ class TeamMpc:
         self._estimator.estimate.unknowns[fresh] = 0.0
         return self._estimator.loads, self._estimator.forces
 
-    def _trust_plans(self, states: np.ndarray, payload_rotation: np.ndarray, mask: np.ndarray) -> None:
-        """Let states (E, 12 + 7 N) of the teams in the mask (E,) be those of their last plans, corrected by a share."""
-        planned = self._last.states(self._dt)
+    def _correct_plans(self, states: np.ndarray, payload_rotation: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Let states (E, 12 + 7 N) of the teams in the mask (E,) be those that were planned, corrected by a share.
+
+        Return where the next plans begin, `planner.delay` later, corrected alike.
+        """
+        later = self._last.states(self._dt)
+        # Of the plan that began with the present, if plans are ahead of it.
+        planned = (self._starts[1] if len(self._starts) > 1 else later).copy()
         off = states - planned
         off[:, 3:6] = np.remainder(off[:, 3:6] + np.pi, 2 * np.pi) - np.pi
         states[mask] = (planned + self._feedback * off)[mask]
         payload_rotation[mask] = rotations(states[mask, 3:6])
+        return later + self._feedback * off
 
     def _forget_unsound(self, states: np.ndarray, loads: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """Let estimates that are not finite begin anew from planned states; return whose they were (E,)."""
