@@ -1,6 +1,6 @@
 """A node of real ROS 2 (rclpy), run by the Python that has it; prints what it found as JSON. For test_ros2.py.
 
-python ros2_peer.py hear|fly|release <domain>
+python ros2_peer.py hear|fly|release|pipeline <domain>
 """
 
 import json
@@ -9,12 +9,12 @@ import time
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float32MultiArray
+from std_msgs.msg import Bool, Float32MultiArray, Int32, Int64
 from visualization_msgs.msg import MarkerArray
 
 WAIT = 40.0  # [s] for the other side to start
@@ -122,11 +122,38 @@ def release(node):
     return {"ready": ready, "complete": bool(done), "still": still, "off": off}
 
 
+def pipeline(node):
+    """Hear the pipeline of the report's names, by its QoS; come late to the planned path and to the clock."""
+    flown, stages, poses = [], [], []
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    node.create_subscription(Odometry, "/payload_odom", flown.append, best_effort)
+    node.create_subscription(PoseStamped, "/simulation/position_drone_2", poses.append, best_effort)
+    node.create_subscription(Int32, "/state/state_drone_1", stages.append, 10)
+    # 3 s of the flight, in which the nodes have begun
+    complete = spin(node, lambda: len(flown) > 1 and stamp(flown[-1]) - stamp(flown[0]) > 3.0 and poses and stages)
+    paths, times = [], []
+    late = DurabilityPolicy.TRANSIENT_LOCAL
+    reliable = QoSProfile(depth=1, durability=late, reliability=ReliabilityPolicy.RELIABLE)
+    node.create_subscription(Path, "/path", paths.append, reliable)
+    clock = QoSProfile(depth=1, durability=late, reliability=ReliabilityPolicy.BEST_EFFORT)
+    node.create_subscription(Int64, "/sync_time", lambda message: times.append(message.data), clock)
+    spin(node, lambda: paths and len(times) > 30, 15.0)
+    (published,) = node.get_publishers_info_by_topic("/sync_time")
+    target = paths[0].poses[-1].pose.position if paths else None
+    at = flown[-1].pose.pose.position
+    return {
+        "complete": bool(complete), "stages": sorted({message.data for message in stages}), "times": times,
+        "off": [at.x - target.x, at.y - target.y, at.z - target.z] if target else [],
+        "frame": paths[0].header.frame_id if paths else "", "stamp": stamp(flown[-1]),
+        "qos": [published.qos_profile.reliability.name, published.qos_profile.durability.name],
+    }  # fmt: skip
+
+
 def main():
     role, domain = sys.argv[1], int(sys.argv[2])
     rclpy.init(domain_id=domain)
     node = Node("peer", parameter_overrides=[Parameter("use_sim_time", value=True)])
-    print(json.dumps({"hear": hear, "fly": fly, "release": release}[role](node)))
+    print(json.dumps({"hear": hear, "fly": fly, "release": release, "pipeline": pipeline}[role](node)))
     node.destroy_node()
     rclpy.shutdown()
 

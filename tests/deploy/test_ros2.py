@@ -86,3 +86,21 @@ def test_ros_releases_a_policy():
     assert found["ready"] and found["complete"]
     assert np.ptp(found["still"]) < 0.3  # before that, the drones' own places
     assert found["off"] < 0.15
+
+
+@pytest.mark.slow
+def test_ros_hears_a_pipeline_of_the_reports_names():
+    """Simulation, planner, geometric control and clock: four processes of ours, and one of ROS 2."""
+    found = meet(
+        "pipeline",
+        ("policy=none", "names=report", "sync=false", "seconds=90", *TEAM),
+        ("role=trajectory_planner", "receiver=geometric_control", "policy=formation_integral", *TEAM),
+        ("role=geometric_control", "control.disturbance=none", "control.position_frequency=4", *TEAM),
+        ("role=clock", "patience=60", *TEAM),
+    )
+    assert found["complete"] and found["stages"] == [5]
+    assert np.linalg.norm(found["off"]) < 0.15 and found["frame"] == "world"  # the team is where the path leads
+    steps = np.diff(found["times"])
+    assert (steps > 0).all() and np.median(steps) == pytest.approx(50_000, abs=10_000)
+    assert abs(1e-6 * found["times"][-1] - found["stamp"]) < 20.0  # time of the simulation
+    assert found["qos"] == ["BEST_EFFORT", "TRANSIENT_LOCAL"]
