@@ -15,6 +15,7 @@ from multilift_marl.deploy.px4.__main__ import Options as FlightOptions
 from multilift_marl.deploy.ros.__main__ import USUAL
 from multilift_marl.deploy.ros.__main__ import Options as NodeOptions
 from multilift_marl.errors import ConfigError, reason, shorten
+from multilift_marl.policies.baselines import SCRIPTED
 from multilift_marl.schema.files import as_mapping
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.yaml_text import read_yaml
@@ -106,8 +107,10 @@ def _command(name: str, module: str, options: type[CommandOptions], *parts: Mapp
     try:
         check_names(values, options.model_fields)
         _, overrides = split_options(options, values)
-        if values.get("config") is not None:  # else that of a policy, which the process finds
-            load_config(values["config"], USUAL.get(str(values.get("role")), {}) | overrides)
+        trained = values.get("policy") not in (None, "none", *SCRIPTED)
+        config = values.get("config") or (None if trained else "hover")
+        if config is not None:  # that of a trained policy is found by the process
+            load_config(config, USUAL.get(str(values.get("role")), {}) | overrides)
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from None
     return [sys.executable, "-m", f"multilift_marl.{module}", *spell_arguments(options, values)]

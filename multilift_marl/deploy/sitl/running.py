@@ -20,7 +20,8 @@ from multilift_marl.deploy.processes import end_together, end_with_parent
 _POLL = 0.05  # [s]
 _LAST_WORDS = 1.0  # [s] for what a process has printed to be read after its end
 _END_FLIGHT = ((signal.SIGINT, 10.0),)  # [s]: it ends its autopilots, which takes up to 5 s
-_END_NODES = ((signal.SIGINT, 2.0), (signal.SIGINT, 3.0))  # by the first a policy lets drones sink, who are gone
+# A policy lets drones, which are gone, sink by the first; others need up to 2 s to leave DDS, and no second one.
+_END_NODES = ((signal.SIGINT, 4.0), (signal.SIGINT, 4.0))
 
 
 class Process(subprocess.Popen[bytes]):
