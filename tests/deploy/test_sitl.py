@@ -49,11 +49,11 @@ def test_the_file_gives_the_commands_and_arguments_go_over_it(tmp_path):
         "bag": "flight bag",
     }
     found = commands_of(tmp_path, content, **{"flight.seed": 2001, "common.domain": 9, "nodes.plan.config": "track"})
-    common = {"names": "report", "domain": 9, "env.policy_hz": 50}
+    common = {"names": "report", "seed": 2001, "domain": 9, "env.policy_hz": 50}
     assert list(found) == ["flight", "plan", "tick"]
     assert found["flight"] == {
         "": "multilift_marl.px4", "policy": "none", "live": True, "out": "out/flight", "bag": "flight bag",
-        "seed": 2001, "parameters": {"MPC_XY_P": 1.2}, "env.num_drones": 4, **common,
+        "parameters": {"MPC_XY_P": 1.2}, "env.num_drones": 4, **common,
     }  # fmt: skip
     plan = {"role": "trajectory_planner", "config": "track", "env.num_drones": 3}
     assert found["plan"] == {"": "multilift_marl.ros", **plan, **common}
@@ -61,9 +61,9 @@ def test_the_file_gives_the_commands_and_arguments_go_over_it(tmp_path):
 
 
 def test_a_simulation_takes_the_place_of_the_flight(tmp_path):
-    found = commands_of(tmp_path, FLOWN, **{"simulation.seconds": 3})
-    assert found["simulation"] == {"": "multilift_marl.ros", "policy": "none", "seconds": 3, **TEAM}
-    assert "names" not in found["pilot"]
+    found = commands_of(tmp_path, FLOWN, **{"simulation.seconds": 3, "common.seed": 5, "nodes.pilot.seed": 6})
+    assert found["simulation"] == {"": "multilift_marl.ros", "policy": "none", "seconds": 3, "seed": 5, **TEAM}
+    assert found["pilot"]["seed"] == 6 and "names" not in found["pilot"]
 
 
 def test_the_example_is_that_of_the_help_and_can_be_started(tmp_path, capsys):

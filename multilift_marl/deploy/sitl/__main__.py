@@ -17,7 +17,7 @@ from multilift_marl.errors import ConfigError
 EXAMPLE = """\
 flight:                      # keys of python -m multilift_marl.px4, which finds PX4 by PX4_DIR
   config: track_circle
-  seed: 2000
+  seed: 2000                 # also of the nodes
   sync: false                # the clock below does
 nodes:                       # keys of python -m multilift_marl.ros; names are free
   planner: {role: trajectory_planner, config: track_circle, receiver: geometric_control}

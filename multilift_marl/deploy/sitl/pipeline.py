@@ -23,6 +23,7 @@ from multilift_marl.schema.yaml_text import read_yaml
 Keys = dict[str, Any]
 _RUN_CODE = {"import", "trust", "px4", "residual", "base_policy", "ray"}
 """Keys that name what is run, beside `policy=module:Class`."""
+_SHARED = ("seed", "domain", "ros", "names", "allow_network")  # in which nodes that fly a team agree with it
 
 
 class Options(CommandOptions):
@@ -36,7 +37,7 @@ class Options(CommandOptions):
         None, description="in place of a flight of PX4s: keys of multilift_marl.ros; policy=none likewise"
     )
     nodes: dict[Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,30}$")], Keys] = Field(
-        {}, description="keys of multilift_marl.ros, of each a role"
+        {}, description="keys of multilift_marl.ros, of each a role; seed and domain as above unless they say otherwise"
     )
     common: Keys = Field({}, description="keys of all processes, where they do not say otherwise")
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the flight")
@@ -80,30 +81,30 @@ def list_commands(options: Options, out: Path) -> dict[str, list[str]]:
         raise ConfigError("give either flight or simulation, the team that nodes fly, in file=<YAML file>; see --help")
     common: Keys = {"trust": True} if options.trust else {}
     common |= options.common
-    commands: dict[str, list[str]] = {}
     if options.flight is not None:
-        common = {"names": "report"} | common
-        own: Keys = {"policy": "none", "live": True, "out": str(out / "flight"), "bag": options.bag}
-        commands["flight"] = _command("flight", "px4", FlightOptions, own, common, options.flight)
+        kind = "flight"
+        usual = {"policy": "none", "live": True, "names": "report", "out": str(out / "flight"), "bag": options.bag}
+        first = _merge(FlightOptions, usual, common, options.flight)
+        commands = {kind: _command(kind, "px4", FlightOptions, first)}
     else:
         if options.bag is not None:
             raise ConfigError("bag is of a flight, and a simulation writes none; leave it out")
-        own = {"policy": "none"}
-        commands["simulation"] = _command("simulation", "ros", NodeOptions, own, common, options.simulation or {})
+        kind = "simulation"
+        first = _merge(NodeOptions, {"policy": "none"}, common, options.simulation or {})
+        commands = {kind: _command(kind, "ros", NodeOptions, first)}
+    shared = {key: first[key] for key in _SHARED if key in first}
     for name, values in options.nodes.items():
         if name in ("flight", "simulation"):
             raise ConfigError(f"nodes.{name} has the name of another process; give it another one")
         if values.get("role", "simulation") == "simulation":
             raise ConfigError(f"nodes.{name} needs a role, such as policy; a simulation is a section of its own")
-        commands[name] = _command(f"nodes.{name}", "ros", NodeOptions, {}, common, values)
+        merged = _merge(NodeOptions, shared, common, values)
+        commands[name] = _command(f"nodes.{name}", "ros", NodeOptions, merged)
     return commands
 
 
-def _command(name: str, module: str, options: type[CommandOptions], *parts: Mapping[str, Any]) -> list[str]:
-    """Return the command of a process by parts of its values, of which later ones go over earlier ones; check them."""
-    values: dict[str, Any] = {}
-    for part in parts:
-        values |= _flatten(part, options)
+def _command(name: str, module: str, options: type[CommandOptions], values: Keys) -> list[str]:
+    """Return the command of a process, whose values are checked first."""
     try:
         check_names(values, options.model_fields)
         _, overrides = split_options(options, values)
@@ -116,9 +117,17 @@ def _command(name: str, module: str, options: type[CommandOptions], *parts: Mapp
     return [sys.executable, "-m", f"multilift_marl.{module}", *spell_arguments(options, values)]
 
 
-def _flatten(values: Mapping[str, Any], options: type[CommandOptions], prefix: str = "") -> dict[str, Any]:
+def _merge(options: type[CommandOptions], *parts: Mapping[str, Any]) -> Keys:
+    """Return the values of a process by dotted name; those of later parts go over those of earlier ones."""
+    merged: Keys = {}
+    for part in parts:
+        merged |= _flatten(part, options)
+    return merged
+
+
+def _flatten(values: Mapping[str, Any], options: type[CommandOptions], prefix: str = "") -> Keys:
     """Return values by dotted name; mappings that a command has as one value stay whole."""
-    flat: dict[str, Any] = {}
+    flat: Keys = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
         whole = not isinstance(value, Mapping) or not value or name in options.model_fields
