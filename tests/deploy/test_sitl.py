@@ -176,7 +176,7 @@ def test_the_flight_ends_before_the_nodes_and_what_is_deaf_is_killed(tmp_path, m
             time.sleep(0.01)
     flight, node = pipeline.processes
     assert (flight.ending, node.ending) == ("signal 9", "status 7")
-    assert flight.seconds < node.seconds - 0.25
+    assert flight.seconds < node.seconds - 0.1
     assert capsys.readouterr().out == "node   | once\n"
 
 
