@@ -18,7 +18,7 @@ from multilift_marl._platform import STOPPING, handles_signals
 
 _SCRIPTS = [os.path.abspath(f"{__file__}/../../{name}") for name in ("train.py", "evaluate.py")]
 _MODULES = tuple(
-    f"multilift_marl.{name}" for name in ("cli.", "view", "export", "benchmark", "ros", "px4", "validation")
+    f"multilift_marl.{name}" for name in ("cli.", "view", "export", "benchmark", "ros", "px4", "sitl", "validation")
 )
 
 last_acts: set[Callable[[], object]] = set()
@@ -172,6 +172,21 @@ def interrupted_by_signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler or signal.SIG_DFL)
+
+
+@contextmanager
+def signals_waiting() -> Iterator[None]:
+    """Let signals of `STOPPING` wait until this context ends, whichever thread gets them; ignored ones stay so."""
+    came: list[int] = []
+    numbers = [n for n in STOPPING if handles_signals() and signal.getsignal(n) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, lambda which, frame: came.append(which)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+        if came:
+            signal.raise_signal(came[0])
 
 
 _begin_quiet_import()

@@ -29,6 +29,7 @@ _ROOMS = {
     "px4": "deploy.px4",
     "ros": "deploy.ros",
     "sim.sensors": "sensing.sensors",
+    "sitl": "deploy.sitl",
     "tasks.communication": "sensing.communication",
     "tasks.failures": "mdp.failures",
     "tasks.global_state": "mdp.global_state",

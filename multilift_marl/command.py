@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shlex
 import subprocess
@@ -126,6 +127,18 @@ def spell_command(name: str, *arguments: str) -> str:
 def join_command(*words: str) -> str:
     """Return the words of a command as this system's shell takes them apart again."""
     return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
+
+
+def spell_arguments(options: type[CommandOptions], values: Mapping[str, Any]) -> list[str]:
+    """Return values by key as arguments key=value, from which a command of such options reads the same again."""
+    own, arguments = options.model_fields, []
+    for key, value in values.items():
+        if key not in own or not _is_text(own[key].annotation):
+            value = json.dumps(value, ensure_ascii=False)
+        elif value is None:  # text cannot say so, and no argument does
+            continue
+        arguments.append(f"{key}={value}")
+    return arguments
 
 
 def spell_modules(config: Config) -> list[str]:

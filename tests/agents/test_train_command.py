@@ -56,13 +56,13 @@ def test_interrupt_saves_and_resume_finishes(tmp_path):
     [
         [str(ROOT / "train.py")],
         [str(ROOT / "evaluate.py")],
-        *(["-m", f"multilift_marl.{name}"] for name in ("view", "ros", "px4", "validation")),
+        *(["-m", f"multilift_marl.{name}"] for name in ("view", "ros", "px4", "sitl", "validation")),
         [
             "-c",
             "import sys; sys.argv = ['multilift-train']; from multilift_marl.cli.train import main; sys.exit(main())",
         ],
     ],
-    ids=["train.py", "evaluate.py", "view", "ros", "px4", "validation", "multilift-train"],
+    ids=["train.py", "evaluate.py", "view", "ros", "px4", "sitl", "validation", "multilift-train"],
 )
 def test_interrupt_while_importing_is_one_line(tmp_path, command):
     process = subprocess.Popen(

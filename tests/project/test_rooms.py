@@ -90,7 +90,7 @@ def test_a_module_within_a_renamed_folder_is_found_and_one_that_never_was_is_not
 
 
 @pytest.mark.parametrize(
-    "command", ["view", *(pytest.param(name, marks=pytest.mark.slow) for name in ("px4", "ros", "viewer"))]
+    "command", ["view", *(pytest.param(name, marks=pytest.mark.slow) for name in ("px4", "ros", "sitl", "viewer"))]
 )
 def test_commands_have_short_names(command):
     done = subprocess.run([sys.executable, "-m", f"multilift_marl.{command}", "--help"], capture_output=True, text=True)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -15,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from multilift_marl._platform import STOPPING
+from multilift_marl._interrupt import signals_waiting
+from multilift_marl.deploy.processes import end_together, end_with_parent
 from multilift_marl.errors import ConfigError, FlightError
 from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.system import System
 
 BUILD = "build/px4_sitl_default"
-_PR_SET_PDEATHSIG = 1  # of Linux's prctl
 PX4_PORT = 14580  # of the first PX4, where it hears set-points by UDP; the next ones have the next
 _GRACE = 5.0  # [s] for PX4s to end by themselves
 _RATE_CROSSOVER = 18.5  # [rad/s] of the rate loop: PX4's gain of 0.15 by its iris' 123 rad/s² at a set-point of 1
@@ -85,12 +83,6 @@ USUAL: dict[str, float] = {
 """Parameters of every flight."""
 
 
-def _end_with_parent() -> None:
-    """Let Linux end this process when the one that started it has ended, however that was."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
 def _check_port(index: int) -> None:
     """Refuse a port that PX4 would not get: it starts without, and hears nothing."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -141,7 +133,7 @@ class Autopilots:
         with (folder / "px4.log").open("wb") as output:
             process = subprocess.Popen(
                 command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=output,
-                stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_end_with_parent,
+                stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=end_with_parent,
             )  # fmt: skip
         self._processes[index] = process
 
@@ -161,25 +153,10 @@ class Autopilots:
 
     def close(self) -> None:
         """End them all, and remove their files."""
-        if not self._processes:
-            self._temporary.cleanup()
-            return
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # Ctrl-C once more waits until all have ended
-        running = [process for process in self._processes.values() if process.poll() is None]
-        try:
-            for process in running:
-                os.killpg(process.pid, signal.SIGTERM)
-            end = time.monotonic() + _GRACE
-            while time.monotonic() < end and any(process.poll() is None for process in running):
-                time.sleep(0.02)
-            for process in running:
-                if process.poll() is None:
-                    os.killpg(process.pid, signal.SIGKILL)
-                    process.wait()
+        with signals_waiting():
+            end_together(self._processes.values(), (signal.SIGTERM, _GRACE))
             self._processes.clear()
             self._temporary.cleanup()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def __enter__(self) -> Autopilots:
         return self

@@ -1,0 +1,166 @@
+"""The file of a pipeline: which processes it has, and the command of each."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from multilift_marl.command import CommandOptions, spell_arguments, split_options
+from multilift_marl.config.load import check_names, load_config
+from multilift_marl.deploy.px4.__main__ import Options as FlightOptions
+from multilift_marl.deploy.ros.__main__ import USUAL
+from multilift_marl.deploy.ros.__main__ import Options as NodeOptions
+from multilift_marl.errors import ConfigError, reason, shorten
+from multilift_marl.policies.baselines import SCRIPTED
+from multilift_marl.schema.files import as_mapping
+from multilift_marl.schema.validate import validate
+from multilift_marl.schema.yaml_text import read_yaml
+
+Keys = dict[str, Any]
+_RUN_CODE = {"import", "trust", "px4", "residual", "base_policy", "ray"}
+"""Keys that name what is run, beside `policy=module:Class`."""
+_SHARED = ("seed", "domain", "ros", "names", "allow_network")  # in which nodes that fly a team agree with it
+
+
+class Options(CommandOptions):
+    """Keys of the command, which its file has, too."""
+
+    file: str | None = Field(None, description="YAML file with the keys below; key=value arguments go over it")
+    flight: Keys | None = Field(
+        None, description="keys of multilift_marl.px4; policy=none live=true names=report unless it says otherwise"
+    )
+    simulation: Keys | None = Field(
+        None, description="in place of a flight of PX4s: keys of multilift_marl.ros; policy=none likewise"
+    )
+    nodes: dict[Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,30}$")], Keys] = Field(
+        {}, description="keys of multilift_marl.ros, of each a role; seed and domain as above unless they say otherwise"
+    )
+    common: Keys = Field({}, description="keys of all processes, where they do not say otherwise")
+    bag: str | None = Field(None, description="folder of a ROS 2 bag of the flight")
+    out: str | None = Field(None, description="folder for a log of each process; None: runs/sitl-...")
+
+
+def read_options(values: Mapping[str, Any]) -> Options:
+    """Return the options of arguments by dotted name, over those of the file that they name.
+
+    Raises:
+        ConfigError: a file that cannot be read, names code that nobody trusts, or has wrong keys.
+    """
+    name = values.get("file")
+    merged = {} if name is None else _read_file(Path(str(name)).expanduser())
+    if values.get("trust") is not True:
+        _refuse_code(merged, str(name))
+    for dotted, value in values.items():
+        *sections, key = dotted.split(".", 2 if dotted.startswith("nodes.") else 1)
+        place = merged
+        for section in sections:
+            if place.get(section) is None:
+                place[section] = {}
+            place = place[section]
+            if not isinstance(place, dict):
+                raise ConfigError(f"{dotted}: '{section}' is a value, not a section")
+        place[key] = value
+    return validate(Options, merged, where=str(name))
+
+
+def list_commands(options: Options, out: Path) -> dict[str, list[str]]:
+    """Return the command of each process by its name, that of the flight or simulation first.
+
+    Args:
+        options: of the pipeline.
+        out: folder for what the flight writes.
+
+    Raises:
+        ConfigError: neither flight nor simulation, or both; a wrong key or value of one.
+    """
+    if (options.flight is None) == (options.simulation is None):
+        raise ConfigError("give either flight or simulation, the team that nodes fly, in file=<YAML file>; see --help")
+    common: Keys = {"trust": True} if options.trust else {}
+    common |= options.common
+    if options.flight is not None:
+        kind = "flight"
+        usual = {"policy": "none", "live": True, "names": "report", "out": str(out / "flight"), "bag": options.bag}
+        first = _merge(FlightOptions, usual, common, options.flight)
+        commands = {kind: _command(kind, "px4", FlightOptions, first)}
+    else:
+        if options.bag is not None:
+            raise ConfigError("bag is of a flight, and a simulation writes none; leave it out")
+        kind = "simulation"
+        first = _merge(NodeOptions, {"policy": "none"}, common, options.simulation or {})
+        commands = {kind: _command(kind, "ros", NodeOptions, first)}
+    shared = {key: first[key] for key in _SHARED if key in first}
+    for name, values in options.nodes.items():
+        if name in ("flight", "simulation"):
+            raise ConfigError(f"nodes.{name} has the name of another process; give it another one")
+        if values.get("role", "simulation") == "simulation":
+            raise ConfigError(f"nodes.{name} needs a role, such as policy; a simulation is a section of its own")
+        merged = _merge(NodeOptions, shared, common, values)
+        commands[name] = _command(f"nodes.{name}", "ros", NodeOptions, merged)
+    return commands
+
+
+def _command(name: str, module: str, options: type[CommandOptions], values: Keys) -> list[str]:
+    """Return the command of a process, whose values are checked first."""
+    try:
+        check_names(values, options.model_fields)
+        _, overrides = split_options(options, values)
+        trained = values.get("policy") not in (None, "none", *SCRIPTED)
+        config = values.get("config") or (None if trained else "hover")
+        if config is not None:  # that of a trained policy is found by the process
+            load_config(config, USUAL.get(str(values.get("role")), {}) | overrides)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
+    return [sys.executable, "-m", f"multilift_marl.{module}", *spell_arguments(options, values)]
+
+
+def _merge(options: type[CommandOptions], *parts: Mapping[str, Any]) -> Keys:
+    """Return the values of a process by dotted name; those of later parts go over those of earlier ones."""
+    merged: Keys = {}
+    for part in parts:
+        merged |= _flatten(part, options)
+    return merged
+
+
+def _flatten(values: Mapping[str, Any], options: type[CommandOptions], prefix: str = "") -> Keys:
+    """Return values by dotted name; mappings that a command has as one value stay whole."""
+    flat: Keys = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        whole = not isinstance(value, Mapping) or not value or name in options.model_fields
+        flat |= {name: value} if whole else _flatten(value, options, f"{name}.")
+    return flat
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    try:
+        return as_mapping(read_yaml(path), path, "sections such as 'nodes:'")
+    except ConfigError:  # a ValueError, too
+        raise
+    except FileNotFoundError:
+        raise ConfigError(f"no file {shorten(path, 300)}; give the path of a YAML file, see --help") from None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot read {shorten(path, 300)} as YAML: {reason(error)}") from None
+
+
+def _refuse_code(values: Mapping[str, Any], source: str) -> None:
+    """Refuse what a file would have run: others may have written it."""
+    for key, value in _leaves(values):
+        name = key.rpartition(".")[2]
+        if name in _RUN_CODE or (name == "policy" and ":" in str(value)):
+            raise ConfigError(
+                f"{shorten(source, 300)} has {shorten(key)}={shorten(value)}, which was not run: the code that a file "
+                f"names may be anybody's; read it, then give {shorten(key)}=<value> as an argument, or trust=true"
+            )
+
+
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield values that are no mappings by dotted name."""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
