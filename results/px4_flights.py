@@ -1,16 +1,18 @@
 """Flights by PX4 over seeds that nobody chose: each row of the table is a task, a team and a policy.
 
   python results/px4_flights.py px4=DIR [rows=hover,circle] [flights=20] [out=docs/data/px4_runs.csv] [policy=RUN]
+                                [instance=0]
   python results/px4_flights.py table [out=...]     what docs/flight.md says of them
 
-`policy` flies `hover_px4` as row `hover_learned`. Each flight is one run of `python -m multilift_marl.px4`; those that
-the file has are not flown again.
+`policy` flies `hover_px4` as row `hover_learned`. Each flight is one run of `python -m multilift_marl.px4`, or of
+`multilift_marl.sitl` in rows of nodes; those that the file has are not flown again.
 """
 
 from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -34,18 +36,55 @@ ROWS: dict[str, list[str]] = {
     "hover_rtk_halved": ["config=hover", "policy=formation_integral", "position_errors=0.5"],
     "hover_conditions": ["config=hover_px4", "policy=formation_integral"],
 }
+EIGHT = ("task_options.speed=2", "task_options.acceleration=2")
+RATES = "nodes.control.output=rates"
+
+
+def pipeline(config: str, planner: str, *more: str) -> list[str]:
+    """Return arguments of `multilift_marl.sitl`: a flight, a planner, geometric control and a clock."""
+    return [
+        f"flight.config={config}", "flight.sync=false", f"nodes.planner.config={config}",
+        f"nodes.planner.role={planner}", "nodes.planner.receiver=geometric_control",
+        "nodes.control.role=geometric_control", f"nodes.control.config={config}", "nodes.control.patience=0.2",
+        "nodes.clock.role=clock", "nodes.clock.patience=60", "common.domain=77", *more,
+    ]  # fmt: skip
+
+
+def eight(planner: str, *more: str) -> list[str]:
+    """Return the same of a figure-eight of 2 m/s and 2 m/s²."""
+    spans = [f"{part}.{key}" for part in ("flight", "nodes.planner") for key in EIGHT]
+    return pipeline("track", planner, *spans, *more)
+
+
+PIPELINES: dict[str, list[str]] = {
+    "nodes_hover": pipeline("hover", "trajectory_planner"),
+    "nodes_circle": pipeline("track_circle", "trajectory_planner"),
+    "nodes_circle_mpc": pipeline("track_circle", "mpc_planner"),
+    "nodes_eight": eight("trajectory_planner"),
+    "nodes_eight_rates": eight("trajectory_planner", RATES),
+    "nodes_eight_mpc": eight("mpc_planner"),
+    "nodes_eight_mpc_rates": eight("mpc_planner", RATES),
+}
+ROWS |= {
+    "eight": ["config=track", "policy=formation_lead", *EIGHT],
+}
 COLUMNS = (
     "row", "seed", "success", "position_cm", "rmse_cm", "attitude_deg", "drones_cm", "estimates_cm", "separation_m",
-    "tension_task_N", "tension_N", "tilt_deg", "real_time_factor", "ended",
+    "tension_task_N", "tension_N", "tilt_deg", "real_time_factor", "latency_50_ms", "latency_99_ms", "ended",
 )  # fmt: skip
 
 
-def fly(row: str, seed: int, px4: str) -> dict[str, Any]:
+def fly(row: str, seed: int, px4: str, instance: str) -> dict[str, Any]:
     """Fly once; return what the table says of it."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "multilift_marl.px4", *ROWS[row], f"seed={seed}", f"px4={px4}"]
-        done = subprocess.run([*command, f"out={folder}/out"], cwd=ROOT, capture_output=True, text=True)
-        written = Path(folder) / "out" / "metrics.json"
+        out, flight = Path(folder) / "out", "flight." if row in PIPELINES else ""
+        module, keys = ("sitl", PIPELINES[row]) if row in PIPELINES else ("px4", ROWS[row])
+        command = [sys.executable, "-m", f"multilift_marl.{module}", *keys, f"{flight}seed={seed}", f"out={out}"]
+        done = subprocess.run(
+            [*command, f"{flight}px4={px4}", f"{flight}instance={instance}"], cwd=ROOT, capture_output=True, text=True
+        )
+        written = out / ("flight" if row in PIPELINES else "") / "metrics.json"
+        latency = _read_latency(out / "control.log")
         said = (done.stderr or done.stdout).strip().split("\n")[-1]
         if not written.is_file():
             return {"row": row, "seed": seed, "success": 0, "ended": said}
@@ -59,14 +98,22 @@ def fly(row: str, seed: int, px4: str) -> dict[str, Any]:
         "position_cm": round(100 * metrics["payload_position_error_m"], 2),
         "rmse_cm": round(100 * metrics["payload_rmse_m"], 2),
         "attitude_deg": round(metrics["payload_attitude_error_deg"], 2),
-        "drones_cm": round(100 * flight["drone_error_m"], 2),
+        "drones_cm": "" if flight["drone_error_m"] is None else round(100 * flight["drone_error_m"], 2),
         "estimates_cm": round(100 * flight["estimate_error_m"], 2),
         "separation_m": round(min(phase["separation"] for phase in phases), 3),
         "tension_task_N": round(own["tension"], 1), "tension_N": round(max(phase["tension"] for phase in phases), 1),
         "tilt_deg": round(max(phase["tilt"] for phase in phases), 1),
         "real_time_factor": round(flight["real_time_factor"], 2),
+        **latency,
         "ended": flight["ended"],
     }  # fmt: skip
+
+
+def _read_latency(log: Path) -> dict[str, float]:
+    """Return how long after odometry attitudes or rates were asked for, as the log of that node says at its end."""
+    text = log.read_text() if log.is_file() else ""
+    found = re.search(r"followed odometry by ([\d.]+) / ([\d.]+) /", text)
+    return {f"latency_{share}_ms": float(found[k]) for k, share in ((1, 50), (2, 99))} if found else {}
 
 
 def print_table(lines: list[dict[str, str]]) -> None:
@@ -84,6 +131,7 @@ def print_table(lines: list[dict[str, str]]) -> None:
             row, len(flights), success, f"{np.median(place):.1f} ({place.max():.1f})",
             f"{np.median(angle):.1f} ({angle.max():.1f})", (angle <= 5.0).sum(), f"{column('separation_m').min():.2f}",
             f"{column('tension_task_N').max():.1f}, {column('tension_N').max():.0f}",
+            f"{np.median(column('rmse_cm')):.1f}",
         ]  # fmt: skip
         print("|" + "|".join(str(number) for number in numbers) + "|")
     learned, base = flown.get("hover_learned", {}), flown.get("hover_conditions", {})
@@ -115,7 +163,7 @@ def main(arguments: list[str]) -> int:
         for seed in range(FIRST, FIRST + int(options.get("flights", 20))):
             if (row, seed) in known:
                 continue
-            line = fly(row, seed, options["px4"])
+            line = fly(row, seed, options["px4"], options.get("instance", "0"))
             with out.open("a", newline="") as file:
                 csv.DictWriter(file, COLUMNS, lineterminator="\n").writerow(line)
             print(line, flush=True)

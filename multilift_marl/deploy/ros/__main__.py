@@ -43,12 +43,12 @@ FLYING = ("policy", "trajectory_planner", "mpc_planner")
 NODES = (*FLYING, "geometric_control", "clock")
 OURS = ("simulation", "policy")  # whose topics are ours unless they are told otherwise
 USUAL: dict[str, dict[str, Any]] = {
-    "mpc_planner": {"control.action": "full_state"}
+    "mpc_planner": {"control.action": "full_state", "planner.feedback": 0.0, "planner.estimate": False}
     | {f"control.{key}": wide for key, (_, wide) in ENOUGH["full_state"].items()},
     # PX4's attitude loop answers at 6.5 rad/s, so that the position loop is as slow as PX4's own, see conditions/px4.
     "geometric_control": {
         "control.position_frequency": 2.12, "control.position_damping": 0.707, "control.disturbance": "integral",
-        "control.disturbance_frequency": 0.65,
+        "control.disturbance_frequency": 0.65, "control.attitude_frequency": 11.0,
     },
 }  # fmt: skip
 """Values of the configuration that a role has unless it is told otherwise: the whole motion; PX4's loops."""
