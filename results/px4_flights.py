@@ -37,7 +37,7 @@ ROWS: dict[str, list[str]] = {
     "hover_conditions": ["config=hover_px4", "policy=formation_integral"],
 }
 EIGHT = ("task_options.speed=2", "task_options.acceleration=2")
-RATES = "nodes.control.output=rates"
+RATES, LEAD = "nodes.control.output=rates", "nodes.planner.policy=formation_lead"
 
 
 def pipeline(config: str, planner: str, *more: str) -> list[str]:
@@ -57,11 +57,11 @@ def eight(planner: str, *more: str) -> list[str]:
 
 
 PIPELINES: dict[str, list[str]] = {
-    "nodes_hover": pipeline("hover", "trajectory_planner"),
-    "nodes_circle": pipeline("track_circle", "trajectory_planner"),
+    "nodes_hover": pipeline("hover", "trajectory_planner", "nodes.planner.policy=formation_integral"),
+    "nodes_circle": pipeline("track_circle", "trajectory_planner", LEAD),
     "nodes_circle_mpc": pipeline("track_circle", "mpc_planner"),
-    "nodes_eight": eight("trajectory_planner"),
-    "nodes_eight_rates": eight("trajectory_planner", RATES),
+    "nodes_eight": eight("trajectory_planner", LEAD),
+    "nodes_eight_rates": eight("trajectory_planner", LEAD, RATES),
     "nodes_eight_mpc": eight("mpc_planner"),
     "nodes_eight_mpc_rates": eight("mpc_planner", RATES),
 }

@@ -21,8 +21,8 @@ flight:                      # keys of python -m multilift_marl.px4, which finds
   sync: false                # the clock below does
 nodes:                       # keys of python -m multilift_marl.ros; names are free
   planner: {role: trajectory_planner, config: track_circle, receiver: geometric_control}
-  control: {role: geometric_control, config: track_circle}
-  clock: {role: clock}
+  control: {role: geometric_control, config: track_circle, patience: 0.2}
+  clock: {role: clock, patience: 60}
 common: {domain: 7, env.num_drones: 4}
 """
 _USAGE = f"""Start a flight of PX4s, or a simulation, and the nodes that fly it; end all when it has ended.
