@@ -37,6 +37,7 @@ ROWS: dict[str, list[str]] = {
     "hover_conditions": ["config=hover_px4", "policy=formation_integral"],
 }
 EIGHT = ("task_options.speed=2", "task_options.acceleration=2")
+LONGER = [f"{part}.env.episode_seconds=20" for part in ("flight", "nodes.planner")]  # integrals begin with the task
 RATES, LEAD = "nodes.control.output=rates", "nodes.planner.policy=formation_lead"
 
 
@@ -57,7 +58,7 @@ def eight(planner: str, *more: str) -> list[str]:
 
 
 PIPELINES: dict[str, list[str]] = {
-    "nodes_hover": pipeline("hover", "trajectory_planner", "nodes.planner.policy=formation_integral"),
+    "nodes_hover": pipeline("hover", "trajectory_planner", "nodes.planner.policy=formation_integral", *LONGER),
     "nodes_circle": pipeline("track_circle", "trajectory_planner", LEAD),
     "nodes_circle_mpc": pipeline("track_circle", "mpc_planner"),
     "nodes_eight": eight("trajectory_planner", LEAD),

@@ -205,17 +205,15 @@ def test_a_flight_waits_for_its_orders_and_comes_home_when_it_is_told_to():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("output", ["attitude", "rates"])
-def test_two_nodes_fly_autopilots_and_their_silence_brings_the_team_home(output):
+def test_two_nodes_fly_autopilots_and_their_silence_brings_the_team_home():
     """Planner and geometric control over DDS, until the control is lost in the middle of the task."""
     config = config_of("hover", **PLAIN, **{"env.episode_seconds": 14.0})
-    domain = DOMAIN + 10 * (output == "rates")
-    here, there, third, over = (*(Node(domain=domain) for _ in range(3)), threading.Event())
+    here, there, third, over = (*(Node(domain=DOMAIN) for _ in range(3)), threading.Event())
     planner = PolicyNode(
         config, lambda team: make_scripted("formation", team), there, "report", start="stage", say=lambda text: None,
         receiver="geometric_control",
     )  # fmt: skip
-    control = GeometricControlNode(config, third, patience=1.0, by_rates=output == "rates", say=lambda text: None)
+    control = GeometricControlNode(config, third, patience=1.0, say=lambda text: None)
     places, lost = [], 500
 
     def work(node, until):
