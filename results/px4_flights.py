@@ -60,7 +60,7 @@ def eight(planner: str, *more: str) -> list[str]:
 PIPELINES: dict[str, list[str]] = {
     "nodes_hover": pipeline("hover", "trajectory_planner", "nodes.planner.policy=formation_integral", *LONGER),
     "nodes_circle": pipeline("track_circle", "trajectory_planner", LEAD),
-    "nodes_circle_mpc": pipeline("track_circle", "mpc_planner"),
+    "nodes_circle_mpc": pipeline("track_circle", "mpc_planner", RATES),
     "nodes_eight": eight("trajectory_planner", LEAD),
     "nodes_eight_rates": eight("trajectory_planner", LEAD, RATES),
     "nodes_eight_mpc": eight("mpc_planner"),

@@ -348,7 +348,8 @@ class PolicyNode:
     ) -> None:  # fmt: skip
         """Publish set-points; those with accelerations have what the drones carry added to them."""
         still, store = np.zeros_like(places), self._node.store
-        # A plan knows the force on each cable, its drag included; else it is the formation's.
+        # A plan knows the force on each cable, with the drag in it unless controllers are to add that; else it is the
+        # formation's.
         planned = velocities is not None and self.team.controller.interface.commands_force
         force = (self.team.controller.commanded_force if planned else self.team.task.planned.cable_force)[0]
         velocities, accelerations, jerks = (
@@ -362,7 +363,7 @@ class PolicyNode:
             if self._names.setpoints == POSE:
                 messages = [pose_stamped(store, now, places[i], level(yaws[i]))]
             else:
-                through = still[i] if planned else velocities[i]
+                through = velocities[i] if not planned or self.team.config.control.drag_feedforward else still[i]
                 rise = self._feedforward.acceleration(i, through, accelerations[i], force[i], yaws[i])
                 motion = places[i], velocities[i], rise, yaws[i], yaw_rates[i]
                 if self._names.is_report:
