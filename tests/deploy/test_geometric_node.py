@@ -19,6 +19,7 @@ pytest.importorskip("rosbags")  # of the ros extra
 pytest.importorskip("cyclonedds")
 from ros_wire import Wire
 
+from multilift_marl.deploy.ros.__main__ import USUAL
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER
 from multilift_marl.deploy.ros.geometric_node import DroneControl, GeometricControlNode
@@ -225,19 +226,23 @@ def test_its_integral_is_that_of_the_position_error_and_stops_at_full_thrust():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("output", ["attitude", "rates"])
-def test_a_flight_by_planner_and_control_follows_the_path_of_the_policy(output):
+@pytest.mark.parametrize(("output", "script"), [("attitude", "formation"), ("rates", "formation"), ("rates", "mpc")])
+def test_a_flight_by_planner_and_control_follows_the_path_of_the_policy(output, script):
     """The whole chain over DDS: a circle in the simulation, its drones flown by what two nodes say."""
-    config = config_of("track", **{"env.episode_seconds": 20, "env.num_drones": 3, "payload.mass": 1.0})
+    team = {"env.episode_seconds": 20, "env.num_drones": 3, "payload.mass": 1.0}
+    if script == "mpc":  # fast enough for drag and jerk to matter
+        team |= {"task_options.speed": 2.0, "task_options.acceleration": 2.0, "randomization.payload_mass": 0.0}
+    config = config_of("track", **team)
+    planned = config_of("track", **team, **USUAL["mpc_planner"]) if script == "mpc" else config
     here, there, third = (Node(domain=DOMAIN) for _ in range(3))
-    vec, plain = MultiliftVec(config, EVALUATION), MultiliftVec(config, EVALUATION)
+    vec, plain = MultiliftVec(config, EVALUATION), MultiliftVec(planned, EVALUATION)
     live = LiveFlight(vec, here, "report")
     planner = PolicyNode(
-        config, lambda team: make_scripted("formation", team), there, "report", seed=3, start="stage",
+        planned, lambda team: make_scripted(script, team), there, "report", seed=3, start="stage",
         receiver="geometric_control",
     )  # fmt: skip
     control = GeometricControlNode(config, third, patience=5.0, by_rates=output == "rates")
-    policy, errors = make_scripted("formation", plain), []
+    policy, errors = make_scripted(script, plain), []
     observation, _ = plain.reset(seed=3)
     live.begin(3)
 
