@@ -182,6 +182,19 @@ def test_without_set_points_it_holds_then_says_nothing_and_begins_again(monkeypa
     assert len(bench.sent(0)) == counts[-1] + 1 and bench.said[-1] == "drone 0: following"
 
 
+def test_a_velocity_without_a_place_is_held_at_rest(monkeypatch):
+    bench = Bench(monkeypatch)
+    moving = (np.zeros(3), np.eye(3), np.array([1.0, 0.0, 0.0]), np.zeros(3))
+    bench.ask(0, STEP, np.full(3, np.nan), np.array([1.0, 0.0, 0.0]), np.zeros(3), 0.0)
+    tilts = []
+    for k in range(1, 2 + round(1.1 * HOLD_AFTER * 50)):
+        bench.measure(0, k * STEP, moving)
+        bench.node.spin_once(0.1)
+        tilts.append(read_attitude(bench.sent(0)[-1], 1.0).attitude[0, 2])
+    np.testing.assert_allclose(tilts[0], 0.0, atol=1e-6)  # as fast as it is to be
+    assert tilts[-1] < -0.1  # it brakes
+
+
 def test_it_waits_for_the_set_point_that_belongs_to_an_odometry(monkeypatch):
     bench = Bench(monkeypatch, patience=0.05)
     bench.ask(0, STEP, *HERE)
@@ -272,6 +285,7 @@ def test_a_flight_by_planner_and_control_follows_the_path_of_the_policy(output, 
     [
         ({}, {"names": "multilift"}, "not of names=multilift"),
         ({"control.disturbance": "indi"}, {}, "set integral or none"),
+        ({}, {"drones": []}, "leaves nothing to control"),
         ({}, {"drones": [0, 2]}, r"drones=\[2\] are none of this team, which has 0 to 1"),
     ],
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import annotated_types
 import numpy as np
 import pytest
-from test_mpc import BY_RATES
+from test_mpc import BY_RATES, FULL_STATE
 
 import multilift_marl as ml
 from multilift_marl.policies.baselines import make_scripted
@@ -30,7 +30,7 @@ def bounds():
 @pytest.mark.parametrize(("limits", "conditions"), [("soft", "hover_realistic"), ("hard", "track")])
 @pytest.mark.parametrize(("key", "value"), bounds())
 def test_actions_are_finite(key, value, limits, conditions):
-    overrides = BY_RATES | {"env.num_envs": 3, "env.num_threads": 1, "control.disturbance": "none"}
+    overrides = (FULL_STATE if key == "feedback" else BY_RATES) | {"env.num_envs": 3, "env.num_threads": 1, "control.disturbance": "none"}
     overrides |= {f"planner.{key}": value, "planner.limits": limits}
     vec = ml.make_vec(conditions, **overrides)
     policy = make_scripted("mpc", vec)

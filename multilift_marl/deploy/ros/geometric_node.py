@@ -173,6 +173,8 @@ class GeometricControlNode:
             )
         count = config.env.num_drones
         chosen = range(count) if drones is None else drones
+        if not chosen:
+            raise ConfigError("drones=[] leaves nothing to control; give numbers of drones, or leave it out for all")
         if wrong := [drone for drone in chosen if not 0 <= drone < count]:
             raise ConfigError(f"drones={wrong} are none of this team, which has 0 to {count - 1}")
         self._drones = {i: _Drone(config, i, node, names, by_rates) for i in chosen}
@@ -259,8 +261,8 @@ class GeometricControlNode:
         if mode == SILENT:
             return None
         if mode == HOLDING:
-            still = np.where(np.isfinite(setpoint.position), 0.0, setpoint.velocity)
-            return setpoint._replace(velocity=still, acceleration=drone.control.carried, yaw_rate=0.0, jerk=np.zeros(3))
+            still = np.zeros(3)
+            return setpoint._replace(velocity=still, acceleration=drone.control.carried, yaw_rate=0.0, jerk=still)
         ahead = 1e-9 * (time_ns - stamp) if stamp else 0.0
         ahead = ahead if 0.0 <= ahead <= HOLD_AFTER else 0.0  # a clock of its own
         moved = np.where(np.isfinite(setpoint.velocity), setpoint.velocity, 0.0)
