@@ -30,7 +30,8 @@ def bounds():
 @pytest.mark.parametrize(("limits", "conditions"), [("soft", "hover_realistic"), ("hard", "track")])
 @pytest.mark.parametrize(("key", "value"), bounds())
 def test_actions_are_finite(key, value, limits, conditions):
-    overrides = (FULL_STATE if key == "feedback" else BY_RATES) | {"env.num_envs": 3, "env.num_threads": 1, "control.disturbance": "none"}
+    overrides = FULL_STATE if key == "feedback" else BY_RATES
+    overrides = overrides | {"env.num_envs": 3, "env.num_threads": 1, "control.disturbance": "none"}
     overrides |= {f"planner.{key}": value, "planner.limits": limits}
     vec = ml.make_vec(conditions, **overrides)
     policy = make_scripted("mpc", vec)
