@@ -44,8 +44,8 @@ class LastPlan:
         self.late += late
         self.failed += failed
 
-    def states(self, later: float = 0.0) -> np.ndarray:
-        """Return the planned states (E, 12 + 7 N) `later` [s] from now, the last ones where a plan ends before."""
+    def states(self, later: float | np.ndarray = 0.0) -> np.ndarray:
+        """Return the planned states (E, 12 + 7 N) `later` [s] from now, scalar or (E,); where a plan ends, its last."""
         every = np.arange(len(self.age))
         at = np.minimum((self.age + later) / self._step, self._inputs.shape[1])
         before = np.minimum(at.astype(int), self._inputs.shape[1] - 1)

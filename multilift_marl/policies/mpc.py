@@ -102,7 +102,7 @@ class TeamMpc:
         self._starts = [
             np.zeros((vec.num_envs, 12 + 7 * n)) for _ in range(under_way + 1)
         ]  # of the plans for now and later
-        self._fresh = np.ones(vec.num_envs, bool)
+        self._fresh, self._acted = np.ones(vec.num_envs, bool), np.zeros(vec.num_envs)
         self._last = LastPlan(self.planner.plans, settings.step, self._dt)
         self._without_plan = HoldAccRates(vec) if self._full_state is None else HoldFullState(vec)
         self._approach = Approach.zeros(vec.num_envs)
@@ -176,6 +176,7 @@ class TeamMpc:
         for start in self._starts:
             start[~following] = states[~following]  # they begin
         self._starts = [*self._starts[1:], states.copy()]
+        self._acted = vec.task.time.copy()
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
         late = (perf_counter() - begin) / shape[0] > self._deadline
         self._last.keep(plans, late, plans.failed | unknown)
@@ -207,7 +208,8 @@ class TeamMpc:
 
         Return where the next plans begin, `planner.delay` later, corrected alike.
         """
-        later = self._last.states(self._dt)
+        # Where the last plans are by now, also where steps were missed.
+        later = self._last.states(np.maximum(self._vec.task.time - self._acted, self._dt))
         # Of the plan that began with the present, if plans are ahead of it.
         planned = (self._starts[1] if len(self._starts) > 1 else later).copy()
         off = states - planned

@@ -77,10 +77,10 @@ def test_its_answers_are_the_torques_and_thrusts_of_the_simulations_controller(m
     vec = MultiliftVec(config, EVALUATION)
     vec.reset(seed=seed)
     rng, state, reference, goal = np.random.default_rng(seed), vec.world.state, vec.reference, vec.task.goal
-    for name, size in (("position", 0.05), ("velocity", 0.2), ("acceleration", 0.5), ("jerk", 1.0)):
+    for name, size in (("position", 0.02), ("velocity", 0.1), ("acceleration", 0.3), ("jerk", 0.5)):
         getattr(reference, name)[:] += size * rng.standard_normal((1, 3, 3))
     reference.yaw_rate[:] = 0.3 * rng.standard_normal((1, 3))
-    state.drone_velocity[:] = 0.2 * rng.standard_normal((1, 3, 3))
+    state.drone_velocity[:] = 0.1 * rng.standard_normal((1, 3, 3))
     state.drone_body_rates[:] = 0.3 * rng.standard_normal((1, 3, 3))
     gains, thrust = vec.controller.gains, np.zeros((1, 3, 4))
     fly(0, 1, state, reference, goal.cable_force, thrust, gains, None)
@@ -173,8 +173,9 @@ def test_without_set_points_it_holds_then_says_nothing_and_begins_again(monkeypa
     first = round(HOLD_AFTER * 50) + 2
     # then it is the place alone that counts, with the load held up
     control = DroneControl(bench.config, 0)
-    still = PX4Setpoint(np.zeros(3), np.zeros(3), control.carried, 0.0)
-    control.follow(STILL, still, 0.0)
+    place = np.array([0.0, 0.0, bench.node._drones[0].place[2]])
+    assert HOLD_AFTER - 0.02 <= place[2] <= HOLD_AFTER  # it had moved on by then
+    control.follow(STILL, PX4Setpoint(place, np.zeros(3), control.carried, 0.0), 0.0)
     np.testing.assert_allclose(held[first:], control.share, rtol=1e-6)
     bench.ask(0, 300 * STEP, *HERE)
     bench.measure(0, 300 * STEP, STILL)
@@ -216,6 +217,33 @@ def test_it_waits_for_the_set_point_that_belongs_to_an_odometry(monkeypatch):
     assert len(bench.sent(0)) == 3
 
 
+def test_patience_ends_while_odometry_goes_on(monkeypatch):
+    """An odometry every 20 ms, patience of 0.2 s, and a planner that has gone: held, then silent."""
+    bench = Bench(monkeypatch, patience=0.2)
+    for k in range(1, 200):
+        if k <= 20:
+            bench.ask(0, k * STEP, *HERE)
+        bench.measure(0, k * STEP, STILL)
+        bench.clock += 0.02
+        bench.node.spin_once(0.1)
+    assert [word.split(",")[0] for word in bench.said] == ["drone 0: following", "drone 0: holding", "drone 0: silent"]
+    # one answer after each patience, then for each odometry while it holds
+    assert len(bench.sent(0)) == pytest.approx(20 + 2 + round((LAND_AFTER - 2 * 0.2) * 50), abs=6)
+
+
+def test_what_is_far_off_is_approached_and_no_heading_is_kept():
+    control = DroneControl(config_of(), 0)
+    north = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    motion = (np.zeros(3), north, np.zeros(3), np.zeros(3))
+    tilts = []
+    for x in (0.5, 1.0, 100.0):
+        control.follow(motion, PX4Setpoint(np.array([x, 0.0, 0.0]), np.zeros(3), np.zeros(3), np.nan), 0.0)
+        tilts.append(np.degrees(np.arccos(control.desired[2, 2])))
+        np.testing.assert_allclose(control.desired[:2, 1], [-1.0, 0.0], atol=0.6)  # it faces north still
+        assert np.abs(control.rates).max() <= 4.0
+    assert tilts[0] < tilts[1] < 60.0 and tilts[2] == pytest.approx(tilts[1])
+
+
 def test_its_integral_is_that_of_the_position_error_and_stops_at_full_thrust():
     config = config_of(**{"control.disturbance": "integral", "control.disturbance_limit": 10.0})
     control, plain = DroneControl(config, 0), DroneControl(config_of(), 0)
@@ -228,11 +256,12 @@ def test_its_integral_is_that_of_the_position_error_and_stops_at_full_thrust():
         control.follow(below, setpoint, 0.02)
     gain, full = MultiliftVec(config, EVALUATION).controller._rejection.gain[0], 4 * vehicle.rotor_thrust_max
     assert control.share - plain.share == pytest.approx(gain * 0.1 * 0.8 / full, rel=1e-9)  # m k_p ω ∫ e dt
-    deep = (np.array([0.0, 0.0, -5.0]), *STILL[1:])
+    falling = (below[0], np.eye(3), np.array([0.0, 0.0, -10.0]), np.zeros(3))
     for _ in range(500):  # after the first all rotors are at their limit
-        control.follow(deep, setpoint, 0.02)
+        control.follow(falling, setpoint, 0.02)
+    control.follow(below, setpoint, 5.0)  # after a gap nothing is known of the error in it
     control.follow(below, setpoint, 0.0)
-    assert control.share - plain.share == pytest.approx(gain * (0.1 * 0.8 + 5.0 * 0.02) / full, rel=1e-9)
+    assert control.share - plain.share == pytest.approx(gain * 0.1 * (0.8 + 0.02) / full, rel=1e-9)
     control.restart()
     control.follow(below, setpoint, 0.0)
     assert control.share == pytest.approx(plain.share, rel=1e-12)
@@ -286,6 +315,7 @@ def test_a_flight_by_planner_and_control_follows_the_path_of_the_policy(output, 
         ({}, {"names": "multilift"}, "not of names=multilift"),
         ({"control.disturbance": "indi"}, {}, "set integral or none"),
         ({}, {"drones": []}, "leaves nothing to control"),
+        ({}, {"drones": [1, 1]}, "has a drone twice"),
         ({}, {"drones": [0, 2]}, r"drones=\[2\] are none of this team, which has 0 to 1"),
     ],
 )

@@ -78,7 +78,7 @@ class Options(CommandOptions):
     sync: bool = Field(True, description="with names=report, whether /sync_time is published; role=clock does, too")
     domain: Annotated[Int, Between(0, 232)] = Field(0, description="ROS_DOMAIN_ID of the peers")
     allow_network: bool = Field(False, description="whether other machines may hear and fly it, by multicast")
-    patience: Annotated[Float, Between(0, 10, "s")] = Field(
+    patience: Annotated[Float, Between(0, 1.5, "s")] = Field(
         0.1, description="[s] of real time that a step waits for the set-points of others, with policy=none"
     )
     log: bool = Field(False, description="also the flight logs of PX4, .ulg")

@@ -41,6 +41,7 @@ environment: env.num_drones=6."""
 
 FLYING = ("policy", "trajectory_planner", "mpc_planner")
 NODES = (*FLYING, "geometric_control", "clock")
+CLOCK_PATIENCE = 5.0  # [s]
 OURS = ("simulation", "policy")  # whose topics are ours unless they are told otherwise
 USUAL: dict[str, dict[str, Any]] = {
     "mpc_planner": {"control.action": "full_state", "planner.feedback": 0.0, "planner.estimate": False}
@@ -73,10 +74,10 @@ class Options(CommandOptions):
         "attitude", description="of geometric control, with thrust: attitudes, or body rates"
     )
     drones: list[Int] | None = Field(None, description="with role=geometric_control: which it controls; None: all")
-    patience: Annotated[Float, Between(0, 600, "s")] = Field(
-        0.0,
+    patience: Annotated[Float, Between(0, 600, "s")] | None = Field(
+        None,
         description="[s] of real time that geometric control waits for the set-point of an odometry, and a clock "
-        "for /clock before it broadcasts the machine's time",
+        "for /clock before it broadcasts the machine's time; None: 0, of the clock 5",
     )
     sync: bool = Field(True, description="with names=report, whether a simulation publishes /sync_time, as clocks do")
     start: Literal["at_once", "topic", "stage"] | None = Field(
@@ -164,7 +165,11 @@ def _fly(options: Options, config: Config, policy: NamedPolicy | None, node: Nod
 
     if policy is None:
         raise ConfigError(f"role={options.role} needs a policy: give policy=<a run, an .onnx file or a baseline>")
-    start, say = options.start or ("at_once" if options.role in OURS else "stage"), partial(print, flush=True)
+    staged = options.names == "report"  # others have no stages
+    if options.start == "stage" and not staged:
+        raise ConfigError(f"start=stage needs the stages of names=report, which names={options.names} does not have")
+    start = options.start or ("at_once" if options.role in OURS else "stage" if staged else "topic")
+    say = partial(print, flush=True)
     flown = PolicyNode(config, policy.bind, node, str(options.names), options.seed, start, say, options.receiver)
     print(f"listening {ending}", flush=True)
     try:
@@ -186,7 +191,9 @@ def _control(options: Options, config: Config, node: Node, ending: str) -> None:
 
     say = partial(print, flush=True)
     by_rates = options.output == "rates"
-    control = GeometricControlNode(config, node, str(options.names), options.drones, options.patience, by_rates, say)
+    control = GeometricControlNode(
+        config, node, str(options.names), options.drones, options.patience or 0.0, by_rates, say
+    )
     print(f"listening {ending}", flush=True)
     with suppress(KeyboardInterrupt):
         control.spin(options.seconds or float("inf"))
@@ -200,7 +207,12 @@ def _broadcast(options: Options, config: Config, node: Node, ending: str) -> Non
     """Broadcast the time."""
     from multilift_marl.deploy.ros.clock_node import ClockNode
 
-    clock = ClockNode(config.env.num_drones, node, options.patience, say=partial(print, flush=True))
+    clock = ClockNode(
+        config.env.num_drones,
+        node,
+        CLOCK_PATIENCE if options.patience is None else options.patience,
+        say=partial(print, flush=True),
+    )
     print(f"broadcasting {ending}", flush=True)
     with suppress(KeyboardInterrupt):
         clock.spin(options.seconds or float("inf"))

@@ -86,7 +86,7 @@ def write_reference(
     if np.isfinite(yaw):
         reference.yaw[0, i] = yaw
     reference.yaw_rate[0, i] = yaw_rate if np.isfinite(yaw_rate) else 0.0
-    reference.jerk[0, i] = np.where(np.isfinite(setpoint.jerk), setpoint.jerk, 0.0)
+    reference.jerk[0, i] = 0.0  # which PX4 ignores
 
 
 class TopicAutopilots(Controller):

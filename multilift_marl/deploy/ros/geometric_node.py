@@ -40,6 +40,8 @@ Say = Callable[[str], None]
 Numbers = TypeVar("Numbers", bound=tuple[Any, ...])
 FOLLOWING, HOLDING, SILENT = "following", "holding", "silent"
 _STALE = 1.0  # [s] between odometries, above which the integral does not go on
+_FARTHEST = 1.0  # [m] of a place that is corrected at once; what is farther is approached
+_FASTEST = 4.0  # [rad/s] of body rates, as PX4 limits them
 _REMEMBERED = 1_000_000  # answers of which the latency is known
 
 
@@ -78,7 +80,8 @@ class DroneControl:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the integral."""
+        """Forget the integral and the heading."""
+        self._begins = True
         reset_estimate(0, self._state, self._disturbance)
         self._disturbance.cable_force[:] = 0.0
 
@@ -92,16 +95,25 @@ class DroneControl:
         """
         state = self._state
         state.drone_position[0, 0], state.drone_rotation[0, 0], state.drone_velocity[0, 0] = motion[:3]
-        write_reference(0, setpoint, self.carried, state, self._reference, 0.0)
+        if self._begins:
+            self._reference.yaw[:] = np.arctan2(motion[1][1, 0], motion[1][0, 0])  # unless another is asked for
+            self._begins = False
+        off = setpoint.position - motion[0]
+        near = setpoint.position - off * max(
+            1.0 - _FARTHEST / max(float(np.linalg.norm(np.nan_to_num(off))), 1e-9), 0.0
+        )
+        write_reference(0, setpoint._replace(position=near), self.carried, state, self._reference, 0.0)
+        self._reference.jerk[0, 0] = np.nan_to_num(setpoint.jerk)
         force = self._nominal
         if self._reject is not None:
             # Whether thrusts are at a limit is known of those that were asked for last.
             each = np.clip(self._total / 4, 0.0, self._vehicle.rotor_thrust_max)
             state.rotor_speed[:] = np.sqrt(each / self._vehicle.thrust_coefficient)[..., None]
-            paced = self._rejection._replace(dt=min(elapsed, _STALE))
+            paced = self._rejection._replace(dt=elapsed if elapsed <= _STALE else 0.0)
             self._reject(0, 1, state, self._reference, self._nominal, self._disturbance, paced)
             force = self._disturbance.cable_force
         command_attitude(0, 1, state, self._reference, force, self._desired, self._rates, self._total, self._gains)
+        np.clip(self._rates, -_FASTEST, _FASTEST, out=self._rates)
 
     @property
     def desired(self) -> np.ndarray:
@@ -135,6 +147,7 @@ class _Drone:
         self.arrived = 0.0
         self.pending = False
         self.setpoint: tuple[int, PX4Setpoint] | None = None
+        self.place = np.full(3, np.nan)  # of the last set-point, moved on
         self.heard_at = self.answered = -1  # [ns] by the odometry's clock
 
 
@@ -175,6 +188,8 @@ class GeometricControlNode:
         chosen = range(count) if drones is None else drones
         if not chosen:
             raise ConfigError("drones=[] leaves nothing to control; give numbers of drones, or leave it out for all")
+        if len(set(chosen)) < len(chosen):
+            raise ConfigError(f"drones={list(chosen)} has a drone twice; give each once")
         if wrong := [drone for drone in chosen if not 0 <= drone < count]:
             raise ConfigError(f"drones={wrong} are none of this team, which has 0 to {count - 1}")
         self._drones = {i: _Drone(config, i, node, names, by_rates) for i in chosen}
@@ -214,7 +229,9 @@ class GeometricControlNode:
     @staticmethod
     def _hear(drone: _Drone, now: float) -> None:
         for time_ns, motion in drone.take_odometry():
-            drone.measured, drone.arrived, drone.pending = (time_ns, motion), now, True
+            if not drone.pending:  # patience is counted from the oldest that waits
+                drone.arrived = now
+            drone.measured, drone.pending = (time_ns, motion), True
         for stamped in drone.take_setpoints():
             drone.setpoint = stamped
             drone.heard_at = -1 if drone.measured is None else drone.measured[0]
@@ -262,11 +279,14 @@ class GeometricControlNode:
             return None
         if mode == HOLDING:
             still = np.zeros(3)
-            return setpoint._replace(velocity=still, acceleration=drone.control.carried, yaw_rate=0.0, jerk=still)
+            return setpoint._replace(
+                position=drone.place, velocity=still, acceleration=drone.control.carried, yaw_rate=0.0, jerk=still
+            )
         ahead = 1e-9 * (time_ns - stamp) if stamp else 0.0
         ahead = ahead if 0.0 <= ahead <= HOLD_AFTER else 0.0  # a clock of its own
         moved = np.where(np.isfinite(setpoint.velocity), setpoint.velocity, 0.0)
-        return setpoint._replace(position=setpoint.position + ahead * moved)
+        drone.place = setpoint.position + ahead * moved
+        return setpoint._replace(position=drone.place)
 
 
 def _of(drone: int, numbers: Numbers) -> Numbers:

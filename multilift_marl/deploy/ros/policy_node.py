@@ -285,10 +285,11 @@ class PolicyNode:
         observation = self.team.begin(self._bodies.measured, self._seed, self._target)
         self._why = f"the task has failed where the team is, {self.team.failure}" if self.team.failure else ""
         if not self._wanted and not self._why:
-            self._change(READY, "true on /fly lets it fly")
+            self._change(READY, f"{self._awaited} lets it fly")
             # Drones are asked to stay where they are, so that who follows set-points has some before the flight.
             reference = self.team.reference  # which begins where the drones are
-            self._publish(reference.position[0], reference.yaw[0])
+            if self._names.setpoints != FULL_STATE:  # which would start a Crazyflie's motors
+                self._publish(reference.position[0], reference.yaw[0])
         if self._why or not self._wanted:
             return None
         self._policy.reset()
@@ -394,6 +395,6 @@ def check_flyable(config: Config, names: str = "multilift", receiver: str = PX4)
     if receiver != PX4 and not is_report:
         raise ConfigError(f"receiver={receiver} takes set-points of PX4; set names=report")
     if config.env.sensing == "onboard":
-        raise ConfigError("role=policy cannot fly policies of env.sensing=onboard: nobody measures the cables' tension")
+        raise ConfigError("this node cannot fly policies of env.sensing=onboard: nobody measures the cables' tension")
     if config.task == "loss":
-        raise ConfigError("role=policy cannot fly config=loss: nobody measures whose motors have stopped")
+        raise ConfigError("this node cannot fly config=loss: nobody measures whose motors have stopped")

@@ -90,7 +90,10 @@ def list_commands(options: Options, out: Path) -> dict[str, list[str]]:
         if options.bag is not None:
             raise ConfigError("bag is of a flight, and a simulation writes none; leave it out")
         kind = "simulation"
-        first = _merge(NodeOptions, {"policy": "none"}, common, options.simulation or {})
+        usual = {"policy": "none"}
+        if any(values.get("role", "policy") != "policy" for values in options.nodes.values()):
+            usual["names"] = "report"  # of all roles but that
+        first = _merge(NodeOptions, usual, common, options.simulation or {})
         commands = {kind: _command(kind, "ros", NodeOptions, first)}
     shared = {key: first[key] for key in _SHARED if key in first}
     for name, values in options.nodes.items():
@@ -98,7 +101,7 @@ def list_commands(options: Options, out: Path) -> dict[str, list[str]]:
             raise ConfigError(f"nodes.{name} has the name of another process; give it another one")
         if values.get("role", "simulation") == "simulation":
             raise ConfigError(f"nodes.{name} needs a role, such as policy; a simulation is a section of its own")
-        merged = _merge(NodeOptions, shared, common, values)
+        merged = _merge(NodeOptions, common, shared, values)
         commands[name] = _command(f"nodes.{name}", "ros", NodeOptions, merged)
     return commands
 
