@@ -21,8 +21,8 @@ from ros_wire import Wire
 
 from multilift_marl.deploy.ros.__main__ import USUAL
 from multilift_marl.deploy.ros.dds import Node
-from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER
-from multilift_marl.deploy.ros.geometric_node import DroneControl, GeometricControlNode
+from multilift_marl.deploy.ros.failsafe import HOLD_AFTER
+from multilift_marl.deploy.ros.geometric_node import SILENT_AFTER, DroneControl, GeometricControlNode
 from multilift_marl.deploy.ros.live import LiveFlight
 from multilift_marl.deploy.ros.policy_node import PolicyNode
 from multilift_marl.deploy.ros.types import (
@@ -166,7 +166,7 @@ def test_without_set_points_it_holds_then_says_nothing_and_begins_again(monkeypa
         bench.measure(0, k * STEP, STILL)
         bench.node.spin_once(0.1)
         counts.append(len(bench.sent(0)))
-    answered = 1 + round(LAND_AFTER * 50)
+    answered = 1 + round(SILENT_AFTER * 50)
     assert counts[-1] == pytest.approx(answered, abs=1)
     assert [word.split(",")[0] for word in bench.said] == ["drone 0: following", "drone 0: holding", "drone 0: silent"]
     held = [read_attitude(message, 1.0).thrust for message in bench.sent(0)]
@@ -227,8 +227,8 @@ def test_patience_ends_while_odometry_goes_on(monkeypatch):
         bench.clock += 0.02
         bench.node.spin_once(0.1)
     assert [word.split(",")[0] for word in bench.said] == ["drone 0: following", "drone 0: holding", "drone 0: silent"]
-    # one answer after each patience, then for each odometry while it holds
-    assert len(bench.sent(0)) == pytest.approx(20 + 2 + round((LAND_AFTER - 2 * 0.2) * 50), abs=6)
+    # an answer after each patience (two of 11 odometries), then for each odometry while it holds
+    assert len(bench.sent(0)) == pytest.approx(20 + 2 + SILENT_AFTER * 50 - 2 * 11, abs=2)
 
 
 def test_what_is_far_off_is_approached_and_no_heading_is_kept():

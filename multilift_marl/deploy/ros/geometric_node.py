@@ -17,7 +17,7 @@ from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import command_attitude
 from multilift_marl.deploy.ros.autopilots import read_stamped, write_reference
 from multilift_marl.deploy.ros.dds import Node
-from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER
+from multilift_marl.deploy.ros.failsafe import HOLD_AFTER
 from multilift_marl.deploy.ros.messages import NAMES, Topic, control_topics
 from multilift_marl.deploy.ros.types import (
     ATTITUDE,
@@ -39,6 +39,7 @@ from multilift_marl.sim.state import SystemState
 Say = Callable[[str], None]
 Numbers = TypeVar("Numbers", bound=tuple[Any, ...])
 FOLLOWING, HOLDING, SILENT = "following", "holding", "silent"
+SILENT_AFTER = 0.5  # [s] without a set-point; then the fail-safe of who executes attitudes is to begin
 _STALE = 1.0  # [s] between odometries, above which the integral does not go on
 _FARTHEST = 1.0  # [m] of a place that is corrected at once; what is farther is approached
 _FASTEST = 4.0  # [rad/s] of body rates, as PX4 limits them
@@ -155,7 +156,7 @@ class GeometricControlNode:
     """Controls drones of PX4 by attitude or body rates, and thrust, one answer for each odometry.
 
     Set-points move on by their velocities to the time of the odometry. A drone without a fresh one holds the last
-    place, and after 2 s nothing more is said of it: its autopilot has a fail-safe of its own.
+    place, and after 0.5 s nothing more is said of it: its autopilot has a fail-safe of its own.
 
     Args:
         config: the rig, its gains, and `control.disturbance`, none or integral.
@@ -268,7 +269,7 @@ class GeometricControlNode:
             drone.heard_at = time_ns
         age = 1e-9 * (time_ns - drone.heard_at)
         stamp, setpoint = drone.setpoint
-        mode = FOLLOWING if age <= HOLD_AFTER else HOLDING if age <= LAND_AFTER else SILENT
+        mode = FOLLOWING if age <= HOLD_AFTER else HOLDING if age <= SILENT_AFTER else SILENT
         if mode != drone.mode:
             if mode != FOLLOWING or drone.mode == SILENT:
                 self._say(f"drone {i}: {mode}" + ("" if mode == FOLLOWING else f", no set-point for {age:.2f} s"))
