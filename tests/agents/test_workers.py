@@ -87,7 +87,8 @@ def test_a_worker_that_is_stopped_is_replaced_bit_for_bit(tmp_path, local_ray, m
     pid = ray.get(wounded.rollouts._workers[0].pulse.options(concurrency_group="pulse").remote())
     os.kill(pid, signal.SIGSTOP)
     assert_equal(whole, learn(wounded, 2))
-    assert not psutil.pid_exists(pid)
+    with contextlib.suppress(psutil.NoSuchProcess):
+        psutil.Process(pid).wait(60)  # Ray may still be clearing it away
 
 
 @pytest.mark.slow
