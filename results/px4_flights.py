@@ -132,9 +132,15 @@ def print_table(lines: list[dict[str, str]]) -> None:
             row, len(flights), success, f"{np.median(place):.1f} ({place.max():.1f})",
             f"{np.median(angle):.1f} ({angle.max():.1f})", (angle <= 5.0).sum(), f"{column('separation_m').min():.2f}",
             f"{column('tension_task_N').max():.1f}, {column('tension_N').max():.0f}",
-            f"{np.median(column('rmse_cm')):.1f}",
+            f"{np.median(column('rmse_cm')):.1f} ({column('rmse_cm').max():.1f})",
         ]  # fmt: skip
         print("|" + "|".join(str(number) for number in numbers) + "|")
+    nodes = [line for line in lines if line["latency_50_ms"]]
+    for name in ("latency_50_ms", "latency_99_ms", "real_time_factor", "separation_m") if nodes else ():
+        values = np.array([float(line[name]) for line in nodes])
+        print(
+            f"{len(nodes)} flights by nodes, {name}: {np.median(values):.2f} ({values.min():.2f} to {values.max():.2f})"
+        )
     learned, base = flown.get("hover_learned", {}), flown.get("hover_conditions", {})
     if both := sorted(learned.keys() & base.keys()):
         for name in ("position_cm", "attitude_deg"):

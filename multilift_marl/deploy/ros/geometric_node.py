@@ -66,11 +66,11 @@ class DroneControl:
         system, control = config.system, config.control
         self._vehicle = system.vehicles[drone]
         gains = make_gains(control, system)
-        gains = gains._replace(load_share=np.zeros_like(gains.load_share), drag=np.zeros_like(gains.drag))
-        self._gains = _of(drone, gains)
+        alone = {name: np.zeros_like(getattr(gains, name)) for name in ("load_share", "drag")}
+        self._gains = _of(drone, gains._replace(**alone))
         self._reject = None
         if control.disturbance != "none":
-            rejection = make_rejection(control, system, make_gains(control, system), 1.0 / config.env.policy_hz)
+            rejection = make_rejection(control, system, gains, 1.0 / config.env.policy_hz)
             self._rejection = _of(drone, rejection._replace(gains=self._gains))
             self._reject = REJECTIONS[control.disturbance]
         self._state, self._reference = SystemState.zeros(1, 1), Reference.zeros(1, 1)
@@ -100,9 +100,8 @@ class DroneControl:
             self._reference.yaw[:] = np.arctan2(motion[1][1, 0], motion[1][0, 0])  # unless another is asked for
             self._begins = False
         off = setpoint.position - motion[0]
-        near = setpoint.position - off * max(
-            1.0 - _FARTHEST / max(float(np.linalg.norm(np.nan_to_num(off))), 1e-9), 0.0
-        )
+        far = max(float(np.linalg.norm(np.nan_to_num(off))), _FARTHEST)
+        near = setpoint.position - (1.0 - _FARTHEST / far) * off
         write_reference(0, setpoint._replace(position=near), self.carried, state, self._reference, 0.0)
         self._reference.jerk[0, 0] = np.nan_to_num(setpoint.jerk)
         force = self._nominal
