@@ -1,0 +1,99 @@
+"""Obstacles among which teams fly: convex bodies, fixed or moving back and forth, each environment its own.
+
+Row m of an environment is one obstacle; rows of kind NONE are free. A wall with gaps is several boxes, a mesh its convex
+hull. Distances are in `obstacle_distance.py`, their bodies in MuJoCo's model in `obstacle_bodies.py`.
+"""
+
+from __future__ import annotations
+
+from math import cos, pi, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl.kernels.jit import kernel
+
+NONE, BOX, CYLINDER, SPHERE, HULL = range(5)
+KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": SPHERE, "hull": HULL}
+HIDDEN = (0.0, 0.0, -100.0)  # [m] where free rows are
+
+
+class Obstacles(NamedTuple):
+    """M obstacles of E environments; live arrays."""
+
+    kind: np.ndarray
+    """(E, M) int64, NONE, BOX, CYLINDER (upright in its own frame), SPHERE or HULL."""
+    size: np.ndarray
+    """(E, M, 3) half edges of the box that encloses it in its own frame: of a cylinder radius twice and half height,
+    of a sphere its radius thrice [m]."""
+    rotation: np.ndarray
+    """(E, M, 3, 3) its own frame to world; fixed."""
+    position: np.ndarray
+    """(E, M, 3) of its middle, now [m]."""
+    velocity: np.ndarray
+    """(E, M, 3) now [m/s]."""
+    center: np.ndarray
+    """(E, M, 3) about which it moves: position = center + travel · sin(2π (t/period + phase)) [m]."""
+    travel: np.ndarray
+    """(E, M, 3) zero of a fixed one [m]."""
+    period: np.ndarray
+    """(E, M) [s]."""
+    phase: np.ndarray
+    """(E, M) [-]."""
+    hull: np.ndarray
+    """(E, M) int64, row of `System.hulls` with a HULL's vertices."""
+
+    @classmethod
+    def zeros(cls, num_envs: int, count: int) -> Obstacles:
+        """Return M free rows."""
+        shape = num_envs, count
+        place = np.tile(np.array(HIDDEN), (*shape, 1))
+        return cls(
+            kind=np.zeros(shape, np.int64),
+            size=np.ones((*shape, 3)),
+            rotation=np.tile(np.eye(3), (*shape, 1, 1)),
+            position=place,
+            velocity=np.zeros((*shape, 3)),
+            center=place.copy(),
+            travel=np.zeros((*shape, 3)),
+            period=np.ones(shape),
+            phase=np.zeros(shape),
+            hull=np.zeros(shape, np.int64),
+        )
+
+
+@kernel
+def move_obstacles(e, t, obstacles):
+    """Write positions and velocities of environment e at a time [s]; return whether any obstacle moves."""
+    moving = False
+    for m in range(obstacles.kind.shape[1]):
+        rate = 2.0 * pi / obstacles.period[e, m]
+        angle = rate * t + 2.0 * pi * obstacles.phase[e, m]
+        share, change = sin(angle), rate * cos(angle)
+        for i in range(3):
+            travel = obstacles.travel[e, m, i]
+            moving = moving or travel != 0.0
+            obstacles.position[e, m, i] = obstacles.center[e, m, i] + share * travel
+            obstacles.velocity[e, m, i] = change * travel
+    return moving
+
+
+def clear_obstacles(env: int, obstacles: Obstacles) -> None:
+    """Make all rows of one environment free."""
+    obstacles.kind[env] = NONE
+    obstacles.center[env] = obstacles.position[env] = HIDDEN
+    obstacles.travel[env] = obstacles.velocity[env] = 0.0
+
+
+def place_obstacle(
+    env: int, row: int, obstacles: Obstacles, kind: int, size: tuple[float, float, float],
+    position: tuple[float, float, float], yaw: float = 0.0,
+) -> None:  # fmt: skip
+    """Put a fixed box, cylinder or sphere into a row; sizes as in `Obstacles.size`, `yaw` [rad] turns it about z."""
+    c, s = cos(yaw), sin(yaw)
+    obstacles.kind[env, row] = kind
+    obstacles.size[env, row] = size
+    obstacles.rotation[env, row] = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    obstacles.center[env, row] = obstacles.position[env, row] = position
+    obstacles.travel[env, row] = obstacles.velocity[env, row] = 0.0
+    obstacles.period[env, row], obstacles.phase[env, row], obstacles.hull[env, row] = 1.0, 0.0, 0
