@@ -1,7 +1,7 @@
 """Obstacles among which teams fly: convex bodies, fixed or moving back and forth, each environment its own.
 
-Row m of an environment is one obstacle; rows of kind NONE are free. A wall with gaps is several boxes, a mesh its convex
-hull. Distances are in `obstacle_distance.py`, their bodies in MuJoCo's model in `obstacle_bodies.py`.
+Row m of an environment is one obstacle; rows of kind NONE are free. A wall with gaps is several boxes, a mesh its
+convex hull. Distances are in `obstacle_distance.py`, their bodies in MuJoCo's model in `obstacle_bodies.py`.
 """
 
 from __future__ import annotations
