@@ -24,11 +24,7 @@ SIDE = 2.8  # ... to its sides
 TALL = 4.0  # height of pillars and walls
 LEVEL = 1.4  # height of start and goal, at least
 CEILING = 2.6  # of the payload
-PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # how many, and least gaps between them
-    "sparse": (7, 1.15),
-    "dense": (14, 0.72),
-    "unknown": (11, 0.85),
-}  # how many, and how far apart their surfaces
+PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # how many; least gaps between them
 RADIUS = 0.12, 0.32  # of pillars
 GAPS = 0.5, 0.8  # widths of the gaps of a narrow map over the resting formation's
 WALLS = 3
