@@ -89,7 +89,7 @@ def drone_places(system: System, forces: np.ndarray) -> np.ndarray:
 def find_breach(forces: np.ndarray, system: System) -> str | None:
     """Return which limit of a shape its cable forces (N, 3) [N] break, in words; None if none."""
     limits = make_shape_limits(system)
-    spare = np.zeros(_num_spares(len(forces)))
+    spare = np.zeros(num_spares(len(forces)))
     write_spares(forces, limits, spare)
     n = len(forces)
     pairs = n * (n - 1) // 2
@@ -127,7 +127,7 @@ def _with_choices(shapes: FormationShapes, limits: ShapeLimits) -> FormationShap
 
 
 def _holds(forces: np.ndarray, limits: ShapeLimits) -> bool:
-    spare = np.zeros(_num_spares(len(forces)))
+    spare = np.zeros(num_spares(len(forces)))
     write_spares(forces, limits, spare)
     return bool(spare.min(initial=0.0) >= -1e-9)
 
@@ -207,12 +207,13 @@ def _minimize(
     return x
 
 
-def _num_spares(n: int) -> int:
+def num_spares(n: int) -> int:
+    """Return how many limits the shape of N drones has."""
     return n * (n - 1) + 3 * n
 
 
 def _num_residuals(n: int) -> int:
-    return len(_SHARES) * _num_spares(n) + n
+    return len(_SHARES) * num_spares(n) + n
 
 
 @kernel

@@ -31,7 +31,7 @@ SQUEEZE = 0.3  # ... of one in the narrowest shape, over one in the open
 CLIMB = 1.5  # [-] of a metre of height
 TURN = 0.5  # [m] cost of a radian of yaw
 RESHAPE = 0.4  # [m] of a mode
-UNKNOWN = np.float32(1e9)
+UNKNOWN = 1e9
 
 
 class Lattice(NamedTuple):
@@ -70,6 +70,8 @@ class SearchWork(NamedTuple):
     """(Q,) int32 the state before it."""
     closed: np.ndarray
     """(Q,) bool."""
+    price: np.ndarray
+    """(C,) of a metre of the payload's way in each cell, `UNKNOWN` where it does not fit."""
     ahead: np.ndarray
     """(C,) heuristic of each cell [m]."""
     key: np.ndarray
@@ -125,12 +127,13 @@ def search_route(lattice: Lattice, start: np.ndarray, body: TeamBody, scene: Sce
     cells = int(lattice.count.prod())
     states = cells * YAWS * len(lattice.arms)
     work = SearchWork(
-        cost=np.full(states, UNKNOWN, np.float32),
-        clearance=np.full(states, UNKNOWN, np.float32),
+        cost=np.full(states, UNKNOWN),
+        clearance=np.full(states, UNKNOWN),
         parent=np.empty(states, np.int32),
         closed=np.zeros(states, bool),
-        ahead=np.empty(cells, np.float32),
-        key=np.empty(max(8 * cells, 24 * most) + 64, np.float32),
+        price=np.full(cells, UNKNOWN),
+        ahead=np.full(cells, UNKNOWN),
+        key=np.empty(max(8 * cells, 24 * most) + 64),
         state=np.empty(max(8 * cells, 24 * most) + 64, np.int32),
     )
     measure_way(lattice, body, scene, work)
@@ -194,14 +197,22 @@ def pop(work, size):
 
 @kernel
 def measure_way(lattice, body, scene, work):
-    """Write the payload's way from each cell to the goal (Dijkstra), `UNKNOWN` where it does not fit."""
+    """Write the payload's way from each cell to the goal (Dijkstra), `UNKNOWN` where there is none."""
+    # How close each cell is to obstacles.
     count, step = lattice.count, lattice.step
     thinnest = min(body.half[0], body.half[1], body.half[2]) + lattice.clearance[0]
     wide = lattice.reach[0] + lattice.clearance[1]
     across, layer = count[2], count[1] * count[2]
-    for cell in range(work.ahead.shape[0]):
-        work.ahead[cell] = UNKNOWN
     goal = lattice.goal[0]
+    for cell in range(work.price.shape[0]):
+        place = place_of(cell, 0.0, lattice)
+        here, far = (place[0], place[1], place[2]), wide
+        for m in range(scene.kind.shape[0]):
+            far = min(far, obstacle_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0])
+        if far >= thinnest or cell == goal:
+            work.price[cell] = 1.0 + CAUTION * (1.0 - max(far, 0.0) / wide) ** 2
+
+    # From the goal outwards.
     work.ahead[goal] = 0.0
     size = push(work, 0, 0.0, goal)
     while size > 0:
@@ -210,14 +221,6 @@ def measure_way(lattice, body, scene, work):
         if key > work.ahead[cell]:
             continue
         x, y, z = cell // layer, cell // across % count[1], cell % across
-        here = (lattice.low[0] + x * step[0], lattice.low[1] + y * step[1], lattice.low[2] + z * step[2])
-        far = wide
-        for m in range(scene.kind.shape[0]):
-            far = min(far, obstacle_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0])
-        if far < thinnest and cell != goal:
-            work.ahead[cell] = UNKNOWN
-            continue
-        price = 1.0 + CAUTION * (1.0 - max(far, 0.0) / wide) ** 2
         for i in range(-1, 2):
             for j in range(-1, 2):
                 for k in range(-1, 2):
@@ -226,8 +229,8 @@ def measure_way(lattice, body, scene, work):
                         continue
                     other = u * layer + v * across + w
                     length = sqrt((i * step[0]) ** 2 + (j * step[1]) ** 2 + (CLIMB * k * step[2]) ** 2)
-                    cost = key + price * length
-                    if cost < work.ahead[other]:
+                    cost = key + 0.5 * (work.price[cell] + work.price[other]) * length
+                    if work.price[other] < UNKNOWN and cost < work.ahead[other]:
                         work.ahead[other] = cost
                         size = push(work, size, cost, other)
 

@@ -1,0 +1,95 @@
+"""The speed along a route: as fast as limits of all bodies allow, from rest to rest.
+
+The curve through pose and shape is a quintic B-spline of its knots. Payload and drones keep limits of speed and
+acceleration along it, those of speed lower where obstacles are close: two passes along the curve give the fastest
+speeds. Their means over a short time make a curve of continuous derivatives in time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from multilift_marl.planning.spline import fit_spline
+
+SAMPLES = 4  # of the curve between two knots
+KNOT = 0.1  # [s] between the knots in time
+BOXES = 4  # means that are taken in turn, each over ...
+BOX = 0.2  # [s]
+_TICK = 0.02  # [s] of the times at which means are taken
+
+
+def sample_curve(knots: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return values (M, D) of the quintic B-spline of knots (K, D) at parameters u (M,) from 0 to K - 1.
+
+    It begins and ends at the first and the last knot, beyond which knots are mirrored in them.
+    """
+    head, tail = 2 * knots[0] - knots[2:0:-1], 2 * knots[-1] - knots[-2:-4:-1]
+    points = np.vstack([head, knots, tail, tail[-1:]])
+    i = np.clip(u.astype(int), 0, len(knots) - 2)
+    t = u - i
+    value = np.zeros((len(u), knots.shape[1]))
+    for k in range(6):
+        value += _basis(t + 5 - k)[:, None] * points[i + k]
+    return value
+
+
+def _basis(x: np.ndarray) -> np.ndarray:
+    """Return the quintic B-spline whose support is 0 to 6."""
+    binomials = (1, -6, 15, -20, 15, -6)
+    return sum(b * np.maximum(x - k, 0.0) ** 5 for k, b in enumerate(binomials)) / 120.0
+
+
+def fit_speeds(points: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+    """Return the times (M,) [s] at which samples are passed, from rest to rest.
+
+    Args:
+        points: (M, P, 3) of all bodies at even parameters of the curve [m].
+        speed: (M,) of any body, at most [m/s].
+        acceleration: (M,) the same, of turning and of gaining speed each at most 1/√2 of it [m/s²].
+    """
+    each = acceleration / 2**0.5
+    first = np.gradient(points, axis=0)
+    second = np.gradient(first, axis=0)
+    rate = np.maximum(np.linalg.norm(first, axis=-1).max(axis=1), 1e-9)  # [m] per sample
+    bend = np.maximum(np.linalg.norm(second, axis=-1).max(axis=1), 1e-9)
+    square = np.minimum((speed / rate) ** 2, each / bend)  # of samples per second
+    square[0] = square[-1] = 0.0
+    gain = 2.0 * each / rate
+    for i in range(1, len(square)):
+        square[i] = min(square[i], square[i - 1] + 0.5 * (gain[i] + gain[i - 1]))
+    for i in range(len(square) - 2, -1, -1):
+        square[i] = min(square[i], square[i + 1] + 0.5 * (gain[i] + gain[i + 1]))
+    pace = np.sqrt(square)
+    return np.append(0.0, np.cumsum(2.0 / np.maximum(pace[1:] + pace[:-1], 1e-6)))
+
+
+def smooth_times(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return even times (T,) [s] and the samples passed then, as means of those at the given times (M,).
+
+    The means take `BOXES * BOX` seconds more, half of it at either end.
+    """
+    width = round(BOX / _TICK)
+    spread = BOXES * width // 2
+    ticks = int(np.ceil(times[-1] / _TICK)) + 1
+    at = np.arange(-2 * spread, ticks + 2 * spread) * _TICK
+    passed = np.interp(at, times, np.arange(len(times)))
+    box = np.full(width, 1.0 / width)
+    for _ in range(BOXES):
+        passed = np.convolve(passed, box, mode="valid")
+    return np.arange(len(passed)) * _TICK, passed
+
+
+def time_route(knots: np.ndarray, points: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+    """Return the route through knots as a table, see `fit_spline`.
+
+    Args:
+        knots: (K, D) of the curve.
+        points, speed, acceleration: see `fit_speeds`, at `SAMPLES` for each piece.
+    """
+    times, passed = smooth_times(fit_speeds(points, speed, acceleration))
+    stride = round(KNOT / _TICK)
+    last = -(-(len(times) - 1) // stride) * stride  # whole knots; the curve rests at its end
+    index = np.minimum(np.arange(0, last + 1, stride), len(times) - 1)
+    values = sample_curve(knots, np.clip(passed[index] / SAMPLES, 0, len(knots) - 1))
+    values[0], values[-1] = knots[0], knots[-1]
+    return fit_spline(np.column_stack([np.arange(0, last + 1, stride) * _TICK, values]))
