@@ -71,39 +71,48 @@ def find_route(
     start: np.ndarray,
     goal: np.ndarray,
     settings: RouteSettings = RouteSettings(),
+    departure: np.ndarray | None = None,
 ) -> Route:
-    """Return a route of a team from rest in the resting formation to the same at a goal.
+    """Return a route of a team to rest in the resting formation at a goal.
 
     Args:
         system: the team.
         obstacles, env: those of one environment, where they are now.
         start, goal: (4,) x, y, z [m] and yaw [rad] of the level payload.
         settings: what it is to keep.
+        departure: (3, 4 + J) pose and shape of the team at the start, their rates and second rates, such as
+            `route.sample(time)[:3, 0]` of another route; `start` is not used then. None: at rest in the resting
+            formation.
 
     Raises:
         NoRoute: start or goal is too close to an obstacle or too low, or no way is found.
     """
     begun = thread_time()
-    start, goal = np.array(start, dtype=float), np.array(goal, dtype=float)
+    start = np.array(start if departure is None else departure[0, :4], dtype=float)
+    goal = np.array(goal, dtype=float)
     shapes, scene = make_shapes(system), make_scene(obstacles, env)
     body = make_body(system, shapes.rest, shapes.modes)
     space = _space(start, goal, scene, body, settings)
-    for name, pose in (("start", start), ("goal", goal)):
-        _check_pose(name, pose, space, body, scene, settings)
+    still = np.zeros(len(shapes.modes))
+    shape = still if departure is None else departure[0, 4:]
+    for name, pose, own in (("start", start, shape), ("goal", goal, still)):
+        _check_pose(name, pose, own, space, body, scene, settings)
+    nearest = int(np.abs(shapes.choices - shape).sum(axis=1).argmin())
 
     expanded = 0
     for fineness in FINENESS:
         step = fineness * STEP * (system.payload_size[:2].min() / 2 + body.radius.max()) * np.array([1.0, 1.0, TALL])
         clearance = settings.least_clearance * fineness**2, settings.comfort
         lattice = make_lattice(start, goal, space, step, body, shapes, clearance)
-        way, count = search_route(lattice, start, body, scene, settings.most)
+        way, count = search_route(lattice, start, nearest, body, scene, settings.most)
         expanded += count
         if not len(way):
             continue
         states = states_at(way, lattice, shapes)
+        states[0, 4:] = shape
         turns = round((states[-1, 3] - goal[3]) / (2 * np.pi))
         states[-1, :4] = *goal[:3], goal[3] + 2 * np.pi * turns
-        route = _make_route(states, system, body, scene, space, settings)
+        route = _make_route(states, departure, system, body, scene, space, settings)
         if route is not None:
             return route._replace(report=route.report._replace(expanded=expanded, planning_time=thread_time() - begun))
     raise NoRoute(
@@ -124,15 +133,16 @@ def _space(start: np.ndarray, goal: np.ndarray, scene: Scene, body: TeamBody, se
 
 
 def _check_pose(
-    name: str, pose: np.ndarray, space: np.ndarray, body: TeamBody, scene: Scene, settings: RouteSettings
-) -> None:
-    """Refuse a start or a goal where the resting team cannot be."""
+    name: str, pose: np.ndarray, shape: np.ndarray, space: np.ndarray, body: TeamBody, scene: Scene,
+    settings: RouteSettings,
+) -> None:  # fmt: skip
+    """Refuse a start or a goal where the team cannot be."""
     if pose[2] < space[0, 2] - 1e-9:
         raise NoRoute(f"the {name} is {pose[2]:.2f} m high, and the payload has to be at least {space[0, 2]:.2f} m high")
     if (pose[:3] < space[0] - 1e-9).any() or (pose[:3] > space[1] + 1e-9).any():
         raise NoRoute(f"the {name} {_text(pose)} is outside the space from {_text(space[0])} to {_text(space[1])}")
     arms = np.zeros_like(body.rest)
-    write_arms(np.zeros(len(body.modes)), body, arms)
+    write_arms(shape, body, arms)
     left = team_clearance(tuple(pose), arms, body, scene, team_reach(arms, body), settings.comfort)
     if left < settings.least_clearance:
         where = "in an obstacle" if left <= 0 else f"{left:.3f} m from an obstacle"
@@ -147,8 +157,9 @@ def _text(place: np.ndarray) -> str:
 
 
 def _make_route(
-    states: np.ndarray, system: System, body: TeamBody, scene: Scene, space: np.ndarray, settings: RouteSettings
-) -> Route | None:
+    states: np.ndarray, departure: np.ndarray | None, system: System, body: TeamBody, scene: Scene, space: np.ndarray,
+    settings: RouteSettings,
+) -> Route | None:  # fmt: skip
     """Return the smooth route along states (S, 4 + J) of a lattice, None if it comes too close to obstacles."""
     weights = coordinate_scale(len(body.modes))
     knots, spacing = space_knots(states, weights)
@@ -179,7 +190,7 @@ def _make_route(
     points = _points(values, system, body)
     care = np.clip(clearance / settings.comfort, _SLOWEST, 1.0)
     for _ in range(REPAIRS):
-        table = time_route(knots, points, care * settings.speed, care * settings.acceleration)
+        table = time_route(knots, points, care * settings.speed, care * settings.acceleration, departure)
         report = RouteReport(0, _length(values), float(table[-1, 0]), 0.0, 0.0)
         route = Route(table[:, 0], table, body.rest, body.modes, report)
         motion = move_team(route, system, body, scene, settings.comfort)

@@ -25,13 +25,14 @@ from multilift_marl.planning.team_clearance import (
 )
 
 YAWS = 16  # of the lattice
-GREED = 2.0  # [-] weight of the heuristic: the way found costs at most so many times the least
+GREED = 1.3  # [-] weight of the heuristic: the way found costs at most so many times the least
 CAUTION = 2.0  # [-] cost of a metre beside obstacles, and ...
 SQUEEZE = 0.3  # ... of one in the narrowest shape, over one in the open
 CLIMB = 1.5  # [-] of a metre of height
 TURN = 0.5  # [m] cost of a radian of yaw
 RESHAPE = 0.4  # [m] of a mode
 UNKNOWN = 1e9
+MEASURED, REACHED, CLOSED = 1, 2, 4
 
 
 class Lattice(NamedTuple):
@@ -60,16 +61,16 @@ class Lattice(NamedTuple):
 
 
 class SearchWork(NamedTuple):
-    """Arrays of a search over Q states."""
+    """Arrays of a search over Q states, of which few are ever used."""
 
+    status: np.ndarray
+    """(Q,) uint8, a sum of MEASURED, REACHED and CLOSED; 0 of a state not looked at."""
     cost: np.ndarray
-    """(Q,) of the best way to each [m]."""
+    """(Q,) of the best way to each [m], if REACHED."""
     clearance: np.ndarray
-    """(Q,) of each [m]."""
+    """(Q,) of each [m], if MEASURED."""
     parent: np.ndarray
-    """(Q,) int32 the state before it."""
-    closed: np.ndarray
-    """(Q,) bool."""
+    """(Q,) int32 the state before it, if REACHED."""
     price: np.ndarray
     """(C,) of a metre of the payload's way in each cell, `UNKNOWN` where it does not fit."""
     ahead: np.ndarray
@@ -115,22 +116,24 @@ def make_lattice(
     )
 
 
-def search_route(lattice: Lattice, start: np.ndarray, body: TeamBody, scene: Scene, most: int) -> tuple[np.ndarray, int]:
+def search_route(
+    lattice: Lattice, start: np.ndarray, shape: int, body: TeamBody, scene: Scene, most: int
+) -> tuple[np.ndarray, int]:
     """Return the states (K,) of the best way found, none if there is none, and how many states were expanded.
 
     Args:
         lattice: of the search.
-        start: (4,) its first state.
+        start, shape: (4,) its first state's pose, the choice of its shape.
         body, scene: the team and the obstacles.
         most: states to expand.
     """
     cells = int(lattice.count.prod())
     states = cells * YAWS * len(lattice.arms)
     work = SearchWork(
-        cost=np.full(states, UNKNOWN),
-        clearance=np.full(states, UNKNOWN),
+        status=np.zeros(states, np.uint8),
+        cost=np.empty(states),
+        clearance=np.empty(states),
         parent=np.empty(states, np.int32),
-        closed=np.zeros(states, bool),
         price=np.full(cells, UNKNOWN),
         ahead=np.full(cells, UNKNOWN),
         key=np.empty(max(8 * cells, 24 * most) + 64),
@@ -139,7 +142,7 @@ def search_route(lattice: Lattice, start: np.ndarray, body: TeamBody, scene: Sce
     measure_way(lattice, body, scene, work)
     cell = np.rint((start[:3] - lattice.low) / lattice.step).astype(np.int64)
     first = (cell[0] * lattice.count[1] + cell[1]) * lattice.count[2] + cell[2]
-    last, expanded = expand_states(int(first) * YAWS * len(lattice.arms), lattice, body, scene, work, most)
+    last, expanded = expand_states(int(first) * YAWS * len(lattice.arms) + shape, lattice, body, scene, work, most)
     if last < 0:
         return np.zeros(0, np.int64), expanded
     way = [last]
@@ -238,7 +241,8 @@ def measure_way(lattice, body, scene, work):
 @kernel
 def check_state(state, lattice, body, scene, work):
     """Return the clearance of a state [m], measured once."""
-    if work.clearance[state] == UNKNOWN:
+    if not work.status[state] & MEASURED:
+        work.status[state] |= MEASURED
         shapes = lattice.arms.shape[0]
         cell, yaw, shape = state // (YAWS * shapes), state // shapes % YAWS, state % shapes
         work.clearance[state] = team_clearance(
@@ -267,7 +271,8 @@ def still_ahead(cell, yaw, shape, lattice, work):
 @kernel
 def reach_state(state, other, length, lattice, body, scene, work, size):
     """Let a way lead from a state to another if that is free, and the best to it so far; return the heap's new size."""
-    if work.closed[other] or work.cost[state] + length >= work.cost[other]:
+    status = work.status[other]
+    if status & CLOSED or (status & REACHED and work.cost[state] + length >= work.cost[other]):
         return size
     shapes = lattice.arms.shape[0]
     cell, yaw, shape = other // (YAWS * shapes), other // shapes % YAWS, other % shapes
@@ -288,9 +293,10 @@ def reach_state(state, other, length, lattice, body, scene, work, size):
             return size
     short = 1.0 - clear / lattice.clearance[1]
     cost = work.cost[state] + length * (1.0 + CAUTION * short * short + SQUEEZE * lattice.size[shape])
-    if cost >= work.cost[other]:
+    if status & REACHED and cost >= work.cost[other]:
         return size
     work.cost[other], work.parent[other] = cost, state
+    work.status[other] |= REACHED
     return push(work, size, cost + GREED * still_ahead(cell, yaw, shape, lattice, work), other)
 
 
@@ -301,13 +307,14 @@ def expand_states(first, lattice, body, scene, work, most):
     shapes = lattice.arms.shape[0]
     across, layer = count[2], count[1] * count[2]
     work.cost[first], work.parent[first] = 0.0, -1
+    work.status[first] |= REACHED
     check_state(first, lattice, body, scene, work)
     size, expanded = push(work, 0, 0.0, first), 0
     while size > 0 and expanded < most:
         state, size = pop(work, size)
-        if work.closed[state]:
+        if work.status[state] & CLOSED:
             continue
-        work.closed[state] = True
+        work.status[state] |= CLOSED
         expanded += 1
         cell, yaw, shape = state // (YAWS * shapes), state // shapes % YAWS, state % shapes
         if cell == lattice.goal[0] and yaw == lattice.goal[1] and shape == 0:

@@ -15,6 +15,7 @@ SAMPLES = 4  # of the curve between two knots
 KNOT = 0.1  # [s] between the knots in time
 BOXES = 4  # means that are taken in turn, each over ...
 BOX = 0.2  # [s]
+FADE = 0.8  # [s] in which what a curve lacks of the motion at its start fades away
 _TICK = 0.02  # [s] of the times at which means are taken
 
 
@@ -39,13 +40,14 @@ def _basis(x: np.ndarray) -> np.ndarray:
     return sum(b * np.maximum(x - k, 0.0) ** 5 for k, b in enumerate(binomials)) / 120.0
 
 
-def fit_speeds(points: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
-    """Return the times (M,) [s] at which samples are passed, from rest to rest.
+def fit_speeds(points: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, pace: float = 0.0) -> np.ndarray:
+    """Return the times (M,) [s] at which samples are passed, to rest at the last one.
 
     Args:
         points: (M, P, 3) of all bodies at even parameters of the curve [m].
         speed: (M,) of any body, at most [m/s].
         acceleration: (M,) the same, of turning and of gaining speed each at most 1/√2 of it [m/s²].
+        pace: samples per second at the first one.
     """
     each = acceleration / 2**0.5
     first = np.gradient(points, axis=0)
@@ -53,43 +55,79 @@ def fit_speeds(points: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) 
     rate = np.maximum(np.linalg.norm(first, axis=-1).max(axis=1), 1e-9)  # [m] per sample
     bend = np.maximum(np.linalg.norm(second, axis=-1).max(axis=1), 1e-9)
     square = np.minimum((speed / rate) ** 2, each / bend)  # of samples per second
-    square[0] = square[-1] = 0.0
+    square[0], square[-1] = min(square[0], pace**2), 0.0
     gain = 2.0 * each / rate
     for i in range(1, len(square)):
         square[i] = min(square[i], square[i - 1] + 0.5 * (gain[i] + gain[i - 1]))
     for i in range(len(square) - 2, -1, -1):
         square[i] = min(square[i], square[i + 1] + 0.5 * (gain[i] + gain[i + 1]))
-    pace = np.sqrt(square)
-    return np.append(0.0, np.cumsum(2.0 / np.maximum(pace[1:] + pace[:-1], 1e-6)))
+    paces = np.sqrt(square)
+    return np.append(0.0, np.cumsum(2.0 / np.maximum(paces[1:] + paces[:-1], 1e-6)))
 
 
-def smooth_times(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return even times (T,) [s] and the samples passed then, as means of those at the given times (M,).
+def smooth_times(times: np.ndarray, pace: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return even times (T,) [s] from 0 and the samples passed then, as means of those at the given times (M,).
 
-    The means take `BOXES * BOX` seconds more, half of it at either end.
+    The means take half of `BOXES * BOX` seconds more at a rest.
+
+    Args:
+        times: see `fit_speeds`.
+        pace: samples per second before the first one.
     """
     width = round(BOX / _TICK)
-    spread = BOXES * width // 2
-    ticks = int(np.ceil(times[-1] / _TICK)) + 1
-    at = np.arange(-2 * spread, ticks + 2 * spread) * _TICK
-    passed = np.interp(at, times, np.arange(len(times)))
+    spread = BOXES * (width - 1) // 2
+    before = spread if pace > 0.0 else 2 * spread
+    at = np.arange(-before, int(np.ceil(times[-1] / _TICK)) + 1 + 2 * spread) * _TICK
+    passed = np.interp(at, times, np.arange(len(times))) + pace * np.minimum(at, 0.0)
     box = np.full(width, 1.0 / width)
     for _ in range(BOXES):
         passed = np.convolve(passed, box, mode="valid")
     return np.arange(len(passed)) * _TICK, passed
 
 
-def time_route(knots: np.ndarray, points: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+def time_route(
+    knots: np.ndarray,
+    points: np.ndarray,
+    speed: np.ndarray,
+    acceleration: np.ndarray,
+    departure: np.ndarray | None = None,
+) -> np.ndarray:
     """Return the route through knots as a table, see `fit_spline`.
 
     Args:
         knots: (K, D) of the curve.
         points, speed, acceleration: see `fit_speeds`, at `SAMPLES` for each piece.
+        departure: (3, D) values, rates and second rates at the start; None: at rest. What the curve lacks of them is
+            added, and fades away in `FADE` seconds.
     """
-    times, passed = smooth_times(fit_speeds(points, speed, acceleration))
+    pace = 0.0
+    if departure is not None:  # its part along the curve
+        ahead = (knots[1] - knots[0])[:3] / SAMPLES
+        pace = max(0.0, float(departure[1, :3] @ ahead) / max(float(ahead @ ahead), 1e-12))
+        rate = np.linalg.norm(points[1] - points[0], axis=-1).max()
+        pace = min(pace, float(speed[0] / max(rate, 1e-9)))
+    times, passed = smooth_times(fit_speeds(points, speed, acceleration, pace), pace)
     stride = round(KNOT / _TICK)
     last = -(-(len(times) - 1) // stride) * stride  # whole knots; the curve rests at its end
     index = np.minimum(np.arange(0, last + 1, stride), len(times) - 1)
-    values = sample_curve(knots, np.clip(passed[index] / SAMPLES, 0, len(knots) - 1))
-    values[0], values[-1] = knots[0], knots[-1]
-    return fit_spline(np.column_stack([np.arange(0, last + 1, stride) * _TICK, values]))
+    at = np.arange(0, last + 1, stride) * _TICK
+    u = np.clip(passed / SAMPLES, 0, len(knots) - 1)
+    values = sample_curve(knots, u[index])
+    values[-1] = knots[-1]
+    if departure is None:
+        values[0] = knots[0]
+        return fit_spline(np.column_stack([at, values]))
+    curve = sample_curve(knots, u[:3])  # at 0, 1 and 2 ticks
+    rates = (-1.5 * curve[0] + 2.0 * curve[1] - 0.5 * curve[2]) / _TICK
+    bends = (curve[0] - 2.0 * curve[1] + curve[2]) / _TICK**2
+    fade = min(FADE, at[-1])
+    values += fade_out(departure - np.array([values[0], rates, bends]), at, fade)
+    return fit_spline(np.column_stack([at, values]), (departure[1], departure[2]))
+
+
+def fade_out(lack: np.ndarray, times: np.ndarray, fade: float) -> np.ndarray:
+    """Return the quintic (T, D) that begins with value, rate and second rate `lack` (3, D), and is zero after `fade`."""
+    u = np.clip(times / fade, 0.0, 1.0)[:, None]
+    value, rate, bend = lack[0], lack[1] * fade, lack[2] * fade**2
+    # (1 - u)³ times a polynomial of second degree
+    return (1 - u) ** 3 * (value + u * (rate + 3 * value) + u**2 * (0.5 * bend + 3 * rate + 6 * value))

@@ -14,7 +14,7 @@ from multilift_marl.kernels.jit import kernel
 NO_FILE = np.zeros((2, 13))  # the table of a task without a file: at rest at the origin
 
 
-def fit_spline(rows: np.ndarray) -> np.ndarray:
+def fit_spline(rows: np.ndarray, start: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
     """Return the quintic spline through rows (K, 1 + D) as a table (K, 1 + 3 D): time, values, rates, second rates.
 
     Each piece is the quintic with the given value, velocity and acceleration at its two ends. Velocity and
@@ -23,11 +23,14 @@ def fit_spline(rows: np.ndarray) -> np.ndarray:
 
     Args:
         rows: t [s] and D values, four in paths; at least 2 rows, t increasing.
+        start: velocity and acceleration (D,) at the first row, if it is not at rest there.
     """
     count, unit = len(rows), float(np.median(np.diff(rows[:, 0])))  # a unit of time for which the equations are even
     h, d = np.diff(rows[:, 0]) / unit, np.diff(rows[:, 1:], axis=0)
     solution = np.zeros((count, 2, d.shape[1]))
     upper, right = np.zeros((count, 2, 2)), np.zeros_like(solution)
+    if start is not None:
+        solution[0] = right[0] = start[0] * unit, start[1] * unit**2
     for i in range(1, count - 1):  # the first line of each block is of the third derivative, the second of the fourth
         p, q = h[i - 1], h[i]
         before = np.array([[-24 / p**2, -3 / p], [-168 / p**3, -24 / p**2]])
