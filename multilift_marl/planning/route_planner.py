@@ -32,6 +32,7 @@ TALL = 1.5  # [-] steps of height, over those
 REPAIRS = 8  # of the curve, and as many of its speeds
 CLOSER = 0.015  # [m] that a knot is to keep more, each time that it is too close
 SLOWER = 0.75  # of speed and acceleration where they bring the team too close
+_STILL = 0.05  # [m/s] below which a team is at rest
 _AHEAD = 1.0  # [s] before and after a time, in which the team is slower then
 _SLOWEST = 0.35  # of speed and acceleration in the open, where obstacles are closest
 
@@ -163,6 +164,9 @@ def _make_route(
     """Return the smooth route along states (S, 4 + J) of a lattice, None if it comes too close to obstacles."""
     weights = coordinate_scale(len(body.modes))
     knots, spacing = space_knots(states, weights)
+    lead, pace = np.zeros(len(weights)), 0.0
+    if departure is not None and (fast := float(np.linalg.norm(weights * departure[1]))) > _STILL:
+        lead, pace = departure[1] * spacing / fast, fast / spacing * SAMPLES
     band = Band(
         body=body,
         scene=scene,
@@ -172,6 +176,7 @@ def _make_route(
         safe=np.full(len(knots), settings.clearance),
         comfort=settings.comfort,
         spacing=spacing,
+        lead=lead,
     )
     for _ in range(REPAIRS):
         knots = smooth_knots(knots, band)
@@ -190,7 +195,7 @@ def _make_route(
     points = _points(values, system, body)
     care = np.clip(clearance / settings.comfort, _SLOWEST, 1.0)
     for _ in range(REPAIRS):
-        table = time_route(knots, points, care * settings.speed, care * settings.acceleration, departure)
+        table = time_route(knots, points, care * settings.speed, care * settings.acceleration, pace, departure)
         report = RouteReport(0, _length(values), float(table[-1, 0]), 0.0, 0.0)
         route = Route(table[:, 0], table, body.rest, body.modes, report)
         motion = move_team(route, system, body, scene, settings.comfort)

@@ -52,6 +52,8 @@ class Band(NamedTuple):
     """[m] beyond which more distance is worth nothing."""
     spacing: float
     """[m] of knots."""
+    lead: np.ndarray
+    """(4 + J,) from a knot before the first one to that, with a motion that goes on; zeros without."""
 
 
 class BandWork(NamedTuple):
@@ -159,6 +161,15 @@ def assemble(knots, band, w):
                         other = (2.0 * b - 1.0) if order == 1 else (1.0 - 3.0 * (b % 2))
                         if q > 0:
                             w.hessian[(p - 1) * size + i, (p - q) * size] += pull * share * other
+
+    # The second difference at the first knot, where the band goes on with a motion.
+    for i in range(size):
+        if band.lead[i] != 0.0 or band.lead[0] != 0.0:
+            pull = STIFFNESS / h**3 * band.scale[i] ** 2
+            value = knots[1, i] - knots[0, i] - band.lead[i]
+            cost += 0.5 * pull * value * value
+            w.gradient[i] += pull * value
+            w.hessian[i, 0] += pull
 
     # Each knot alone.
     for k in range(1, count - 1):

@@ -15,7 +15,7 @@ SAMPLES = 4  # of the curve between two knots
 KNOT = 0.1  # [s] between the knots in time
 BOXES = 4  # means that are taken in turn, each over ...
 BOX = 0.2  # [s]
-FADE = 0.8  # [s] in which what a curve lacks of the motion at its start fades away
+FADE = 1.0  # [s] in which what a curve lacks of the motion at its start fades away
 _TICK = 0.02  # [s] of the times at which means are taken
 
 
@@ -55,8 +55,11 @@ def fit_speeds(points: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, 
     rate = np.maximum(np.linalg.norm(first, axis=-1).max(axis=1), 1e-9)  # [m] per sample
     bend = np.maximum(np.linalg.norm(second, axis=-1).max(axis=1), 1e-9)
     square = np.minimum((speed / rate) ** 2, each / bend)  # of samples per second
-    square[0], square[-1] = min(square[0], pace**2), 0.0
     gain = 2.0 * each / rate
+    # From a start that is faster than that, the team brakes.
+    brake = 0.5 * (gain[1:] + gain[:-1])
+    square = np.maximum(square, pace**2 - np.append(0.0, np.cumsum(brake)))
+    square[0], square[-1] = pace**2, 0.0
     for i in range(1, len(square)):
         square[i] = min(square[i], square[i - 1] + 0.5 * (gain[i] + gain[i - 1]))
     for i in range(len(square) - 2, -1, -1):
@@ -90,22 +93,17 @@ def time_route(
     points: np.ndarray,
     speed: np.ndarray,
     acceleration: np.ndarray,
+    pace: float = 0.0,
     departure: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the route through knots as a table, see `fit_spline`.
 
     Args:
         knots: (K, D) of the curve.
-        points, speed, acceleration: see `fit_speeds`, at `SAMPLES` for each piece.
+        points, speed, acceleration, pace: see `fit_speeds`, at `SAMPLES` for each piece.
         departure: (3, D) values, rates and second rates at the start; None: at rest. What the curve lacks of them is
             added, and fades away in `FADE` seconds.
     """
-    pace = 0.0
-    if departure is not None:  # its part along the curve
-        ahead = (knots[1] - knots[0])[:3] / SAMPLES
-        pace = max(0.0, float(departure[1, :3] @ ahead) / max(float(ahead @ ahead), 1e-12))
-        rate = np.linalg.norm(points[1] - points[0], axis=-1).max()
-        pace = min(pace, float(speed[0] / max(rate, 1e-9)))
     times, passed = smooth_times(fit_speeds(points, speed, acceleration, pace), pace)
     stride = round(KNOT / _TICK)
     last = -(-(len(times) - 1) // stride) * stride  # whole knots; the curve rests at its end
