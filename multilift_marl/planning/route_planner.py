@@ -12,7 +12,7 @@ from multilift_marl.planning.route import NoRoute, Route, RouteReport
 from multilift_marl.planning.route_motion import RouteMotion, move_team
 from multilift_marl.planning.route_search import make_lattice, search_route, states_at
 from multilift_marl.planning.route_smoothing import Band, coordinate_scale, smooth_knots, space_knots
-from multilift_marl.planning.route_timing import SAMPLES, sample_curve, time_route
+from multilift_marl.planning.route_timing import FADE, SAMPLES, sample_curve, time_route
 from multilift_marl.planning.team_clearance import (
     Scene,
     TeamBody,
@@ -31,6 +31,7 @@ STEP = 0.5  # [-] of the lattice, over the narrowest half width of payload and d
 TALL = 1.5  # [-] steps of height, over those
 REPAIRS = 8  # of the curve, and as many of its speeds
 CLOSER = 0.015  # [m] that a knot is to keep more, each time that it is too close
+FIRMER = 1.25  # of acceleration where a moving start leaves little room to brake
 SLOWER = 0.75  # of speed and acceleration where they bring the team too close
 _STILL = 0.05  # [m/s] below which a team is at rest
 _AHEAD = 1.0  # [s] before and after a time, in which the team is slower then
@@ -164,9 +165,11 @@ def _make_route(
     """Return the smooth route along states (S, 4 + J) of a lattice, None if it comes too close to obstacles."""
     weights = coordinate_scale(len(body.modes))
     knots, spacing = space_knots(states, weights)
-    lead, pace = np.zeros(len(weights)), 0.0
+    lead, pace = np.zeros(len(weights)), (0.0, 0.0)
     if departure is not None and (fast := float(np.linalg.norm(weights * departure[1]))) > _STILL:
-        lead, pace = departure[1] * spacing / fast, fast / spacing * SAMPLES
+        lead = departure[1] * spacing / fast
+        gain = float((weights * departure[1]) @ (weights * departure[2])) / fast
+        pace = fast / spacing * SAMPLES, gain / spacing * SAMPLES
     band = Band(
         body=body,
         scene=scene,
@@ -194,28 +197,33 @@ def _make_route(
     # Speeds: lower where obstacles are close, and again where inertia swings drones towards them.
     points = _points(values, system, body)
     care = np.clip(clearance / settings.comfort, _SLOWEST, 1.0)
+    slow, firm = care, care
     for _ in range(REPAIRS):
-        table = time_route(knots, points, care * settings.speed, care * settings.acceleration, pace, departure)
+        table = time_route(knots, points, slow * settings.speed, firm * settings.acceleration, pace, departure)
         report = RouteReport(0, _length(values), float(table[-1, 0]), 0.0, 0.0)
         route = Route(table[:, 0], table, body.rest, body.modes, report)
         motion = move_team(route, system, body, scene, settings.comfort)
         if motion.feasible() and motion.clearance.min() >= settings.least_clearance:
             least = float(motion.clearance.min())
             return route._replace(report=report._replace(clearance=least))
-        care = _slower(care, values, motion, settings)
+        if pace[0] > 0.0 and not motion.feasible(FADE):  # it brakes too late for its goal
+            firm = FIRMER * firm
+            continue
+        share = _slower(values, motion, settings)
+        slow, firm = share * slow, share * firm
     return None
 
 
-def _slower(care: np.ndarray, values: np.ndarray, motion: RouteMotion, settings: RouteSettings) -> np.ndarray:
-    """Return the shares of speed and acceleration (M,), lower about where the team comes too close or is overtaxed."""
+def _slower(values: np.ndarray, motion: RouteMotion, settings: RouteSettings) -> np.ndarray:
+    """Return shares of speed and acceleration (M,), lower about where the team comes too close, or is overtaxed."""
     close = motion.clearance < settings.least_clearance
     if not motion.feasible() or not close.any():
-        return SLOWER * care
+        return np.full(len(values), SLOWER)
     near = np.zeros(len(motion.times), bool)
     for time in motion.times[close]:
         near |= np.abs(motion.times - time) <= _AHEAD
     nearest = np.linalg.norm(values[:, None, :3] - motion.places[None, near, :3], axis=-1).min(axis=1)
-    return np.where(nearest < 0.1, SLOWER, 1.0) * care
+    return np.where(nearest < 0.1, SLOWER, 1.0)
 
 
 def _arms(values: np.ndarray, body: TeamBody) -> np.ndarray:

@@ -68,20 +68,22 @@ def fit_speeds(points: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, 
     return np.append(0.0, np.cumsum(2.0 / np.maximum(paces[1:] + paces[:-1], 1e-6)))
 
 
-def smooth_times(times: np.ndarray, pace: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def smooth_times(times: np.ndarray, pace: tuple[float, float] = (0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
     """Return even times (T,) [s] from 0 and the samples passed then, as means of those at the given times (M,).
 
     The means take half of `BOXES * BOX` seconds more at a rest.
 
     Args:
         times: see `fit_speeds`.
-        pace: samples per second before the first one.
+        pace: samples per second at the first one, and their change in a second, which goes on before it.
     """
     width = round(BOX / _TICK)
     spread = BOXES * (width - 1) // 2
-    before = spread if pace > 0.0 else 2 * spread
+    before = spread if pace[0] > 0.0 else 2 * spread
     at = np.arange(-before, int(np.ceil(times[-1] / _TICK)) + 1 + 2 * spread) * _TICK
-    passed = np.interp(at, times, np.arange(len(times))) + pace * np.minimum(at, 0.0)
+    passed = np.interp(at, times, np.arange(len(times)))
+    past = np.minimum(at, 0.0)
+    passed += pace[0] * past + 0.5 * pace[1] * past**2
     box = np.full(width, 1.0 / width)
     for _ in range(BOXES):
         passed = np.convolve(passed, box, mode="valid")
@@ -93,18 +95,19 @@ def time_route(
     points: np.ndarray,
     speed: np.ndarray,
     acceleration: np.ndarray,
-    pace: float = 0.0,
+    pace: tuple[float, float] = (0.0, 0.0),
     departure: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the route through knots as a table, see `fit_spline`.
 
     Args:
         knots: (K, D) of the curve.
-        points, speed, acceleration, pace: see `fit_speeds`, at `SAMPLES` for each piece.
+        points, speed, acceleration: see `fit_speeds`, at `SAMPLES` for each piece.
+        pace: see `smooth_times`.
         departure: (3, D) values, rates and second rates at the start; None: at rest. What the curve lacks of them is
             added, and fades away in `FADE` seconds.
     """
-    times, passed = smooth_times(fit_speeds(points, speed, acceleration, pace), pace)
+    times, passed = smooth_times(fit_speeds(points, speed, acceleration, pace[0]), pace)
     stride = round(KNOT / _TICK)
     last = -(-(len(times) - 1) // stride) * stride  # whole knots; the curve rests at its end
     index = np.minimum(np.arange(0, last + 1, stride), len(times) - 1)
