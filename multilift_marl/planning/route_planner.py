@@ -12,7 +12,7 @@ from multilift_marl.planning.route import NoRoute, Route, RouteReport
 from multilift_marl.planning.route_motion import RouteMotion, move_team
 from multilift_marl.planning.route_search import make_lattice, search_route, states_at
 from multilift_marl.planning.route_smoothing import Band, coordinate_scale, smooth_knots, space_knots
-from multilift_marl.planning.route_timing import FADE, SAMPLES, sample_curve, time_route
+from multilift_marl.planning.route_timing import SAMPLES, sample_curve, time_route
 from multilift_marl.planning.team_clearance import (
     Scene,
     TeamBody,
@@ -29,8 +29,9 @@ from multilift_marl.sim.obstacles import Obstacles
 FINENESS = 1.0, 0.6  # of the lattice, tried in turn
 STEP = 0.5  # [-] of the lattice, over the narrowest half width of payload and drone
 TALL = 1.5  # [-] steps of height, over those
-REPAIRS = 8  # of the curve, and as many of its speeds
+REPAIRS = 9  # of the curve, and as many of its speeds
 CLOSER = 0.015  # [m] that a knot is to keep more, each time that it is too close
+FADES = 1.0, 1.6, 2.2  # [s] in which a route comes to its curve from a moving start, tried in turn
 FIRMER = 1.25  # of acceleration where a moving start leaves little room to brake
 SLOWER = 0.75  # of speed and acceleration where they bring the team too close
 _STILL = 0.05  # [m/s] below which a team is at rest
@@ -198,16 +199,17 @@ def _make_route(
     points = _points(values, system, body)
     care = np.clip(clearance / settings.comfort, _SLOWEST, 1.0)
     slow, firm = care, care
-    for _ in range(REPAIRS):
-        table = time_route(knots, points, slow * settings.speed, firm * settings.acceleration, pace, departure)
+    for attempt in range(REPAIRS):
+        fade = FADES[attempt % len(FADES)]
+        table = time_route(knots, points, slow * settings.speed, firm * settings.acceleration, pace, departure, fade)
         report = RouteReport(0, _length(values), float(table[-1, 0]), 0.0, 0.0)
         route = Route(table[:, 0], table, body.rest, body.modes, report)
         motion = move_team(route, system, body, scene, settings.comfort)
         if motion.feasible() and motion.clearance.min() >= settings.least_clearance:
             least = float(motion.clearance.min())
             return route._replace(report=report._replace(clearance=least))
-        if pace[0] > 0.0 and not motion.feasible(FADE):  # it brakes too late for its goal
-            firm = FIRMER * firm
+        if departure is not None and not motion.feasible(fade):
+            firm = FIRMER * firm if attempt % len(FADES) == 2 else firm  # it brakes too late, too
             continue
         share = _slower(values, motion, settings)
         slow, firm = share * slow, share * firm

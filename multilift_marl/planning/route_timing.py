@@ -15,22 +15,21 @@ SAMPLES = 4  # of the curve between two knots
 KNOT = 0.1  # [s] between the knots in time
 BOXES = 4  # means that are taken in turn, each over ...
 BOX = 0.2  # [s]
-FADE = 1.0  # [s] in which what a curve lacks of the motion at its start fades away
 _TICK = 0.02  # [s] of the times at which means are taken
 
 
 def sample_curve(knots: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return values (M, D) of the quintic B-spline of knots (K, D) at parameters u (M,) from 0 to K - 1.
+    """Return values (M, D) of the quintic B-spline of knots (K, D) at parameters u (M,) from -1 to K - 1.
 
-    It begins and ends at the first and the last knot, beyond which knots are mirrored in them.
+    It is at the first and the last knot at 0 and K - 1, since knots are mirrored in them.
     """
-    head, tail = 2 * knots[0] - knots[2:0:-1], 2 * knots[-1] - knots[-2:-4:-1]
-    points = np.vstack([head, knots, tail, tail[-1:]])
-    i = np.clip(u.astype(int), 0, len(knots) - 2)
+    head, tail = 2 * knots[0] - knots[3:0:-1], 2 * knots[-1] - knots[-2:-5:-1]
+    points = np.vstack([head, knots, tail])
+    i = np.clip(np.floor(u).astype(int), -1, len(knots) - 2)
     t = u - i
     value = np.zeros((len(u), knots.shape[1]))
     for k in range(6):
-        value += _basis(t + 5 - k)[:, None] * points[i + k]
+        value += _basis(t + 5 - k)[:, None] * points[i + k + 1]
     return value
 
 
@@ -97,6 +96,7 @@ def time_route(
     acceleration: np.ndarray,
     pace: tuple[float, float] = (0.0, 0.0),
     departure: np.ndarray | None = None,
+    fade: float = 1.0,
 ) -> np.ndarray:
     """Return the route through knots as a table, see `fit_spline`.
 
@@ -105,14 +105,15 @@ def time_route(
         points, speed, acceleration: see `fit_speeds`, at `SAMPLES` for each piece.
         pace: see `smooth_times`.
         departure: (3, D) values, rates and second rates at the start; None: at rest. What the curve lacks of them is
-            added, and fades away in `FADE` seconds.
+            added, and fades away.
+        fade: time in which it does [s].
     """
     times, passed = smooth_times(fit_speeds(points, speed, acceleration, pace[0]), pace)
     stride = round(KNOT / _TICK)
     last = -(-(len(times) - 1) // stride) * stride  # whole knots; the curve rests at its end
     index = np.minimum(np.arange(0, last + 1, stride), len(times) - 1)
     at = np.arange(0, last + 1, stride) * _TICK
-    u = np.clip(passed / SAMPLES, 0, len(knots) - 1)
+    u = np.clip(passed / SAMPLES, -1, len(knots) - 1)
     values = sample_curve(knots, u[index])
     values[-1] = knots[-1]
     if departure is None:
@@ -121,8 +122,7 @@ def time_route(
     curve = sample_curve(knots, u[:3])  # at 0, 1 and 2 ticks
     rates = (-1.5 * curve[0] + 2.0 * curve[1] - 0.5 * curve[2]) / _TICK
     bends = (curve[0] - 2.0 * curve[1] + curve[2]) / _TICK**2
-    fade = min(FADE, at[-1])
-    values += fade_out(departure - np.array([values[0], rates, bends]), at, fade)
+    values += fade_out(departure - np.array([values[0], rates, bends]), at, min(fade, at[-1]))
     return fit_spline(np.column_stack([at, values]), (departure[1], departure[2]))
 
 
