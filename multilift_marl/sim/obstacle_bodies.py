@@ -1,0 +1,151 @@
+"""Obstacles in MuJoCo: bodies that nothing moves, each environment with its own forms, sizes and places.
+
+They are mocap bodies: fixed for the solver, put where `obstacles.move_obstacles` says before each step. What touches a
+moving one meets its surface at rest, so that friction does not drag along.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from multilift_marl.kernels.jit import bind, kernel
+from multilift_marl.math3d import mat, mat_to_quat, norm, put, sub, tmul, vec
+from multilift_marl.rig.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE
+from multilift_marl.rig.system import System
+from multilift_marl.sim.obstacles import HIDDEN, Obstacles, make_hulls, move_obstacles
+
+_GEOM = mujoco.mjtGeom
+_GEOMS = {BOX: _GEOM.mjGEOM_BOX, CYLINDER: _GEOM.mjGEOM_CYLINDER, SPHERE: _GEOM.mjGEOM_SPHERE, HULL: _GEOM.mjGEOM_MESH}
+
+
+def obstacle_names(system: System) -> list[str]:
+    """Return the names of the obstacles' bodies and geoms."""
+    return [f"obstacle_{m}" for m in range(system.scenery.count)]
+
+
+def add_obstacles(spec: mujoco.MjSpec, system: System) -> None:
+    """Add a body for each obstacle that there may be; free ones are far below the ground."""
+    hulls = iter(make_hulls(system.scenery))
+    fixed = system.scenery.obstacles
+    for m, name in enumerate(obstacle_names(system)):
+        body = spec.worldbody.add_body(name=name, mocap=True, pos=HIDDEN)
+        kind = fixed[m].kind if m < len(fixed) else BOX
+        if kind == HULL:
+            # MuJoCo would move vertices to the principal axes; the pose that it gives the geom undoes that.
+            mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+            mesh.uservert = next(hulls).ravel().tolist()
+            body.add_geom(name=name, type=_GEOM.mjGEOM_MESH, meshname=name)
+            continue
+        size = fixed[m].size if m < len(fixed) else np.ones(3)
+        body.add_geom(name=name, type=_GEOMS[kind], size=geom_size(kind, size))
+
+
+def geom_size(kind: int, half: np.ndarray) -> np.ndarray:
+    """Return MuJoCo's `geom_size` (3,) of a box, cylinder or sphere with half edges (3,) of the box about it."""
+    return np.array({BOX: half, CYLINDER: (half[0], half[2], 0.0), SPHERE: (half[0], 0.0, 0.0)}[kind], float)
+
+
+class ObstacleRows(NamedTuple):
+    """Where the obstacles of a shard's environments are in rows of `batch.state`."""
+
+    state: np.ndarray
+    """(environments, fields)."""
+    first: int
+    """The first environment."""
+    position: int
+    quaternion: int
+    timestep: float
+    """[s]."""
+
+
+class ShardObstacles:
+    """The obstacles of a batch's environments, the first of which is number `first`.
+
+    Args:
+        batch: of the simulations.
+        model: of all.
+        first: environment.
+        system: of all.
+        obstacles: of all environments; live.
+
+    Attributes:
+        step: moves them on by a physics step, before MuJoCo takes it.
+    """
+
+    def __init__(self, batch: Batch, model: mujoco.MjModel, first: int, system: System, obstacles: Obstacles):
+        start = batch.state.__array_interface__["data"][0]
+        # All fields of a row lie in one buffer, see `state_io.make_rows`.
+        places = [
+            (batch.bind(field).__array_interface__["data"][0] - start) // batch.state.itemsize
+            for field in ("mocap_pos", "mocap_quat")
+        ]
+        self._rows = ObstacleRows(batch.state, first, places[0], places[1], system.timestep)
+        self._batch, self._obstacles, self._fixed = batch, obstacles, len(system.scenery.obstacles)
+        self._geoms = [model.geom(name).id for name in obstacle_names(system)[self._fixed :]]
+        self.step: Callable[[], None] = bind(step_obstacles, self._rows, obstacles)
+
+    def load(self, mask: np.ndarray) -> None:
+        """Give the simulations in the mask (environments,) the obstacles as they are at the clock's time."""
+        first = self._rows.first
+        self._write_forms(mask)
+        for i in np.flatnonzero(mask).tolist():
+            move_obstacles(first + i, self._obstacles)
+            write_places(i, self._rows, self._obstacles)
+
+    def _write_forms(self, mask: np.ndarray) -> None:
+        """Write kinds and sizes of the task's obstacles to the models."""
+        if not self._geoms:
+            return
+        fields = ("geom_type", "geom_size", "geom_rbound", "geom_aabb")
+        kinds, sizes, radii, boxes = (self._batch.expand(name) for name in fields)
+        for i in np.flatnonzero(mask).tolist():
+            for m, geom in enumerate(self._geoms, self._fixed):
+                e = self._rows.first + i
+                kind, half = int(self._obstacles.kind[e, m]), self._obstacles.size[e, m]
+                if kind != NONE:
+                    kinds[i, geom], sizes[i, geom] = int(_GEOMS[kind]), geom_size(kind, half)
+                    radii[i, geom], boxes[i, geom] = bounding_radius(kind, half), [0.0, 0.0, 0.0, *half]
+
+
+@kernel
+def step_obstacles(rows, obstacles):
+    """Move the obstacles of a shard's environments on by a physics step."""
+    for i in range(rows.state.shape[0]):
+        e = rows.first + i
+        obstacles.clock[e] += rows.timestep
+        if move_obstacles(e, obstacles):
+            write_places(i, rows, obstacles)
+
+
+@kernel
+def write_places(i, rows, obstacles):
+    """Write places and attitudes of the obstacles into row i."""
+    line, e = rows.state[i], rows.first + i
+    for m in range(obstacles.kind.shape[1]):
+        at, turned = rows.position + 3 * m, rows.quaternion + 4 * m
+        put(line[at : at + 3], vec(obstacles.position, e, m))
+        quaternion = mat_to_quat(mat(obstacles.rotation, e, m))
+        line[turned], line[turned + 1], line[turned + 2], line[turned + 3] = quaternion
+
+
+def bounding_radius(kind: int, half: np.ndarray) -> float:
+    """Return the radius of the sphere about an obstacle's middle that encloses it [m]."""
+    if kind == SPHERE:
+        return float(half[0])
+    return float(np.hypot(half[0], half[2]) if kind == CYLINDER else np.linalg.norm(half))
+
+
+@kernel
+def box_distance(e, m, point, obstacles):
+    """Return the distance of a point to the box about obstacle m [m], at most that to the obstacle; 0 inside."""
+    offset = tmul(mat(obstacles.rotation, e, m), sub(point, vec(obstacles.position, e, m)))
+    size = obstacles.size
+    x = max(abs(offset[0]) - size[e, m, 0], 0.0)
+    y = max(abs(offset[1]) - size[e, m, 1], 0.0)
+    z = max(abs(offset[2]) - size[e, m, 2], 0.0)
+    return norm((x, y, z))
