@@ -17,7 +17,7 @@ from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import mat, mat_to_quat, norm, put, sub, tmul, vec
 from multilift_marl.rig.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE
 from multilift_marl.rig.system import System
-from multilift_marl.sim.obstacles import HIDDEN, Obstacles, make_hulls, move_obstacles
+from multilift_marl.sim.obstacles import HIDDEN, Obstacles, move_obstacles
 
 _GEOM = mujoco.mjtGeom
 _GEOMS = {BOX: _GEOM.mjGEOM_BOX, CYLINDER: _GEOM.mjGEOM_CYLINDER, SPHERE: _GEOM.mjGEOM_SPHERE, HULL: _GEOM.mjGEOM_MESH}
@@ -30,19 +30,31 @@ def obstacle_names(system: System) -> list[str]:
 
 def add_obstacles(spec: mujoco.MjSpec, system: System) -> None:
     """Add a body for each obstacle that there may be; free ones are far below the ground."""
-    hulls = iter(make_hulls(system.scenery))
-    fixed = system.scenery.obstacles
+    add_hulls(spec, system)
+    fixed, hulls = system.scenery.obstacles, 0
     for m, name in enumerate(obstacle_names(system)):
         body = spec.worldbody.add_body(name=name, mocap=True, pos=HIDDEN)
         kind = fixed[m].kind if m < len(fixed) else BOX
         if kind == HULL:
-            # MuJoCo would move vertices to the principal axes; the pose that it gives the geom undoes that.
-            mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
-            mesh.uservert = next(hulls).ravel().tolist()
-            body.add_geom(name=name, type=_GEOM.mjGEOM_MESH, meshname=name)
+            # MuJoCo moves vertices to the principal axes; the pose that it gives the geom undoes that.
+            body.add_geom(name=name, type=_GEOM.mjGEOM_MESH, meshname=hull_name(hulls))
+            hulls += 1
             continue
         size = fixed[m].size if m < len(fixed) else np.ones(3)
         body.add_geom(name=name, type=_GEOMS[kind], size=geom_size(kind, size))
+
+
+def hull_name(number: int) -> str:
+    """Return the name of a hull's mesh."""
+    return f"hull_{number}"
+
+
+def add_hulls(spec: mujoco.MjSpec, system: System) -> None:
+    """Add the meshes of the obstacles that are hulls."""
+    vertices = [each.vertices for each in system.scenery.obstacles if each.vertices is not None]
+    for number, points in enumerate(vertices):
+        mesh = spec.add_mesh(name=hull_name(number), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+        mesh.uservert = points.ravel().tolist()
 
 
 def geom_size(kind: int, half: np.ndarray) -> np.ndarray:

@@ -15,8 +15,9 @@ from multilift_marl.kernels.jit import kernel
 from multilift_marl.rig.obstacles import BOX as BOX
 from multilift_marl.rig.obstacles import CYLINDER as CYLINDER
 from multilift_marl.rig.obstacles import HULL as HULL
-from multilift_marl.rig.obstacles import NONE, Scenery
+from multilift_marl.rig.obstacles import NONE as NONE
 from multilift_marl.rig.obstacles import SPHERE as SPHERE
+from multilift_marl.rig.obstacles import Scenery
 
 HIDDEN = (0.0, 0.0, -100.0)  # [m] where free rows are
 
