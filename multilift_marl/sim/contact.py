@@ -103,27 +103,34 @@ def find_close(lo, state, proximity, radii, timestep, obstacles):
                     reach += 2.0 * timestep * speed
                     if dot(offset, relative) < 0.0 and speed > _FAST and square < reach * reach:
                         found = FAST
-        for m in range(obstacles.kind.shape[1]):
-            if obstacles.kind[e, m] != NONE and found != FAST:
-                found = max(found, _near_obstacle(e, m, state, radii, timestep, obstacles))
+        if obstacles.kind.shape[1] > 0:
+            found = max(found, _find_obstacle(e, state, radii, timestep, obstacles))
         changed = changed or proximity[i] != found
         proximity[i] = found
     return changed
 
 
 @kernel
-def _near_obstacle(e, m, state, radii, timestep, obstacles):
-    """Return how near any body is to obstacle m: APART, NEAR or FAST."""
-    found = APART
-    for b in range(radii.shape[0]):
-        position = row(state.payload_position, e) if b == 0 else vec(state.drone_position, e, b - 1)
-        velocity = row(state.payload_velocity, e) if b == 0 else vec(state.drone_velocity, e, b - 1)
-        speed = norm(sub(velocity, vec(obstacles.velocity, e, m)))
-        distance = box_distance(e, m, position, obstacles)
-        if distance < radii[b]:
-            found = max(found, NEAR)
-        if speed > _FAST and distance < radii[b] + 2.0 * timestep * speed:
-            found = FAST
+def _find_obstacle(e, state, radii, timestep, obstacles):
+    """Return how near any body is to any obstacle: APART, NEAR or FAST."""
+    found, payload = APART, row(state.payload_position, e)
+    # First by a sphere about the whole team, with room for what a step may bring of 10 m/s.
+    team = radii[0]
+    for b in range(1, radii.shape[0]):
+        team = max(team, norm(sub(vec(state.drone_position, e, b - 1), payload)) + radii[b])
+    team += 20.0 * timestep
+    for m in range(obstacles.kind.shape[1]):
+        if obstacles.kind[e, m] == NONE or box_distance(e, m, payload, obstacles) > team:
+            continue
+        for b in range(radii.shape[0]):
+            position = payload if b == 0 else vec(state.drone_position, e, b - 1)
+            velocity = row(state.payload_velocity, e) if b == 0 else vec(state.drone_velocity, e, b - 1)
+            distance = box_distance(e, m, position, obstacles)
+            if distance < radii[b]:
+                found = max(found, NEAR)
+            speed = norm(sub(velocity, vec(obstacles.velocity, e, m)))
+            if speed > _FAST and distance < radii[b] + 2.0 * timestep * speed:
+                found = FAST
     return found
 
 

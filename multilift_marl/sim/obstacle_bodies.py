@@ -1,6 +1,6 @@
-"""Obstacles in MuJoCo: bodies that nothing moves, each environment with its own forms, sizes and places.
+"""Obstacles in MuJoCo: geoms of the world that nothing moves, each environment with its own forms, sizes and places.
 
-They are mocap bodies: fixed for the solver, put where `obstacles.move_obstacles` says before each step. What touches a
+Geoms of the world itself cost a third of a percent of a step each, bodies of their own five times that. What touches a
 moving one meets its surface at rest, so that friction does not drag along.
 """
 
@@ -14,10 +14,24 @@ import numpy as np
 from mujoco.batch import Batch
 
 from multilift_marl.kernels.jit import bind, kernel
-from multilift_marl.math3d import mat, mat_to_quat, norm, put, sub, tmul, vec
+from multilift_marl.math3d import (
+    add,
+    mat,
+    mat_to_quat,
+    matmul,
+    matrow,
+    mul,
+    norm,
+    put,
+    quat_to_mat,
+    row,
+    sub,
+    tmul,
+    vec,
+)
 from multilift_marl.rig.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE
 from multilift_marl.rig.system import System
-from multilift_marl.sim.obstacles import HIDDEN, Obstacles, move_obstacles
+from multilift_marl.sim.obstacles import Obstacles, move_obstacles
 
 _GEOM = mujoco.mjtGeom
 _GEOMS = {BOX: _GEOM.mjGEOM_BOX, CYLINDER: _GEOM.mjGEOM_CYLINDER, SPHERE: _GEOM.mjGEOM_SPHERE, HULL: _GEOM.mjGEOM_MESH}
@@ -29,19 +43,17 @@ def obstacle_names(system: System) -> list[str]:
 
 
 def add_obstacles(spec: mujoco.MjSpec, system: System) -> None:
-    """Add a body for each obstacle that there may be; free ones are far below the ground."""
+    """Add a geom for each obstacle that there may be, in the origin: `ShardObstacles.load` puts it where it is."""
     add_hulls(spec, system)
     fixed, hulls = system.scenery.obstacles, 0
     for m, name in enumerate(obstacle_names(system)):
-        body = spec.worldbody.add_body(name=name, mocap=True, pos=HIDDEN)
         kind = fixed[m].kind if m < len(fixed) else BOX
         if kind == HULL:
-            # MuJoCo moves vertices to the principal axes; the pose that it gives the geom undoes that.
-            body.add_geom(name=name, type=_GEOM.mjGEOM_MESH, meshname=hull_name(hulls))
+            spec.worldbody.add_geom(name=name, type=_GEOM.mjGEOM_MESH, meshname=hull_name(hulls))
             hulls += 1
             continue
         size = fixed[m].size if m < len(fixed) else np.ones(3)
-        body.add_geom(name=name, type=_GEOMS[kind], size=geom_size(kind, size))
+        spec.worldbody.add_geom(name=name, type=_GEOMS[kind], size=geom_size(kind, size))
 
 
 def hull_name(number: int) -> str:
@@ -62,15 +74,21 @@ def geom_size(kind: int, half: np.ndarray) -> np.ndarray:
     return np.array({BOX: half, CYLINDER: (half[0], half[2], 0.0), SPHERE: (half[0], 0.0, 0.0)}[kind], float)
 
 
-class ObstacleRows(NamedTuple):
-    """Where the obstacles of a shard's environments are in rows of `batch.state`."""
+class GeomPlaces(NamedTuple):
+    """Places of the obstacles' geoms in the models of a shard's environments."""
 
-    state: np.ndarray
-    """(environments, fields)."""
+    position: np.ndarray
+    """(environments, geoms, 3) [m]."""
+    quaternion: np.ndarray
+    """(environments, geoms, 4)."""
+    geom: np.ndarray
+    """(M,) int64 number of each obstacle's."""
+    own_position: np.ndarray
+    """(M, 3) of the geom in the obstacle's frame [m]: the compiler moves meshes to their principal axes."""
+    own_rotation: np.ndarray
+    """(M, 3, 3) the geom's frame to the obstacle's."""
     first: int
     """The first environment."""
-    position: int
-    quaternion: int
     timestep: float
     """[s]."""
 
@@ -90,34 +108,32 @@ class ShardObstacles:
     """
 
     def __init__(self, batch: Batch, model: mujoco.MjModel, first: int, system: System, obstacles: Obstacles):
-        start = batch.state.__array_interface__["data"][0]
-        # All fields of a row lie in one buffer, see `state_io.make_rows`.
-        places = [
-            (batch.bind(field).__array_interface__["data"][0] - start) // batch.state.itemsize
-            for field in ("mocap_pos", "mocap_quat")
-        ]
-        self._rows = ObstacleRows(batch.state, first, places[0], places[1], system.timestep)
         self._batch, self._obstacles, self._fixed = batch, obstacles, len(system.scenery.obstacles)
-        self._geoms = [model.geom(name).id for name in obstacle_names(system)[self._fixed :]]
-        self.step: Callable[[], None] = bind(step_obstacles, self._rows, obstacles)
+        geoms = np.array([model.geom(name).id for name in obstacle_names(system)])
+        turned = np.array([quat_to_mat(*quaternion) for quaternion in model.geom_quat[geoms]]).reshape(-1, 3, 3)
+        position, quaternion = batch.expand("geom_pos"), batch.expand("geom_quat")
+        own = model.geom_pos[geoms].copy(), turned
+        self._places = GeomPlaces(position, quaternion, geoms, *own, first, system.timestep)
+        batch.expand("geom_sameframe")[:, geoms] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+        self.step: Callable[[], None] = bind(step_obstacles, self._places, obstacles)
 
     def load(self, mask: np.ndarray) -> None:
         """Give the simulations in the mask (environments,) the obstacles as they are at the clock's time."""
-        first = self._rows.first
         self._write_forms(mask)
         for i in np.flatnonzero(mask).tolist():
-            move_obstacles(first + i, self._obstacles)
-            write_places(i, self._rows, self._obstacles)
+            move_obstacles(self._places.first + i, self._obstacles)
+            write_places(i, self._places, self._obstacles)
 
     def _write_forms(self, mask: np.ndarray) -> None:
         """Write kinds and sizes of the task's obstacles to the models."""
-        if not self._geoms:
+        geoms = self._places.geom[self._fixed :].tolist()
+        if not geoms:
             return
         fields = ("geom_type", "geom_size", "geom_rbound", "geom_aabb")
         kinds, sizes, radii, boxes = (self._batch.expand(name) for name in fields)
         for i in np.flatnonzero(mask).tolist():
-            for m, geom in enumerate(self._geoms, self._fixed):
-                e = self._rows.first + i
+            for m, geom in enumerate(geoms, self._fixed):
+                e = self._places.first + i
                 kind, half = int(self._obstacles.kind[e, m]), self._obstacles.size[e, m]
                 if kind != NONE:
                     kinds[i, geom], sizes[i, geom] = int(_GEOMS[kind]), geom_size(kind, half)
@@ -125,24 +141,26 @@ class ShardObstacles:
 
 
 @kernel
-def step_obstacles(rows, obstacles):
+def step_obstacles(places, obstacles):
     """Move the obstacles of a shard's environments on by a physics step."""
-    for i in range(rows.state.shape[0]):
-        e = rows.first + i
-        obstacles.clock[e] += rows.timestep
+    for i in range(places.position.shape[0]):
+        e = places.first + i
+        obstacles.clock[e] += places.timestep
         if move_obstacles(e, obstacles):
-            write_places(i, rows, obstacles)
+            write_places(i, places, obstacles)
 
 
 @kernel
-def write_places(i, rows, obstacles):
-    """Write places and attitudes of the obstacles into row i."""
-    line, e = rows.state[i], rows.first + i
+def write_places(i, places, obstacles):
+    """Write places and attitudes of the obstacles into model i."""
+    e = places.first + i
     for m in range(obstacles.kind.shape[1]):
-        at, turned = rows.position + 3 * m, rows.quaternion + 4 * m
-        put(line[at : at + 3], vec(obstacles.position, e, m))
-        quaternion = mat_to_quat(mat(obstacles.rotation, e, m))
-        line[turned], line[turned + 1], line[turned + 2], line[turned + 3] = quaternion
+        g = places.geom[m]
+        frame = mat(obstacles.rotation, e, m)
+        put(places.position[i, g], add(vec(obstacles.position, e, m), mul(frame, row(places.own_position, m))))
+        quaternion = mat_to_quat(matmul(frame, matrow(places.own_rotation, m)))
+        for k in range(4):
+            places.quaternion[i, g, k] = quaternion[k]
 
 
 def bounding_radius(kind: int, half: np.ndarray) -> float:

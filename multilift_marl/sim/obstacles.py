@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.kernels.jit import kernel
+from multilift_marl.math3d import add, put, scale, vec
 from multilift_marl.rig.obstacles import BOX as BOX
 from multilift_marl.rig.obstacles import CYLINDER as CYLINDER
 from multilift_marl.rig.obstacles import HULL as HULL
@@ -76,6 +77,7 @@ def make_obstacles(scenery: Scenery, num_envs: int) -> Obstacles:
     for m, each in enumerate(scenery.obstacles):
         made.kind[:, m], made.size[:, m], made.rotation[:, m] = each.kind, each.size, each.rotation
         made.center[:, m], made.travel[:, m] = each.position, each.travel
+        made.position[:, m] = each.position
         made.period[:, m], made.phase[:, m] = each.period, each.phase
         if each.kind == HULL:
             made.hull[:, m] = hulls
@@ -98,17 +100,17 @@ def make_hulls(scenery: Scenery) -> np.ndarray:
 
 @kernel
 def move_obstacles(e, obstacles):
-    """Write positions and velocities of environment e at its clock's time; return whether any obstacle moves."""
+    """Write places and velocities of what moves in environment e at its clock's time; return whether anything does."""
     moving = False
     for m in range(obstacles.kind.shape[1]):
+        travel = vec(obstacles.travel, e, m)
+        if travel[0] == 0.0 and travel[1] == 0.0 and travel[2] == 0.0:
+            continue
+        moving = True
         rate = 2.0 * pi / obstacles.period[e, m]
         angle = rate * obstacles.clock[e] + 2.0 * pi * obstacles.phase[e, m]
-        share, change = sin(angle), rate * cos(angle)
-        for i in range(3):
-            travel = obstacles.travel[e, m, i]
-            moving = moving or travel != 0.0
-            obstacles.position[e, m, i] = obstacles.center[e, m, i] + share * travel
-            obstacles.velocity[e, m, i] = change * travel
+        put(obstacles.position[e, m], add(vec(obstacles.center, e, m), scale(sin(angle), travel)))
+        put(obstacles.velocity[e, m], scale(rate * cos(angle), travel))
     return moving
 
 
