@@ -141,7 +141,7 @@ def _cut_wall(size: np.ndarray, gaps: list[tuple[float, ...]], key: str) -> list
 def _hull(points: np.ndarray) -> np.ndarray:
     """Return the vertices (V, 3) of the convex hull of points, by MuJoCo's compiler."""
     spec = mujoco.MjSpec()
-    mesh = spec.add_mesh(name="hull", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX, needhull=True)
+    mesh = spec.add_mesh(name="hull", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
     mesh.uservert = points.ravel().tolist()
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="hull")
     model = spec.compile()
