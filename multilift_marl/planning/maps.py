@@ -78,10 +78,10 @@ def draw_map(level: str, seed: int, system: System) -> Map:
     return Map(start, goal, low, high, tuple(placed))
 
 
-def place_map(env: int, drawn: Map, obstacles: Obstacles) -> None:
-    """Put a map's obstacles into the rows of one environment."""
-    clear_obstacles(env, obstacles)
-    for row, each in enumerate(drawn.obstacles):
+def place_map(env: int, drawn: Map, obstacles: Obstacles, first: int = 0) -> None:
+    """Put a map's obstacles into the rows of one environment from `first` on."""
+    clear_obstacles(env, obstacles, first)
+    for row, each in enumerate(drawn.obstacles, first):
         place_obstacle(env, row, obstacles, *each)
 
 
