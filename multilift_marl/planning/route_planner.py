@@ -7,7 +7,7 @@ from time import thread_time
 
 import numpy as np
 
-from multilift_marl.planning.formation_shapes import FormationShapes, drone_places, make_shape_limits, make_shapes
+from multilift_marl.planning.formation_shapes import make_shape_limits, make_shapes
 from multilift_marl.planning.route import NoRoute, Route, RouteReport
 from multilift_marl.planning.route_motion import RouteMotion, move_team
 from multilift_marl.planning.route_search import make_lattice, search_route, states_at
@@ -34,6 +34,7 @@ CLOSER = 0.015  # [m] that a knot is to keep more, each time that it is too clos
 FADES = 1.0, 1.6, 2.2  # [s] in which a route comes to its curve from a moving start, tried in turn
 FIRMER = 1.25  # of acceleration where a moving start leaves little room to brake
 SLOWER = 0.75  # of speed and acceleration where they bring the team too close
+_SPARE = 0.005  # [m] of the shapes' limits, for the curve
 _STILL = 0.05  # [m/s] below which a team is at rest
 _AHEAD = 1.0  # [s] before and after a time, in which the team is slower then
 _SLOWEST = 0.35  # of speed and acceleration in the open, where obstacles are closest
@@ -64,7 +65,7 @@ class RouteSettings:
     high: tuple[float, float, float] | None = None
     room: float = 2.0
     ground: float = 0.3
-    most: int = 400_000
+    most: int = 100_000
 
 
 def find_route(
@@ -141,7 +142,9 @@ def _check_pose(
 ) -> None:  # fmt: skip
     """Refuse a start or a goal where the team cannot be."""
     if pose[2] < space[0, 2] - 1e-9:
-        raise NoRoute(f"the {name} is {pose[2]:.2f} m high, and the payload has to be at least {space[0, 2]:.2f} m high")
+        raise NoRoute(
+            f"the {name} is {pose[2]:.2f} m high, and the payload has to be at least {space[0, 2]:.2f} m high"
+        )
     if (pose[:3] < space[0] - 1e-9).any() or (pose[:3] > space[1] + 1e-9).any():
         raise NoRoute(f"the {name} {_text(pose)} is outside the space from {_text(space[0])} to {_text(space[1])}")
     arms = np.zeros_like(body.rest)
@@ -150,8 +153,8 @@ def _check_pose(
     if left < settings.least_clearance:
         where = "in an obstacle" if left <= 0 else f"{left:.3f} m from an obstacle"
         raise NoRoute(
-            f"at the {name} {_text(pose)} the team is {where}, and has to keep {settings.least_clearance:g} m: move the "
-            f"{name} or the obstacle"
+            f"at the {name} {_text(pose)} the team is {where}, and has to keep {settings.least_clearance:g} m: move "
+            f"the {name} or the obstacle"
         )
 
 
@@ -171,10 +174,11 @@ def _make_route(
         lead = departure[1] * spacing / fast
         gain = float((weights * departure[1]) @ (weights * departure[2])) / fast
         pace = fast / spacing * SAMPLES, gain / spacing * SAMPLES
+    limits = make_shape_limits(system)
     band = Band(
         body=body,
         scene=scene,
-        limits=make_shape_limits(system),
+        limits=limits._replace(separation=limits.separation + _SPARE, cables=limits.cables + _SPARE),
         space=space,
         scale=weights,
         safe=np.full(len(knots), settings.clearance),

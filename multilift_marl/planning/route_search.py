@@ -7,7 +7,7 @@ to the goal, which costs more where it is close to obstacles.
 
 from __future__ import annotations
 
-from math import pi, sqrt
+from math import cos, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from multilift_marl.planning.team_clearance import (
     TeamBody,
     local_point,
     obstacle_distance,
+    payload_clearance,
     team_clearance,
     team_reach,
     write_arms,
@@ -42,7 +43,7 @@ class Lattice(NamedTuple):
     """(3,) position of the first cell [m]."""
     step: np.ndarray
     """(3,) between cells [m]."""
-    count: np.ndarray
+    counts: np.ndarray
     """(3,) int64 cells."""
     yaw: float
     """[rad] of the first yaw."""
@@ -105,7 +106,7 @@ def make_lattice(
     return Lattice(
         low=low,
         step=step,
-        count=count,
+        counts=count,
         yaw=float(start[3]),
         arms=arms,
         reach=np.array([team_reach(each, body) for each in arms]),
@@ -127,7 +128,7 @@ def search_route(
         body, scene: the team and the obstacles.
         most: states to expand.
     """
-    cells = int(lattice.count.prod())
+    cells = int(lattice.counts.prod())
     states = cells * YAWS * len(lattice.arms)
     work = SearchWork(
         status=np.zeros(states, np.uint8),
@@ -141,7 +142,7 @@ def search_route(
     )
     measure_way(lattice, body, scene, work)
     cell = np.rint((start[:3] - lattice.low) / lattice.step).astype(np.int64)
-    first = (cell[0] * lattice.count[1] + cell[1]) * lattice.count[2] + cell[2]
+    first = (cell[0] * lattice.counts[1] + cell[1]) * lattice.counts[2] + cell[2]
     last, expanded = expand_states(int(first) * YAWS * len(lattice.arms) + shape, lattice, body, scene, work, most)
     if last < 0:
         return np.zeros(0, np.int64), expanded
@@ -155,8 +156,8 @@ def states_at(way: np.ndarray, lattice: Lattice, shapes: FormationShapes) -> np.
     """Return position, yaw (without leaps) and shape of states (K,), (K, 4 + J)."""
     count = len(lattice.arms)
     cell, yaw, shape = way // (YAWS * count), way // count % YAWS, way % count
-    index = np.stack([cell // lattice.count[2] // lattice.count[1], cell // lattice.count[2] % lattice.count[1],
-                      cell % lattice.count[2]], axis=1)  # fmt: skip
+    index = np.stack([cell // lattice.counts[2] // lattice.counts[1], cell // lattice.counts[2] % lattice.counts[1],
+                      cell % lattice.counts[2]], axis=1)  # fmt: skip
     turned = np.unwrap(lattice.yaw + yaw * (2 * pi / YAWS))
     return np.column_stack([lattice.low + index * lattice.step, turned, shapes.choices[shape]])
 
@@ -202,7 +203,7 @@ def pop(work, size):
 def measure_way(lattice, body, scene, work):
     """Write the payload's way from each cell to the goal (Dijkstra), `UNKNOWN` where there is none."""
     # How close each cell is to obstacles.
-    count, step = lattice.count, lattice.step
+    count, step = lattice.counts, lattice.step
     thinnest = min(body.half[0], body.half[1], body.half[2]) + lattice.clearance[0]
     wide = lattice.reach[0] + lattice.clearance[1]
     across, layer = count[2], count[1] * count[2]
@@ -212,7 +213,7 @@ def measure_way(lattice, body, scene, work):
         here, far = (place[0], place[1], place[2]), wide
         for m in range(scene.kind.shape[0]):
             far = min(far, obstacle_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0])
-        if far >= thinnest or cell == goal:
+        if cell == goal or (far >= thinnest and _payload_fits(cell, far, lattice, body, scene)):
             work.price[cell] = 1.0 + CAUTION * (1.0 - max(far, 0.0) / wide) ** 2
 
     # From the goal outwards.
@@ -239,6 +240,25 @@ def measure_way(lattice, body, scene, work):
 
 
 @kernel
+def _payload_fits(cell, far, lattice, body, scene):
+    """Return whether the payload alone fits into a cell at one of the yaws; `far`: that from obstacles [m]."""
+    widest = 0.0
+    for i in range(3):
+        widest += (abs(body.center[i]) + body.half[i]) ** 2
+    least = lattice.clearance[0]
+    if far >= sqrt(widest) + least:
+        return True
+    for yaw in range(YAWS // 2):  # its box is the same turned by π
+        place, fits = place_of(cell, yaw * 1.0, lattice), True
+        here, c, s = (place[0], place[1], place[2]), cos(place[3]), sin(place[3])
+        for m in range(scene.kind.shape[0]):
+            fits = fits and payload_clearance(scene, m, here, c, s, body, least)[0] >= least
+        if fits:
+            return True
+    return False
+
+
+@kernel
 def check_state(state, lattice, body, scene, work):
     """Return the clearance of a state [m], measured once."""
     if not work.status[state] & MEASURED:
@@ -255,7 +275,7 @@ def check_state(state, lattice, body, scene, work):
 @kernel
 def place_of(cell, yaw, lattice):
     """Return x, y, z and yaw of a cell at a yaw of the lattice."""
-    count, low, step = lattice.count, lattice.low, lattice.step
+    count, low, step = lattice.counts, lattice.low, lattice.step
     x, y, z = cell // (count[1] * count[2]), cell // count[2] % count[1], cell % count[2]
     return low[0] + x * step[0], low[1] + y * step[1], low[2] + z * step[2], lattice.yaw + yaw * (2.0 * pi / YAWS)
 
@@ -286,9 +306,7 @@ def reach_state(state, other, length, lattice, body, scene, work, size):
     if cell != before and clear + work.clearance[state] < length:
         a, b = place_of(before, yaw * 1.0, lattice), place_of(cell, yaw * 1.0, lattice)
         middle = (0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2]), a[3])
-        between = team_clearance(
-            middle, lattice.arms[shape], body, scene, lattice.reach[shape], lattice.clearance[1]
-        )
+        between = team_clearance(middle, lattice.arms[shape], body, scene, lattice.reach[shape], lattice.clearance[1])
         if between < lattice.clearance[0]:
             return size
     short = 1.0 - clear / lattice.clearance[1]
@@ -303,7 +321,7 @@ def reach_state(state, other, length, lattice, body, scene, work, size):
 @kernel
 def expand_states(first, lattice, body, scene, work, most):
     """Expand states from the first in order of cost and heuristic; return the goal's, or -1, and how many."""
-    count, step = lattice.count, lattice.step
+    count, step = lattice.counts, lattice.step
     shapes = lattice.arms.shape[0]
     across, layer = count[2], count[1] * count[2]
     work.cost[first], work.parent[first] = 0.0, -1

@@ -127,7 +127,7 @@ def time_route(
 
 
 def fade_out(lack: np.ndarray, times: np.ndarray, fade: float) -> np.ndarray:
-    """Return the quintic (T, D) that begins with value, rate and second rate `lack` (3, D), and is zero after `fade`."""
+    """Return a quintic (T, D) with value, rate and second rate `lack` (3, D) at 0, and zeros after `fade` [s]."""
     u = np.clip(times / fade, 0.0, 1.0)[:, None]
     value, rate, bend = lack[0], lack[1] * fade, lack[2] * fade**2
     # (1 - u)³ times a polynomial of second degree

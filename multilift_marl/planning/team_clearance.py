@@ -14,7 +14,7 @@ import numpy as np
 from multilift_marl.kernels.jit import inlined, kernel
 from multilift_marl.math3d import add, dot, matmul, mul, norm, put, row, scale, sub, tmul, transpose, turn, unit
 from multilift_marl.rig.system import System
-from multilift_marl.sim.obstacles import BOX, CYLINDER, NONE, SPHERE, Obstacles
+from multilift_marl.sim.obstacles import CYLINDER, NONE, SPHERE, Obstacles
 
 TOLERANCE = 1e-3  # [m] of distances, which are too small rather than too large
 _ITERATIONS = 16
