@@ -13,7 +13,6 @@ from multilift_marl.planning.team_clearance import Scene, TeamBody, measure_clea
 from multilift_marl.rig.system import System
 
 TICK = 0.02  # [s] between the times that are looked at
-MAX_TILT = np.deg2rad(45.0)
 MAX_THRUST = 0.9  # over the largest thrust of a drone
 MIN_TENSION = 0.2  # over the resting one
 
@@ -36,10 +35,10 @@ class RouteMotion(NamedTuple):
     clearance: np.ndarray
     """(M,) from obstacles, no more than what was asked for [m]."""
 
-    def feasible(self, until: float = np.inf) -> bool:
-        """Return whether thrusts, tilts and tensions are within their limits, up to a time [s]."""
+    def feasible(self, tilt: float, until: float = np.inf) -> bool:
+        """Return whether thrusts, tensions and tilts, at most `tilt` [rad], are within limits, up to a time [s]."""
         part = self.times <= until
-        within = self.thrust[part].max() <= MAX_THRUST and self.tilt[part].max() <= MAX_TILT
+        within = self.thrust[part].max() <= MAX_THRUST and self.tilt[part].max() <= tilt
         return bool(within and self.tension[part].min() >= MIN_TENSION)
 
 

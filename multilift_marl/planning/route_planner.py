@@ -34,6 +34,7 @@ CLOSER = 0.015  # [m] that a knot is to keep more, each time that it is too clos
 FADES = 1.0, 1.6, 2.2  # [s] in which a route comes to its curve from a moving start, tried in turn
 FIRMER = 1.25  # of acceleration where a moving start leaves little room to brake
 SLOWER = 0.75  # of speed and acceleration where they bring the team too close
+_TILTS = np.deg2rad([45.0, 60.0])  # of drones along a route from rest, and from a moving start
 _SPARE = 0.005  # [m] of the shapes' limits, for the curve
 _STILL = 0.05  # [m/s] below which a team is at rest
 _AHEAD = 1.0  # [s] before and after a time, in which the team is slower then
@@ -97,6 +98,8 @@ def find_route(
     shapes, scene = make_shapes(system), make_scene(obstacles, env)
     body = make_body(system, shapes.rest, shapes.modes)
     space = _space(start, goal, scene, body, settings)
+    if departure is not None:  # a curve may leave it a little
+        space = np.array([np.minimum(space[0], start[:3]), np.maximum(space[1], start[:3])])
     still = np.zeros(len(shapes.modes))
     shape = still if departure is None else departure[0, 4:]
     for name, pose, own in (("start", start, shape), ("goal", goal, still)):
@@ -203,27 +206,28 @@ def _make_route(
     points = _points(values, system, body)
     care = np.clip(clearance / settings.comfort, _SLOWEST, 1.0)
     slow, firm = care, care
+    tilt = _TILTS[int(departure is not None)]
     for attempt in range(REPAIRS):
         fade = FADES[attempt % len(FADES)]
         table = time_route(knots, points, slow * settings.speed, firm * settings.acceleration, pace, departure, fade)
         report = RouteReport(0, _length(values), float(table[-1, 0]), 0.0, 0.0)
         route = Route(table[:, 0], table, body.rest, body.modes, report)
         motion = move_team(route, system, body, scene, settings.comfort)
-        if motion.feasible() and motion.clearance.min() >= settings.least_clearance:
+        if motion.feasible(tilt) and motion.clearance.min() >= settings.least_clearance:
             least = float(motion.clearance.min())
             return route._replace(report=report._replace(clearance=least))
-        if departure is not None and not motion.feasible(fade):
+        if departure is not None and not motion.feasible(tilt, fade):
             firm = FIRMER * firm if attempt % len(FADES) == 2 else firm  # it brakes too late, too
             continue
-        share = _slower(values, motion, settings)
+        share = _slower(values, motion, motion.feasible(tilt), settings)
         slow, firm = share * slow, share * firm
     return None
 
 
-def _slower(values: np.ndarray, motion: RouteMotion, settings: RouteSettings) -> np.ndarray:
+def _slower(values: np.ndarray, motion: RouteMotion, feasible: bool, settings: RouteSettings) -> np.ndarray:
     """Return shares of speed and acceleration (M,), lower about where the team comes too close, or is overtaxed."""
     close = motion.clearance < settings.least_clearance
-    if not motion.feasible() or not close.any():
+    if not feasible or not close.any():
         return np.full(len(values), SLOWER)
     near = np.zeros(len(motion.times), bool)
     for time in motion.times[close]:

@@ -31,7 +31,8 @@ TENSION = 1.0  # [-] of the band: weight of squared first differences
 STIFFNESS = 0.5  # [m²] of squared second ones
 RELAX = 0.05  # [1/m²] of squared coordinates of the shape
 COMFORT = 20.0  # [1/m²] of squared shortfalls of the distance that is comfortable, and ...
-SAFETY = 4000.0  # ... of that which is to be kept, and of limits
+SAFETY = 4000.0  # ... of that which is to be kept
+LIMITS = 40_000.0  # of squared excesses over the shapes' limits
 ITERATIONS = 60
 _DIFFERENCE = 1e-5
 
@@ -234,7 +235,7 @@ def _keep_shape(knot, first, band, w):
             w.row[:] = 0.0
             for j in range(modes):
                 w.row[4 + j] = (w.spare[1 + j, i] - w.spare[0, i]) / _DIFFERENCE
-            cost += _add_shortfall(-w.spare[0, i], SAFETY * band.spacing, first, w)
+            cost += _add_shortfall(-w.spare[0, i], LIMITS * band.spacing, first, w)
     return cost
 
 
