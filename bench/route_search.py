@@ -12,10 +12,10 @@ import sys
 import numpy as np
 
 from multilift_marl.config.load import load_config
-from multilift_marl.planning.formation_shapes import find_breach
+from multilift_marl.navigation.formation_shapes import find_breach
+from multilift_marl.navigation.planner import RouteSettings, find_route
 from multilift_marl.planning.maps import CAPACITY, draw_map, place_map
 from multilift_marl.planning.route import NoRoute, Route
-from multilift_marl.planning.route_planner import RouteSettings, find_route
 from multilift_marl.rig.system import System
 from multilift_marl.sim.obstacles import Obstacles
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, dot, norm, put, row, scale, sub, turn
-from multilift_marl.planning.formation_shapes import ShapeLimits, num_spares, write_spares
-from multilift_marl.planning.route_search import RESHAPE, TURN
-from multilift_marl.planning.team_clearance import (
+from multilift_marl.navigation.formation_shapes import ShapeLimits, num_spares, write_spares
+from multilift_marl.navigation.search import RESHAPE, TURN
+from multilift_marl.navigation.team_clearance import (
     Scene,
     TeamBody,
     cable_clearance,

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.kernels.jit import kernel
-from multilift_marl.planning.formation_shapes import FormationShapes
-from multilift_marl.planning.team_clearance import (
+from multilift_marl.navigation.formation_shapes import FormationShapes
+from multilift_marl.navigation.team_clearance import (
     Scene,
     TeamBody,
     local_point,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from conftest import make_system
 
-from multilift_marl.planning.formation_shapes import make_shapes
-from multilift_marl.planning.team_clearance import make_body, make_scene, measure_clearance, write_arms
-from multilift_marl.sim.obstacles import BOX, CYLINDER, KINDS, SPHERE, Obstacles, place_obstacle
+from multilift_marl.navigation.formation_shapes import make_shapes
+from multilift_marl.navigation.team_clearance import make_body, make_scene, measure_clearance, write_arms
+from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
 
 
 def point_distance(kind, size, place, yaw, points):
@@ -46,7 +46,7 @@ def exact_clearance(system, place, arms, rows):
     return min(min(point_distance(*row, bodies).min(), (point_distance(*row, drones) - radius).min()) for row in rows)
 
 
-@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
+@pytest.mark.parametrize("kind", [BOX, CYLINDER, SPHERE], ids=["box", "cylinder", "sphere"])
 def test_clearance_is_the_least_distance_of_all_points_of_the_team(kind):
     rng = np.random.default_rng(3)
     system = make_system(4)
@@ -56,10 +56,8 @@ def test_clearance_is_the_least_distance_of_all_points_of_the_team(kind):
     seen = 0
     for _ in range(60):
         across, tall = rng.uniform(0.1, 0.6), rng.uniform(0.1, 1.5)
-        size = {BOX: (across, rng.uniform(0.05, 1.0), tall), CYLINDER: (across, across, tall)}.get(
-            KINDS[kind], (across,) * 3
-        )
-        row = KINDS[kind], size, tuple(rng.uniform(-1.5, 1.5, 3)), rng.uniform(0, 3)
+        size = {BOX: (across, rng.uniform(0.05, 1.0), tall), CYLINDER: (across, across, tall)}.get(kind, (across,) * 3)
+        row = kind, size, tuple(rng.uniform(-1.5, 1.5, 3)), rng.uniform(0, 3)
         place_obstacle(0, 0, obstacles, *row)
         place = np.append(rng.uniform(-0.3, 0.3, 3), rng.uniform(-3, 3))
         arms = np.zeros((4, 3))

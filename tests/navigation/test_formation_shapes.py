@@ -7,7 +7,7 @@ import pytest
 from conftest import GRAVITY, make_system
 from scipy.optimize import nnls
 
-from multilift_marl.planning.formation_shapes import drone_places, find_breach, make_shapes
+from multilift_marl.navigation.formation_shapes import drone_places, find_breach, make_shapes
 from multilift_marl.planning.maps import GAPS, formation_width
 
 TEAMS = (2, 3, 4, 6, 8)

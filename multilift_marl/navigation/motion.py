@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.control.cable_forces import RANK, wrench_matrix
+from multilift_marl.navigation.team_clearance import Scene, TeamBody, measure_clearance
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.route import Route
-from multilift_marl.planning.team_clearance import Scene, TeamBody, measure_clearance
 from multilift_marl.rig.system import System
 
 TICK = 0.02  # [s] between the times that are looked at

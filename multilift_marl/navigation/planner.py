@@ -7,13 +7,11 @@ from time import thread_time
 
 import numpy as np
 
-from multilift_marl.planning.formation_shapes import make_shape_limits, make_shapes
-from multilift_marl.planning.route import NoRoute, Route, RouteReport
-from multilift_marl.planning.route_motion import RouteMotion, move_team
-from multilift_marl.planning.route_search import make_lattice, search_route, states_at
-from multilift_marl.planning.route_smoothing import Band, coordinate_scale, smooth_knots, space_knots
-from multilift_marl.planning.route_timing import SAMPLES, sample_curve, time_route
-from multilift_marl.planning.team_clearance import (
+from multilift_marl.navigation.formation_shapes import make_shape_limits, make_shapes
+from multilift_marl.navigation.motion import RouteMotion, move_team
+from multilift_marl.navigation.search import make_lattice, search_route, states_at
+from multilift_marl.navigation.smoothing import Band, coordinate_scale, smooth_knots, space_knots
+from multilift_marl.navigation.team_clearance import (
     Scene,
     TeamBody,
     make_body,
@@ -23,6 +21,8 @@ from multilift_marl.planning.team_clearance import (
     team_reach,
     write_arms,
 )
+from multilift_marl.navigation.timing import SAMPLES, sample_curve, time_route
+from multilift_marl.planning.route import NoRoute, Route, RouteReport
 from multilift_marl.rig.system import System
 from multilift_marl.sim.obstacles import Obstacles
 

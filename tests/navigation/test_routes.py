@@ -8,10 +8,10 @@ from conftest import make_system
 from test_team_clearance import exact_clearance
 
 from multilift_marl.errors import ConfigError
-from multilift_marl.planning.formation_shapes import drone_places, find_breach
+from multilift_marl.navigation.formation_shapes import drone_places, find_breach
+from multilift_marl.navigation.planner import RouteSettings, find_route
 from multilift_marl.planning.maps import draw_map, place_map
 from multilift_marl.planning.route import NoRoute
-from multilift_marl.planning.route_planner import RouteSettings, find_route
 from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
 
 START, GOAL = np.array([-3.0, 0.0, 1.5, 0.0]), np.array([3.0, 0.0, 1.5, 0.0])
