@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 SIGHT = 2.5  # [m] from a drone or the payload, within which obstacles of level `unknown` are seen
 INSIDE = 0.1  # [m] that routes keep from the bounds of the map, beyond which the payload is out of range
+AHEAD = 0.1  # [s] that a route which goes on begins later, as a search takes time
 RETRY = 0.2  # [s] after a search that found no way on
 
 
@@ -46,6 +47,7 @@ class RouteMpc(TeamMpc):
         self._task = vec.task
         self.routes: list[Route | None] = [None] * e
         self.begun, self.searches, self.search_time = np.zeros(e), np.zeros(e), np.zeros((e, 2))
+        self._before: list[tuple[Route | None, float]] = [(None, 0.0)] * e
         self._known = np.zeros(vec.world.obstacles.kind.shape, bool)
         self._due = np.zeros(e)
         self._new = np.ones(e, bool)
@@ -72,13 +74,18 @@ class RouteMpc(TeamMpc):
         if self._new[e]:
             self._new[e], self._known[e], self._due[e] = False, seen, np.inf
             self.routes[e], self.begun[e], self.searches[e], self.search_time[e] = None, 0.0, 0, 0.0
+            self._before[e] = None, 0.0
             self._search(e, None, 0.0)
         elif (seen & ~self._known[e]).any() or time >= self._due[e]:
             self._known[e] |= seen
+            if time < self.begun[e]:  # the last search is still under way
+                self._due[e] = self.begun[e]
+                return
             self._due[e] = np.inf
             route = self.routes[e]
-            departure = None if route is None else route.sample(np.array([time - self.begun[e]]))[:3, 0]
-            self._search(e, departure, time)
+            begin = time if route is None else time + AHEAD
+            departure = None if route is None else route.sample(np.array([begin - self.begun[e]]))[:3, 0]
+            self._search(e, departure, begin)
 
     def _in_sight(self, e: int) -> np.ndarray:
         """Return which obstacles (M,) are known to be there: all, or those near a drone or the payload."""
@@ -92,8 +99,8 @@ class RouteMpc(TeamMpc):
             seen[m] = min(box_distance(e, m, tuple(point), obstacles) for point in points) <= SIGHT
         return seen
 
-    def _search(self, e: int, departure: np.ndarray | None, time: float) -> None:
-        """Replace the route of an environment; one that goes on stays where no other is found."""
+    def _search(self, e: int, departure: np.ndarray | None, begin: float) -> None:
+        """Replace the route of an environment from a time on [s]; the one that it has stays where none is found."""
         own, state = self._task.own, self._vec.world.state
         settings = RouteSettings(low=tuple(own.low[e] + INSIDE), high=tuple(own.high[e] - INSIDE))
         start = np.append(state.payload_position[e], heading(tuple(state.payload_rotation[e].ravel())))
@@ -105,14 +112,15 @@ class RouteMpc(TeamMpc):
             )
         except NoRoute as error:
             warn_once("no_route", f"policy=mpc_route: {error}")
-            self._due[e] = time + RETRY
+            self._due[e] = begin + RETRY
             return
         took = route.report.planning_time
         if departure is None:
             self.search_time[e, 0] = took
         else:
             self.search_time[e, 1] = max(self.search_time[e, 1], took)
-        self.routes[e], self.begun[e] = route, time
+        self._before[e] = self.routes[e], self.begun[e]
+        self.routes[e], self.begun[e] = route, begin
 
     def _map(self, e: int) -> Obstacles:
         """Return the obstacles of an environment that are known."""
@@ -125,9 +133,12 @@ class RouteMpc(TeamMpc):
         shape, n = times.shape, self._vec.num_drones
         places, turned = np.zeros((*shape, 3)), np.tile(np.eye(3), (*shape, 1, 1))
         forces = np.tile(self._vec.world.system.formation_force, (*shape, 1, 1)).reshape(*shape, n, 3)
-        for e, route in enumerate(self.routes):
-            if route is None:
-                places[e] = self._task.own.start[e]
-            else:
-                places[e], turned[e], forces[e] = route.evaluate(times[e] - self.begun[e])
+        for e, (before, begun) in enumerate(self._before):
+            places[e] = self._task.own.start[e]
+            # Differences at the beginning of a route reach back to the one before it.
+            late = (times[e] >= self.begun[e]) | (before is None)
+            for route, begin, chosen in ((before, begun, ~late), (self.routes[e], self.begun[e], late)):
+                if route is not None and chosen.any():
+                    found = route.evaluate(times[e][chosen] - begin)
+                    places[e][chosen], turned[e][chosen], forces[e][chosen] = found
         return places, turned, forces
