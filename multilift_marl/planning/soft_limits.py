@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.kernels.jit import kernel
-from multilift_marl.math3d import add, dot, mul, row, scale, sub, vec
+from multilift_marl.math3d import add, dot, matrow, mul, row, scale, sub, vec
 from multilift_marl.planning.team_model import TeamModel, set_rotation
 from multilift_marl.rig.system import System
 from multilift_marl.schema.planner import PlannerConfig
@@ -53,7 +53,7 @@ def make_points(settings: PlannerConfig, system: System, model: TeamModel) -> Te
     """Return the points of a team."""
     half, signs = np.array(system.payload_size) / 2, np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
     corners = np.array(system.payload_center) + signs * half
-    radius = [np.linalg.norm(vehicle.half_size) for vehicle in system.vehicles]
+    radius = np.array([np.linalg.norm(vehicle.half_size) for vehicle in system.vehicles])
     radius += np.linalg.norm(system.hooks, axis=1)
     far = (np.linalg.norm(model.anchors, axis=1) + model.length + radius).max()
     reach = max(float(far), float(np.linalg.norm(corners, axis=1).max()))
@@ -155,47 +155,38 @@ def add_clearances(k, x, q, problem, w):
     """Add the cost of drones, cables and payload that come too close to obstacles, after `add_separations`."""
     model, around = problem.model, problem.around
     env, obstacles, points = around.env, around.obstacles, around.points
-    payload = x[0], x[1], x[2]
+    payload, r = (x[0], x[1], x[2]), w.model.rotation
+    attitude = r[0, 0], r[0, 1], r[0, 2], r[1, 0], r[1, 1], r[1, 2], r[2, 0], r[2, 1], r[2, 2]
     for m in range(obstacles.kind.shape[1]):
         if obstacles.kind[env, m] == NONE:
             continue
-        # The obstacle by then is as far from a point as it is now from one that is not yet as far.
+        # What has moved by `gone` then is as far from a point as it is now from the point less `gone`.
         gone = scale(around.ahead + k * problem.step, vec(obstacles.velocity, env, m))
         middle = sub(payload, gone)
         if box_distance(env, m, middle, obstacles) > points.reach + points.clearance:
             continue
         for p in range(points.corners.shape[0]):
-            _add_clearance(m, middle, row(points.corners, p), (0, 0.0, 0.0), problem, w)
+            _add_clearance(m, (middle, attitude), row(points.corners, p), (0, 0.0, 0.0), problem, w)
         for n in range(model.anchors.shape[0]):
             anchor = row(model.anchors, n)
             for share in CABLE_POINTS:
-                _add_clearance(m, middle, anchor, (n, share, 0.0), problem, w)
-            _add_clearance(m, middle, anchor, (n, 1.0, points.radius[n]), problem, w)
+                _add_clearance(m, (middle, attitude), anchor, (n, share, 0.0), problem, w)
+            _add_clearance(m, (middle, attitude), anchor, (n, 1.0, points.radius[n]), problem, w)
 
 
 @kernel
-def _frame(rotation):
-    return (
-        rotation[0, 0], rotation[0, 1], rotation[0, 2],
-        rotation[1, 0], rotation[1, 1], rotation[1, 2],
-        rotation[2, 0], rotation[2, 1], rotation[2, 2],
-    )  # fmt: skip
-
-
-@kernel
-def _add_clearance(m, middle, arm, sphere, problem, w):
+def _add_clearance(m, pose, arm, sphere, problem, w):
     """Add the cost of a sphere on the team: its centre is at `arm` on the payload, and a share of cable n from there.
 
     Args:
         m: the obstacle.
-        middle: of the payload, in a frame that moves with the obstacle [m].
+        pose: of the payload: its place in a frame that moves with the obstacle [m], and its attitude.
         arm: in the payload's frame [m].
         sphere: n, the share, and its radius [m].
         problem, w: see `riccati.recur`.
     """
-    n, share, radius = sphere
+    (middle, attitude), (n, share, radius) = pose, sphere
     around, lever = problem.around, w.lever
-    attitude = _frame(w.model.rotation)
     cable = sub(row(w.place, n), mul(attitude, row(problem.model.anchors, n)))
     point = add(middle, add(mul(attitude, arm), scale(share, cable)))
     distance, nearest = point_distance(around.env, m, point, around.obstacles, around.hulls)
@@ -207,7 +198,7 @@ def _add_clearance(m, middle, arm, sphere, problem, w):
     slope = w.place_slope[n]
     for i in range(3):
         lever[i] = normal[i]
-        lever[3 + i] = dot(normal, mul(_frame(w.model.turning[i]), arm))
+        lever[3 + i] = dot(normal, mul(matrow(w.model.turning, i), arm))
     for i in range(2):
         lever[6 + i] = share * (normal[0] * slope[0, 3 + i] + normal[1] * slope[1, 3 + i] + normal[2] * slope[2, 3 + i])
     weight = problem.step * around.points.weight
