@@ -128,6 +128,20 @@ def find_route(
     )
 
 
+def measure_route(
+    system: System, obstacles: Obstacles, env: int, route: Route, enough: float = RouteSettings.comfort
+) -> RouteMotion:
+    """Return a team's motion along a route and its distances from obstacles as they are now, such as new ones.
+
+    Args:
+        system: the team.
+        obstacles, env: those of one environment.
+        route: of the team.
+        enough: distance beyond which it is not measured [m].
+    """
+    return move_team(route, system, make_body(system, route.rest, route.modes), make_scene(obstacles, env), enough)
+
+
 def _space(start: np.ndarray, goal: np.ndarray, scene: Scene, body: TeamBody, settings: RouteSettings) -> np.ndarray:
     """Return the lowest and the highest position of the payload, (2, 3) [m]."""
     far = np.linalg.norm(scene.size, axis=1, keepdims=True) if len(scene.kind) else np.zeros((0, 1))

@@ -9,7 +9,7 @@ from test_team_clearance import exact_clearance
 
 from multilift_marl.errors import ConfigError
 from multilift_marl.navigation.formation_shapes import drone_places, find_breach
-from multilift_marl.navigation.planner import RouteSettings, find_route
+from multilift_marl.navigation.planner import RouteSettings, find_route, measure_route
 from multilift_marl.planning.maps import draw_map, place_map
 from multilift_marl.planning.route import NoRoute
 from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
@@ -114,6 +114,16 @@ def test_a_route_goes_on_with_the_motion_of_another(route):
         assert onward.sample(np.zeros(1))[:3, 0] == pytest.approx(departure, abs=1e-9)
         assert least_clearance(onward, make_system(4), WALL, 60) >= ROOM.least_clearance
         assert onward.times[-1] < 1.1 * (1 - share) * route.times[-1] + 0.2
+
+
+def test_a_new_obstacle_shows_where_a_route_is_no_longer_clear(route):
+    system = make_system(4)
+    motion = measure_route(system, placed(WALL), 0, route)
+    assert motion.clearance.min() == pytest.approx(route.report.clearance)
+    assert motion.tension.min() > 0.5 and motion.thrust.max() < 0.9
+    blocked = measure_route(system, placed([*WALL, (SPHERE, (0.2, 0.2, 0.2), (2.0, 0.0, 1.5), 0.0)]), 0, route)
+    at = blocked.places[blocked.clearance <= 0.0, 0]
+    assert len(at) and 1.4 < at.min() and at.max() < 2.6
 
 
 CLOSED = [(BOX, (0.1, 4.0, 4.0), (0.0, 0.0, 2.0), 0.0)]
