@@ -128,10 +128,10 @@ def test_a_new_obstacle_shows_where_a_route_is_no_longer_clear(route):
 
 CLOSED = [(BOX, (0.1, 4.0, 4.0), (0.0, 0.0, 2.0), 0.0)]
 TIGHT = [(BOX, (0.1, 2.0, 4.0), (0.0, side * 2.23, 4.0), 0.0) for side in (-1.0, 1.0)]  # the payload fits by 1 cm
-BAR = [  # which the payload could pass below, and the drones above
+SHELF = [  # which the payload could pass below, and the drones above
     (BOX, (0.1, 4.0, 0.5), (0.0, 0.0, 0.5), 0.0),
-    (BOX, (0.1, 4.0, 0.1), (0.0, 0.0, 1.85), 0.0),
-    (BOX, (0.1, 4.0, 1.0), (0.0, 0.0, 3.9), 0.0),
+    (BOX, (1.2, 4.0, 0.1), (0.0, 0.0, 1.85), 0.0),
+    (BOX, (1.2, 4.0, 1.0), (0.0, 0.0, 3.9), 0.0),
 ]
 IN_A_PILLAR = [(CYLINDER, (0.3, 0.3, 2.0), (-3.0, 0.4, 2.0), 0.0)]
 AT_THE_GOAL = [(CYLINDER, (0.3, 0.3, 2.0), (3.0, -0.54, 2.0), 0.0)]
@@ -142,7 +142,7 @@ AT_THE_GOAL = [(CYLINDER, (0.3, 0.3, 2.0), (3.0, -0.54, 2.0), 0.0)]
     [
         (CLOSED, GOAL, "no route from the start to the goal"),
         (TIGHT, GOAL, "no route from the start to the goal"),
-        (BAR, GOAL, "no route from the start to the goal"),
+        (SHELF, GOAL, "no route from the start to the goal"),
         (IN_A_PILLAR, GOAL, r"at the start \(-3.00, 0.00, 1.50\) m the team is in an obstacle"),
         (AT_THE_GOAL, GOAL, r"at the goal .* m from an obstacle, and has to keep 0.03 m"),
         ([], [3.0, 0.0, 0.1, 0.0], "the goal is 0.10 m high, and the payload has to be at least 0.50 m high"),
