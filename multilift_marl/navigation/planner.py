@@ -123,8 +123,8 @@ def find_route(
         if route is not None:
             return route._replace(report=route.report._replace(expanded=expanded, planning_time=thread_time() - begun))
     raise NoRoute(
-        f"no route from the start to the goal was found with {len(shapes.choices)} shapes of the formation that keeps "
-        f"{settings.least_clearance:g} m from all obstacles: widen a gap, or lower least_clearance"
+        f"no route that keeps {settings.least_clearance:g} m from all obstacles was found, with any of "
+        f"{len(shapes.choices)} shapes of the formation: widen a gap, lower least_clearance, or raise most"
     )
 
 
