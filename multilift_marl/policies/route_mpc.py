@@ -35,6 +35,7 @@ class RouteMpc(TeamMpc):
     Attributes:
         routes: of each environment (E,), None where none was found: there the team stays where it began.
         begun: when they begin (E,) [s].
+        known: obstacles that are known; those that are not have no kind.
         searches: of the episodes so far (E,).
         search_time: CPU time of the first search and of the longest later one, of each environment (E, 2) [s].
     """
@@ -47,8 +48,10 @@ class RouteMpc(TeamMpc):
         self._task = vec.task
         self.routes: list[Route | None] = [None] * e
         self.begun, self.searches, self.search_time = np.zeros(e), np.zeros(e), np.zeros((e, 2))
-        self._before: list[tuple[Route | None, float]] = [(None, 0.0)] * e
-        self._known = np.zeros(vec.world.obstacles.kind.shape, bool)
+        self._flown: list[list[tuple[float, Route]]] = [[] for _ in range(e)]
+        self.known = Obstacles(*(array.copy() for array in vec.world.obstacles))
+        self.planner.around = self.planner.around._replace(obstacles=self.known)
+        self._seen = np.zeros(self.known.kind.shape, bool)
         self._due = np.zeros(e)
         self._new = np.ones(e, bool)
 
@@ -59,6 +62,8 @@ class RouteMpc(TeamMpc):
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """See `TeamMpc.act`."""
+        for known, true in zip(self.known, self._vec.world.obstacles, strict=True):
+            known[:] = true
         for e in range(self._vec.num_envs):
             self._see(e)
         return super().act(observation)
@@ -70,14 +75,18 @@ class RouteMpc(TeamMpc):
 
     def _see(self, e: int) -> None:
         """Search a route where the episode is new, or an obstacle that was not known is in sight."""
-        seen, time = self._in_sight(e), float(self._task.time[e])
+        time = float(self._task.time[e])
         if self._new[e]:
-            self._new[e], self._known[e], self._due[e] = False, seen, np.inf
+            self._seen[e] = False
+        seen = self._in_sight(e)
+        changed = (seen & ~self._seen[e]).any()
+        self._seen[e] = seen
+        self.known.kind[e, ~seen] = NONE
+        if self._new[e]:
+            self._new[e], self._due[e], self._flown[e] = False, np.inf, []
             self.routes[e], self.begun[e], self.searches[e], self.search_time[e] = None, 0.0, 0, 0.0
-            self._before[e] = None, 0.0
             self._search(e, None, 0.0)
-        elif (seen & ~self._known[e]).any() or time >= self._due[e]:
-            self._known[e] |= seen
+        elif changed or time >= self._due[e]:
             if time < self.begun[e]:  # the last search is still under way
                 self._due[e] = self.begun[e]
                 return
@@ -88,14 +97,14 @@ class RouteMpc(TeamMpc):
             self._search(e, departure, begin)
 
     def _in_sight(self, e: int) -> np.ndarray:
-        """Return which obstacles (M,) are known to be there: all, or those near a drone or the payload."""
+        """Return which obstacles (M,) are known: all, or those that are or were near a drone or the payload."""
         obstacles, state = self._vec.world.obstacles, self._vec.world.state
+        there: np.ndarray = obstacles.kind[e] != NONE
         if self._task.options.level != "unknown":
-            known: np.ndarray = obstacles.kind[e] != NONE
-            return known
+            return there
         points = [state.payload_position[e], *state.drone_position[e]]
-        seen = self._known[e].copy() if not self._new[e] else np.zeros(obstacles.kind.shape[1], bool)
-        for m in np.flatnonzero((obstacles.kind[e] != NONE) & ~seen).tolist():
+        seen = self._seen[e].copy()
+        for m in np.flatnonzero(there & ~seen).tolist():
             seen[m] = min(box_distance(e, m, tuple(point), obstacles) for point in points) <= SIGHT
         return seen
 
@@ -104,11 +113,10 @@ class RouteMpc(TeamMpc):
         own, state = self._task.own, self._vec.world.state
         settings = RouteSettings(low=tuple(own.low[e] + INSIDE), high=tuple(own.high[e] - INSIDE))
         start = np.append(state.payload_position[e], heading(tuple(state.payload_rotation[e].ravel())))
-        known = self._map(e)
         self.searches[e] += 1
         try:
             route = find_route(
-                self._vec.world.system, known, 0, start, np.append(own.goal[e], 0.0), settings, departure
+                self._vec.world.system, self.known, e, start, np.append(own.goal[e], 0.0), settings, departure
             )
         except NoRoute as error:
             warn_once("no_route", f"policy=mpc_route: {error}")
@@ -119,26 +127,20 @@ class RouteMpc(TeamMpc):
             self.search_time[e, 0] = took
         else:
             self.search_time[e, 1] = max(self.search_time[e, 1], took)
-        self._before[e] = self.routes[e], self.begun[e]
+        # Differences at the beginning of a route reach back to those before it.
+        self._flown[e] = [*self._flown[e][-2:], (begin, route)]
         self.routes[e], self.begun[e] = route, begin
-
-    def _map(self, e: int) -> Obstacles:
-        """Return the obstacles of an environment that are known."""
-        known = Obstacles(*(array[e : e + 1].copy() for array in self._vec.world.obstacles))
-        known.kind[0, ~self._known[e]] = NONE
-        return known
 
     def _follow(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return places, attitudes and shapes along the routes, see `TeamMpc.preview`."""
         shape, n = times.shape, self._vec.num_drones
         places, turned = np.zeros((*shape, 3)), np.tile(np.eye(3), (*shape, 1, 1))
         forces = np.tile(self._vec.world.system.formation_force, (*shape, 1, 1)).reshape(*shape, n, 3)
-        for e, (before, begun) in enumerate(self._before):
+        for e, flown in enumerate(self._flown):
             places[e] = self._task.own.start[e]
-            # Differences at the beginning of a route reach back to the one before it.
-            late = (times[e] >= self.begun[e]) | (before is None)
-            for route, begin, chosen in ((before, begun, ~late), (self.routes[e], self.begun[e], late)):
-                if route is not None and chosen.any():
-                    found = route.evaluate(times[e][chosen] - begin)
-                    places[e][chosen], turned[e][chosen], forces[e][chosen] = found
+            for i, (begin, route) in enumerate(flown):
+                late = times[e] >= (begin if i else -np.inf)
+                if late.any():
+                    found = route.evaluate(times[e][late] - begin)
+                    places[e][late], turned[e][late], forces[e][late] = found
         return places, turned, forces
