@@ -1,0 +1,293 @@
+"""How far obstacles are: from points, along rays, from drones, cables and the payload.
+
+Obstacle m of environment e is given by its row of `Obstacles`; `hulls` (H, V, 3) are the vertices of hulls from the
+middles of their boxes, in their own frames [m]. Rows of kind NONE are infinitely far.
+"""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+
+from multilift_marl.kernels.jit import kernel
+from multilift_marl.math3d import (
+    add,
+    clip,
+    column,
+    dot,
+    from_columns,
+    mat,
+    matrow,
+    mul,
+    norm,
+    row,
+    scale,
+    sub,
+    tmul,
+    unit,
+    vec,
+)
+from multilift_marl.sim.gjk import nearest_within, separation
+from multilift_marl.sim.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE
+
+_GRAZE = 1e-6  # [m] from a hull, where a ray has met it
+_ADVANCES = 64  # of a ray towards a hull
+
+
+@kernel
+def point_distance(e, m, point, obstacles, hulls):
+    """Return the signed distance of a point from an obstacle and the nearest point of its surface, world frame [m].
+
+    Inside it is negative, to the nearest face; inside a HULL it is zero, and the nearest point is the point itself.
+    """
+    kind = obstacles.kind[e, m]
+    if kind == NONE:
+        return inf, point
+    middle, attitude, half = vec(obstacles.position, e, m), mat(obstacles.rotation, e, m), vec(obstacles.size, e, m)
+    if kind == HULL:
+        nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        offset = separation((BOX, point, nothing), (HULL, middle, attitude), hulls, obstacles.hull[e, m], inf)
+        return norm(offset), sub(point, offset)
+    local = tmul(attitude, sub(point, middle))
+    if kind == SPHERE:
+        distance, nearest = norm(local) - half[0], scale(half[0], unit(local))
+    elif kind == CYLINDER:
+        distance, nearest = _from_cylinder(local, half)
+    else:
+        distance, nearest = _from_box(local, half)
+    return distance, add(middle, mul(attitude, nearest))
+
+
+@kernel
+def _from_box(local, half):
+    """Return the signed distance of a point from a box in its own frame, and the nearest point of its surface."""
+    x, y, z = clip(local[0], -half[0], half[0]), clip(local[1], -half[1], half[1]), clip(local[2], -half[2], half[2])
+    outside = norm(sub(local, (x, y, z)))
+    if outside > 0.0:
+        return outside, (x, y, z)
+    # Inside: out by the nearest face.
+    dx, dy, dz = half[0] - abs(x), half[1] - abs(y), half[2] - abs(z)
+    if dx <= dy and dx <= dz:
+        return -dx, (half[0] if x >= 0.0 else -half[0], y, z)
+    if dy <= dz:
+        return -dy, (x, half[1] if y >= 0.0 else -half[1], z)
+    return -dz, (x, y, half[2] if z >= 0.0 else -half[2])
+
+
+@kernel
+def _from_cylinder(local, half):
+    """Do as `_from_box` for an upright cylinder."""
+    x, y, z = local
+    radius, radial = half[0], sqrt(x * x + y * y)
+    # Outward along its radius: any direction of a point on the axis.
+    out_x, out_y = (x / radial, y / radial) if radial > 1e-12 else (1.0, 0.0)
+    if radial > radius or abs(z) > half[2]:
+        kept = min(radial, radius)
+        nearest = (kept * out_x, kept * out_y, clip(z, -half[2], half[2]))
+        return norm(sub(local, nearest)), nearest
+    # Inside: out by the wall or by the nearer cap.
+    wall, cap = radius - radial, half[2] - abs(z)
+    if wall <= cap:
+        return -wall, (radius * out_x, radius * out_y, z)
+    return -cap, (x, y, half[2] if z >= 0.0 else -half[2])
+
+
+@kernel
+def ray_distance(e, m, origin, direction, obstacles, hulls):
+    """Return how far a ray along a unit vector is from an obstacle [m]: inf where it misses, 0 from inside."""
+    kind = obstacles.kind[e, m]
+    if kind == NONE:
+        return inf
+    attitude, half = mat(obstacles.rotation, e, m), vec(obstacles.size, e, m)
+    local, along = tmul(attitude, sub(origin, vec(obstacles.position, e, m))), tmul(attitude, direction)
+    if kind == HULL:
+        return _ray_to_hull(e, m, origin, direction, obstacles, hulls)
+    if kind == SPHERE:
+        begin, end = _between(1.0, dot(local, along), dot(local, local) - half[0] * half[0])
+    else:
+        begin, end = _slab(local[2], along[2], half[2])
+        if kind == CYLINDER:
+            square = along[0] * along[0] + along[1] * along[1]
+            share = local[0] * along[0] + local[1] * along[1]
+            rest = local[0] * local[0] + local[1] * local[1] - half[0] * half[0]
+            first, last = _between(square, share, rest)
+            begin, end = max(begin, first), min(end, last)
+        else:
+            for i in range(2):
+                first, last = _slab(local[i], along[i], half[i])
+                begin, end = max(begin, first), min(end, last)
+    return max(begin, 0.0) if begin <= end and end >= 0.0 else inf
+
+
+@kernel
+def _slab(x, slope, half):
+    """Return between which lengths a ray is within ± half in one coordinate."""
+    if abs(slope) < 1e-15:
+        return (-inf, inf) if abs(x) <= half else (inf, -inf)
+    one, other = (-half - x) / slope, (half - x) / slope
+    return min(one, other), max(one, other)
+
+
+@kernel
+def _between(a, b, c):
+    """Return between which t a t² + 2 b t + c is not positive; a is not negative."""
+    if a < 1e-15:
+        return (-inf, inf) if c <= 0.0 else (inf, -inf)
+    root = b * b - a * c
+    if root < 0.0:
+        return inf, -inf
+    return (-b - sqrt(root)) / a, (-b + sqrt(root)) / a
+
+
+@kernel
+def _ray_to_hull(e, m, origin, direction, obstacles, hulls):
+    """Return how far a ray is from a HULL: from plane to plane that separates it from what is left of the ray."""
+    length = 0.0
+    for _ in range(_ADVANCES):
+        point = add(origin, scale(length, direction))
+        distance, nearest = point_distance(e, m, point, obstacles, hulls)
+        if distance <= _GRAZE:
+            return length
+        offset = sub(nearest, point)
+        closing = dot(offset, direction)
+        if closing <= 1e-12 * distance:
+            return inf
+        # The hull is behind the plane through its nearest point across the offset.
+        length += distance * distance / closing
+    return length
+
+
+@kernel
+def segment_distance_to(e, m, a, b, obstacles, hulls):
+    """Return the distance of the segment a b, a cable, from an obstacle [m]; 0 if they touch."""
+    middle, axes = _segment(a, b)
+    return body_distance_to(e, m, BOX, middle, axes, obstacles, hulls, inf)
+
+
+@kernel
+def _segment(a, b):
+    """Return middle and half edges of a segment."""
+    none, along = (0.0, 0.0, 0.0), scale(0.5, sub(b, a))
+    return scale(0.5, add(a, b)), from_columns(along, none, none)
+
+
+@kernel
+def box_distance_to(e, m, center, frame, half, obstacles, hulls):
+    """Return the distance of a box, a drone, from an obstacle [m]; 0 if they touch.
+
+    Args:
+        e, m: environment and obstacle.
+        center: of the box, world frame [m].
+        frame: its attitude, 9 numbers.
+        half: its half edges [m].
+        obstacles, hulls: see the module.
+    """
+    return body_distance_to(e, m, BOX, center, _stretch(frame, half), obstacles, hulls, inf)
+
+
+@kernel
+def cylinder_distance_to(e, m, center, frame, half, obstacles, hulls):
+    """Do as `box_distance_to` for an upright cylinder of radius `half[0]` and half height `half[2]` [m]."""
+    return body_distance_to(e, m, CYLINDER, center, _stretch(frame, half), obstacles, hulls, inf)
+
+
+@kernel
+def _stretch(frame, half):
+    """Return the columns of a frame, as long as half edges."""
+    return (
+        frame[0] * half[0], frame[1] * half[1], frame[2] * half[2],
+        frame[3] * half[0], frame[4] * half[1], frame[5] * half[2],
+        frame[6] * half[0], frame[7] * half[1], frame[8] * half[2],
+    )  # fmt: skip
+
+
+@kernel
+def body_distance_to(e, m, kind, middle, axes, obstacles, hulls, beyond):
+    """Return the distance of a BOX or CYLINDER from an obstacle [m], 0 if they touch; see `gjk.separation`."""
+    other = obstacles.kind[e, m]
+    if other == NONE:
+        return inf
+    place, attitude, half = vec(obstacles.position, e, m), mat(obstacles.rotation, e, m), vec(obstacles.size, e, m)
+    if other == SPHERE:
+        offset = sub(place, middle)
+        return max(norm(sub(offset, nearest_within(kind, axes, offset))) - half[0], 0.0)
+    if other != HULL:
+        attitude = _stretch(attitude, half)
+    return norm(separation((kind, middle, axes), (other, place, attitude), hulls, obstacles.hull[e, m], beyond))
+
+
+@kernel
+def least_clearance(e, state, rig, limits, lost, nodes, obstacles, hulls, within):
+    """Return the least distance of drones, cables and payload from obstacles [m]: 0 if any touch, at most `within`.
+
+    Broken cables are left out, of chains their link at the drone.
+
+    Args:
+        e: the environment.
+        state: SystemState.
+        rig: RigArrays.
+        limits: `mdp.failures.Limits`, the bodies' half edges.
+        lost: (E, N) bool, drones that count no more, nor do their cables.
+        nodes: of chains (`World.nodes`), or None.
+        obstacles, hulls: see the module.
+        within: beyond it distances are not sought, which is quick [m]; inf: any.
+    """
+    least = within
+    payload, attitude = row(state.payload_position, e), matrow(state.payload_rotation, e)
+    # The payload, whose middle is off its centre of mass.
+    half = limits.payload_half
+    middle, axes = add(payload, mul(attitude, limits.payload_center)), _stretch(attitude, half)
+    kind = CYLINDER if limits.payload_round else BOX
+    least = _clearance(e, kind, middle, axes, obstacles, hulls, least)
+    for n in range(state.drone_position.shape[1]):
+        if lost[e, n]:
+            continue
+        drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
+        axes = _stretch(frame, row(limits.drone_half, n))
+        least = _clearance(e, BOX, drone, axes, obstacles, hulls, least)
+        # Its cable, from anchor to hook; of a chain link by link.
+        begin, end = add(payload, mul(attitude, row(rig.anchors, n))), add(drone, mul(frame, row(rig.hooks, n)))
+        if nodes is not None:
+            for k in range(rig.cable_segments[n] - 1):
+                node = vec(nodes.position[e], n, k)
+                middle, axes = _segment(begin, node)
+                least = _clearance(e, BOX, middle, axes, obstacles, hulls, least)
+                begin = node
+        if not state.cable_broken[e, n]:
+            middle, axes = _segment(begin, end)
+            least = _clearance(e, BOX, middle, axes, obstacles, hulls, least)
+    return least
+
+
+@kernel
+def find_touch(e, state, rig, limits, lost, nodes, obstacles, hulls):
+    """Return whether a drone, a cable or the payload touches an obstacle; arguments as of `least_clearance`."""
+    return least_clearance(e, state, rig, limits, lost, nodes, obstacles, hulls, _GRAZE) == 0.0
+
+
+@kernel
+def _clearance(e, kind, middle, axes, obstacles, hulls, least):
+    """Return the distance of a body from the nearest obstacle, if it is less than `least` [m]."""
+    one, two, three = column(axes, 0), column(axes, 1), column(axes, 2)
+    square = dot(one, one) + dot(two, two) + dot(three, three)
+    radius = sqrt(square)
+    for m in range(obstacles.kind.shape[1]):
+        if least <= 0.0:
+            break
+        if obstacles.kind[e, m] == NONE:
+            continue
+        # Spheres first, then the body's sphere and the obstacle's box: only what is left is worth an exact distance.
+        offset, half = sub(middle, vec(obstacles.position, e, m)), vec(obstacles.size, e, m)
+        apart = dot(offset, offset)
+        reach = least + radius
+        if apart > 2.0 * (reach * reach + dot(half, half)):
+            continue
+        local = tmul(mat(obstacles.rotation, e, m), offset)
+        x, y, z = (
+            max(abs(local[0]) - half[0], 0.0),
+            max(abs(local[1]) - half[1], 0.0),
+            max(abs(local[2]) - half[2], 0.0),
+        )
+        if x * x + y * y + z * z >= reach * reach:
+            continue
+        least = min(least, body_distance_to(e, m, kind, middle, axes, obstacles, hulls, least))
+    return least
