@@ -14,6 +14,8 @@ from multilift_marl.kernels.jit import inlined
 from multilift_marl.math3d import clip, mat, matmul, matrow, norm, put, rotation_vector, row, sub, transpose, vec
 from multilift_marl.mdp.failures import FailureMask, Limits
 from multilift_marl.rig.constants import RigArrays
+from multilift_marl.sim.cables.chain_arrays import Nodes
+from multilift_marl.sim.obstacles import Obstacles
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.state import HiddenLoads, SystemState
 
@@ -120,6 +122,15 @@ class View(NamedTuple):
     """(E,) for how long the payload has been within the success region [s]."""
     min_separation: np.ndarray
     """(E,) smallest distance between drones in the episode [m]."""
+    obstacles: Obstacles
+    hulls: np.ndarray
+    """(H, V, 3) vertices of obstacles from their middles, see `obstacles.make_hulls` [m]."""
+    nodes: Nodes | None
+    """Of cables that are chains."""
+    clearance: np.ndarray
+    """(E,) least distance of drones, cables and payload from obstacles, at most `failures.SIGHT` [m]."""
+    min_clearance: np.ndarray
+    """(E,) the same in the episode so far [m]."""
     terms: np.ndarray
     """(E, T) weighted reward terms."""
     dt: float

@@ -26,6 +26,7 @@ from multilift_marl.math3d import (
 from multilift_marl.rig.resolve import MIN_SEPARATION
 from multilift_marl.rig.system import System
 from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.sim.obstacle_distance import least_clearance
 
 CAUSES = (
     "none",
@@ -37,16 +38,18 @@ CAUSES = (
     "tilt",  # a drone tilted over 80°
     "cable_broken",  # its tension has exceeded cable.breaking_load
     "wall",  # anything touches a wall (task gate)
-    "out_of_range",  # payload over 3 m from its target, whatever the vehicle
+    "obstacle",  # a drone, a cable or the payload touches one
+    "out_of_range",  # payload over 3 m from its target, whatever the vehicle; of navigate: outside its map
     "diverged",  # the simulation has failed, not the team
 )
 FIRST_OWN = len(CAUSES)  # the cause that a task's first own failure has, see `Task.FAILURES`
-GROUND, COLLISION, CROSSING, CABLE, BELOW, TILT, BROKEN, WALL, RANGE, DIVERGED = range(1, len(CAUSES))
+GROUND, COLLISION, CROSSING, CABLE, BELOW, TILT, BROKEN, WALL, OBSTACLE, RANGE, DIVERGED = range(1, len(CAUSES))
 LOAD_GROUND = 0  # the payload's contact with the ground, to be ignored apart from the drones'
 
 MAX_DISTANCE = 3.0  # [m]
 _CABLE_DISTANCE = 0.1  # [m] for the span of a falcon
-TOUCH = 0.005  # [m] what is no higher touches the ground
+TOUCH = 0.005  # [m] what is no higher touches the ground, no farther an obstacle
+SIGHT = 2.0  # [m] beyond which clearances are not computed
 MAX_TILT = 80.0  # [deg] of a drone
 _MIN_UP = cos(radians(MAX_TILT))
 _MIN_CABLE_PAYLOAD = cos(radians(135.0))
@@ -81,10 +84,12 @@ class Limits(NamedTuple):
     """Whether it is a cylinder."""
     drone_half: np.ndarray
     """(N, 3) half edges of a drone [m]."""
+    distance: float
+    """Of the payload from its target [m]."""
 
 
-def make_limits(system: System) -> Limits:
-    """Return the limits of `system`."""
+def make_limits(system: System, distance: float = MAX_DISTANCE) -> Limits:
+    """Return the limits of `system`, whose payload may be `distance` [m] from its target."""
     n, anchors, ends = system.num_drones, system.anchors, system.cable_ends
     cables = np.zeros((n, n))
     for i in range(n):
@@ -99,6 +104,7 @@ def make_limits(system: System) -> Limits:
         payload_center=triple(system.payload_center),
         payload_round=system.payload_shape == "cylinder",
         drone_half=np.array([drone_half_size(vehicle) for vehicle in system.vehicles]),
+        distance=distance,
     )
 
 
@@ -126,7 +132,7 @@ def find_cause(e, v):
     payload, attitude = row(state.payload_position, e), matrow(state.payload_rotation, e)
     up = column(attitude, 2)
     # `not a <= b` catches NaN, too. It cannot be ignored: beyond that nothing else means anything.
-    if not v.errors.distance[e] <= MAX_DISTANCE:
+    if not v.errors.distance[e] <= limits.distance:
         return RANGE
     if payload_height(payload, attitude, limits) < TOUCH and _counts(LOAD_GROUND, ignored):
         return GROUND
@@ -162,6 +168,15 @@ def find_cause(e, v):
             if segment_distance(anchor, end, foot, other) < limits.cables[n, m] and _counts(CROSSING, ignored):
                 return CROSSING
     return 0
+
+
+@inlined
+def find_obstacle(e, v):
+    """Return OBSTACLE if anything of environment e touches an obstacle, else 0; update the clearance [m]."""
+    clearance = least_clearance(e, v.state, v.rig, v.limits, v.mask.lost, v.nodes, v.obstacles, v.hulls, SIGHT)
+    v.clearance[e] = clearance
+    v.min_clearance[e] = min(v.min_clearance[e], clearance)
+    return OBSTACLE if clearance < TOUCH and _counts(OBSTACLE, v.mask.ignored[e]) else 0
 
 
 @inlined

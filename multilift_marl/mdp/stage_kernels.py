@@ -11,7 +11,7 @@ from multilift_marl.control.formation import place_formation
 from multilift_marl.kernels.jit import compose, kernel
 from multilift_marl.math3d import matrow, put, putmat, row, scale, sub
 from multilift_marl.mdp.env_data import update_errors
-from multilift_marl.mdp.failures import find_cause
+from multilift_marl.mdp.failures import find_cause, find_obstacle
 
 
 class Ahead(NamedTuple):
@@ -57,7 +57,10 @@ def compose_plan(plan: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def compose_check(
-    check: Callable[..., Any] | None, advances: bool, own: Mapping[int, Callable[..., Any]] | None = None
+    check: Callable[..., Any] | None,
+    advances: bool,
+    own: Mapping[int, Callable[..., Any]] | None = None,
+    obstacles: bool = False,
 ) -> Callable[..., Any]:
     """Return the kernel of (lo, hi, View, dt) that measures errors, integrates them over `dt` [s], finds failures.
 
@@ -68,6 +71,7 @@ def compose_check(
         advances: whether time advances here, because no plan does that.
         own: inlined kernels of (e, View), whether the task's own failures with these numbers have happened, which count
             after all others.
+        obstacles: whether there are any, which cost some compilation.
     """
     lines = ["def check(lo, hi, v, dt):", "    for e in range(lo, hi):"]
     lines += ["        v.time[e] += dt"] if advances else []
@@ -76,7 +80,11 @@ def compose_check(
     # In any case, for it also keeps the least separation.
     lines.append("        cause = find_cause(e, v)")
     lines.append("        v.cause[e] = cause if v.cause[e] == 0 else v.cause[e]")
+    if obstacles:
+        lines.append("        touched = find_obstacle(e, v)")
+        lines.append("        v.cause[e] = touched if v.cause[e] == 0 else v.cause[e]")
     functions: dict[str, Callable[..., Any]] = {"update_errors": update_errors, "find_cause": find_cause}
+    functions |= {"find_obstacle": find_obstacle} if obstacles else {}
     functions |= {"find_own": check} if check else {}
     for number, has_failed in (own or {}).items():
         lines.append(f"        if v.cause[e] == 0 and failure_{number}(e, v):")

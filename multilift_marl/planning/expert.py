@@ -18,7 +18,14 @@ from multilift_marl.config.config import Config
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.planning.augmented_lagrangian import CONVERGED, STATUS
-from multilift_marl.planning.flatness import SAMPLES, STEP, FlatWork, make_flat_team, set_flat_state
+from multilift_marl.planning.flatness import (
+    SAMPLES,
+    STEP,
+    FlatWork,
+    make_flat_team,
+    set_flat_state,
+    steady_shape,
+)
 from multilift_marl.planning.goals import Goal, pose_goal
 from multilift_marl.planning.hard_limits import limit_names
 from multilift_marl.planning.hard_planner import (
@@ -102,6 +109,7 @@ class TeamExpert:
         self.limit_names = limit_names(n)
         self._settings, self._tolerance, self._size = settings, tolerance, state_size(n)
         self._flat = make_flat_team(self.model, system)
+        self._shape = steady_shape(self._flat)
 
     def rest_states(self, positions: np.ndarray, rotations: np.ndarray | None = None) -> np.ndarray:
         """Return states (E, 12 + 7 N) of teams that hold the payload at rest.
@@ -116,7 +124,7 @@ class TeamExpert:
         goal = pose_goal(self.times, positions, rotations)
         states = np.zeros((len(goal.positions), self._size))
         motion = np.ascontiguousarray(goal.positions[:, 0]), np.ascontiguousarray(goal.rotations[:, 0])
-        _set_rest(motion, np.zeros(7), self._flat, FlatWork.of(len(self.model.anchors)), states)
+        _set_rest((*motion, self._shape), np.zeros(7), self._flat, FlatWork.of(len(self.model.anchors)), states)
         return states
 
     def random_states(
@@ -179,7 +187,7 @@ class TeamExpert:
                 )
             plans.states[:], plans.targets[:] = last.states, last.targets
             hard.multipliers.push[:] = last.multipliers
-        given = states, loads, (positions, rotations, np.zeros((count, steps + 1, 12)))
+        given = states, loads, (positions, rotations, self._shape[None, None], np.zeros((count, steps + 1, 12)))
         settings = elapsed, self._settings.step, self._settings.iterations or MOST_ITERATIONS, self._tolerance
         team = self._flat, self.objective, self.limits
 
@@ -233,9 +241,9 @@ class TeamExpert:
 
 @kernel
 def _set_rest(motion, load, flat, w, states):
-    positions, rotations = motion
+    positions, rotations, shape = motion
     for e in range(states.shape[0]):
-        set_flat_state(positions[e], rotations[e], 0.0, load, flat, w, states[e])
+        set_flat_state(positions[e], rotations[e], shape, 0.0, load, flat, w, states[e])
 
 
 def _of_each(name: str, values: np.ndarray, count: int, shape: tuple[int, ...]) -> np.ndarray:

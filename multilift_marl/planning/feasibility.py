@@ -20,6 +20,7 @@ from multilift_marl.planning.flatness import (
     FlatWork,
     make_flat_team,
     set_flat_state,
+    steady_shape,
 )  # fmt: skip
 from multilift_marl.planning.spline import sample_spline
 from multilift_marl.planning.team_model import make_model, state_size
@@ -129,7 +130,8 @@ def assess_motion(
     team = _heaviest_team(system, ranges)
     count, n = len(times), system.num_drones
     motion = TeamMotion(*(np.zeros((count, n, 3)) for _ in TeamMotion._fields))
-    write_motion(positions, rotations, np.zeros(7), team, FlatWork.of(n), np.zeros(state_size(n)), motion)
+    poses = positions, rotations, steady_shape(team)
+    write_motion(poses, np.zeros(7), team, FlatWork.of(n), np.zeros(state_size(n)), motion)
     middle = SAMPLES // 2
     payload = positions[:, middle], rotations[:, middle]
     quantities = (
@@ -161,11 +163,12 @@ class TeamMotion(NamedTuple):
 
 
 @kernel
-def write_motion(positions, rotations, load, team, work, x, motion):
+def write_motion(poses, load, team, work, x, motion):
     """Write the TeamMotion (T, N, 3) of a payload; see `assess_motion`, and `set_flat_state` for the others."""
+    positions, rotations, shape = poses
     count = team.force.shape[0]
     for t in range(positions.shape[0]):
-        set_flat_state(positions[t], rotations[t], 0.0, load, team, work, x)
+        set_flat_state(positions[t], rotations[t], shape, 0.0, load, team, work, x)
         thrust = x[12 + 4 * count :]
         for n in range(count):
             put(motion.thrust[t, n], (thrust[3 * n], thrust[3 * n + 1], thrust[3 * n + 2]))

@@ -1,9 +1,9 @@
 """The state of a whole team that carries a payload along a given motion of its pose.
 
-Pose and its derivatives ask for a force and a moment; cable forces that exert them, the nearest to those of the resting
-formation, point along the cables, so every drone's place follows, and with its acceleration its thrust (differential
-flatness, Sreenath and Kumar, RSS 2013). Derivatives are differences of five poses, of second order in the time between
-them.
+Pose and its derivatives ask for a force and a moment; cable forces that exert them, the nearest to those of a formation
+that holds the payload at rest, point along the cables, so every drone's place follows, and with its acceleration its
+thrust (differential flatness, Sreenath and Kumar, RSS 2013). Those nominal forces are the formation's shape, which may
+change on the way. Derivatives are differences of five poses, of second order in the time between them.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ from multilift_marl.rig.system import System
 
 STEP = 0.02  # [s] between the poses of a state
 SAMPLES = 5  # poses of a state
-MIN_LIFT = 0.1  # of a cable's force at rest, that its vertical component is at least
+SHAPES = slice(1, 4)  # of these, the poses at which the formation's shape counts
+MIN_LIFT = 0.1  # of a cable's nominal force, that its vertical component is at least
 
 
 class FlatTeam(NamedTuple):
@@ -48,7 +49,7 @@ class FlatTeam(NamedTuple):
 
     model: TeamModel
     force: np.ndarray
-    """(N, 3) of each cable on the resting payload, its heading frame [N]."""
+    """(N, 3) of each cable on the resting payload, its heading frame [N]: the nominal ones of a constant shape."""
     distribution: WrenchDistribution
     step: float
     """[s] between the poses of a state."""
@@ -57,6 +58,11 @@ class FlatTeam(NamedTuple):
 def make_flat_team(model: TeamModel, system: System, step: float = STEP) -> FlatTeam:
     """Return the numbers of a team, whose poses are `step` [s] apart."""
     return FlatTeam(model, system.formation_force.copy(), make_wrench_distribution(system.anchors), step)
+
+
+def steady_shape(team: FlatTeam) -> np.ndarray:
+    """Return the nominal forces (3, N, 3) of the formation at rest, as `set_flat_state` takes them."""
+    return np.tile(team.force, (3, 1, 1))
 
 
 class FlatWork(NamedTuple):
@@ -74,23 +80,25 @@ class FlatWork(NamedTuple):
 
 
 @kernel
-def set_flat_state(position, rotation, yaw, load, team, w, x):
+def set_flat_state(position, rotation, shape, yaw, load, team, w, x):
     """Write the state (12 + 7 N,) of a team whose payload moves so.
 
     Args:
         position: (5, 3) of the payload, `team.step` apart [m].
         rotation: (5, 3, 3) its attitude there.
+        shape: (3, N, 3) nominal forces of the cables on the resting payload at the three poses in the middle, its
+            heading frame [N].
         yaw: which the state's yaw is near to [rad]: it may exceed π.
         load: (7,) other force, moment and mass of the payload, see `team_model.accelerations`.
         team: FlatTeam.
         w: FlatWork.
         x: written.
     """
-    count, step = team.force.shape[0], team.step
+    count, step = shape.shape[1], team.step
     q = 6 + 2 * count
     # At the three poses in the middle: forces and places there are differentiated in turn.
     for i in range(3):
-        _place_team(i, position, rotation, load, team, w)
+        _place_team(i, position, rotation, shape, load, team, w)
     middle = _matrix(rotation, 2)
     put(x[0:3], row(position, 2))
     roll, pitch, turned = euler_angles(middle)
@@ -133,7 +141,7 @@ def _turned(rotation, i, j):
 
 
 @kernel
-def _place_team(i, position, rotation, load, team, w):
+def _place_team(i, position, rotation, shape, load, team, w):
     """Write cable forces and places of the drones at pose i + 1 of five."""
     model, step = team.model, team.step
     here, attitude = row(position, i + 1), _matrix(rotation, i + 1)
@@ -151,17 +159,17 @@ def _place_team(i, position, rotation, load, team, w):
     moment = mul(attitude, sub(moment, (load[3], load[4], load[5])))
     psi = heading(attitude)
     c, s = cos(psi), sin(psi)
-    for n in range(team.force.shape[0]):
-        # The resting forces turn with the heading alone, as the formation does; only what they lack is distributed.
-        nominal = turn(c, s, row(team.force, n))
+    for n in range(shape.shape[1]):
+        # Nominal forces turn with the heading alone, as the formation does; only what they lack is distributed.
+        nominal = turn(c, s, vec(shape, i, n))
         put(w.force[i, n], nominal)
         force = sub(force, nominal)
         moment = sub(moment, cross(mul(attitude, row(model.anchors, n)), nominal))
     linear, angular = distribute_wrench(force, moment, attitude, team.distribution)
-    for n in range(team.force.shape[0]):
+    for n in range(shape.shape[1]):
         arm = mul(attitude, row(model.anchors, n))
         f = add(vec(w.force, i, n), add(linear, cross(angular, arm)))
-        f = (f[0], f[1], max(f[2], MIN_LIFT * team.force[n, 2]))  # a cable cannot push
+        f = (f[0], f[1], max(f[2], MIN_LIFT * shape[i, n, 2]))  # a cable cannot push
         put(w.force[i, n], f)
         put(w.place[i, n], add(add(here, arm), scale(model.length[n], unit(f))))
 

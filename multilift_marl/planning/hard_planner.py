@@ -88,11 +88,11 @@ class HardPlanner(TeamPlanner):
     def plan(
         self, states: np.ndarray, positions: np.ndarray, rotations: np.ndarray, elapsed: float,
         offsets: np.ndarray,
-        loads: np.ndarray | None = None,
+        loads: np.ndarray | None = None, shapes: np.ndarray | None = None,
     ) -> Plans:  # fmt: skip
         """Do as `TeamPlanner.plan`; how plans ended is in `hard.report`."""
         loads = self._unloaded if loads is None else loads
-        given = states, loads, (positions, rotations, offsets)
+        given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
         settings = elapsed, self.settings.step, self.settings.iterations or MOST_ITERATIONS, TOLERANCE
         team = self._flat, self.objective, self.limits
         solve_teams((0, len(states)), given, settings, team, self.plans, self.hard, self._newton)

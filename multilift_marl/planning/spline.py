@@ -14,20 +14,23 @@ from multilift_marl.kernels.jit import kernel
 NO_FILE = np.zeros((2, 13))  # the table of a task without a file: at rest at the origin
 
 
-def fit_spline(rows: np.ndarray) -> np.ndarray:
-    """Return the quintic spline through rows (K, 5) as a table (K, 13): time, then values, rates and second rates.
+def fit_spline(rows: np.ndarray, start: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
+    """Return the quintic spline through rows (K, 1 + D) as a table (K, 1 + 3 D): time, values, rates, second rates.
 
     Each piece is the quintic with the given value, velocity and acceleration at its two ends. Velocity and
     acceleration at the inner rows follow from the continuity of the third and fourth derivative there: two equations
     for two unknowns of each row, coupled to its neighbours, solved by block elimination. At both ends they are zero.
 
     Args:
-        rows: t [s] and four values; at least 2 rows, t increasing.
+        rows: t [s] and D values, four in paths; at least 2 rows, t increasing.
+        start: velocity and acceleration (D,) at the first row, if it is not at rest there.
     """
     count, unit = len(rows), float(np.median(np.diff(rows[:, 0])))  # a unit of time for which the equations are even
     h, d = np.diff(rows[:, 0]) / unit, np.diff(rows[:, 1:], axis=0)
-    solution = np.zeros((count, 2, 4))
-    upper, right = np.zeros((count, 2, 2)), np.zeros((count, 2, 4))
+    solution = np.zeros((count, 2, d.shape[1]))
+    upper, right = np.zeros((count, 2, 2)), np.zeros_like(solution)
+    if start is not None:
+        solution[0] = right[0] = start[0] * unit, start[1] * unit**2
     for i in range(1, count - 1):  # the first line of each block is of the third derivative, the second of the fourth
         p, q = h[i - 1], h[i]
         before = np.array([[-24 / p**2, -3 / p], [-168 / p**3, -24 / p**2]])
@@ -44,14 +47,16 @@ def fit_spline(rows: np.ndarray) -> np.ndarray:
 
 
 def sample_spline(table: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the values of a spline and their first three derivatives at times (T,) [s], (4, T, 4)."""
+    """Return the values of a spline and their first three derivatives at times (T,) [s], (4, T, D)."""
+    size = (table.shape[1] - 1) // 3
     t = np.clip(t, 0.0, table[-1, 0])
     i = np.clip(np.searchsorted(table[:, 0], t, side="right") - 1, 0, len(table) - 2)
     first, last, s = table[i], table[i + 1], (t - table[i, 0])[:, None]
     h = (last[:, 0] - first[:, 0])[:, None]
     u = s / h
-    value, rate, bend = first[:, 1:5], first[:, 5:9], first[:, 9:13]
-    c, d, e = _quintic(value, rate, bend, last[:, 1:5], last[:, 5:9], last[:, 9:13], h)
+    value, rate, bend = first[:, 1 : 1 + size], first[:, 1 + size : 1 + 2 * size], first[:, 1 + 2 * size :]
+    then = last[:, 1 : 1 + size], last[:, 1 + size : 1 + 2 * size], last[:, 1 + 2 * size :]
+    c, d, e = _quintic(value, rate, bend, *then, h)
     return np.stack(
         [
             value + s * (rate + 0.5 * s * bend) + u**3 * (c + u * (d + u * e)),

@@ -12,7 +12,7 @@ import numpy as np
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.physical import GRAVITY
-from multilift_marl.planning.flatness import SAMPLES, STEP, FlatWork, make_flat_team, set_flat_state
+from multilift_marl.planning.flatness import SAMPLES, STEP, FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.riccati import IterationWork, Objective, Problem, find_gains, take_step
 from multilift_marl.planning.team_model import TeamModel, make_model, state_size, step_state
 from multilift_marl.rig.system import System
@@ -90,11 +90,12 @@ class TeamPlanner:
         self._flat = make_flat_team(self.model, system)
         self._work = PlannerWork.of(steps, n)
         self._unloaded = np.zeros((e, 7))
+        self._steady = steady_shape(self._flat)[None, None]
 
     def plan(
         self, states: np.ndarray, positions: np.ndarray, rotations: np.ndarray, elapsed: float,
         offsets: np.ndarray,
-        loads: np.ndarray | None = None,
+        loads: np.ndarray | None = None, shapes: np.ndarray | None = None,
     ) -> Plans:  # fmt: skip
         """Plan on from the present states, and return the live plans.
 
@@ -105,9 +106,10 @@ class TeamPlanner:
             elapsed: time since the last plan [s].
             offsets: (E, K + 1, 12) of the target states, see `approach.write_approaches`.
             loads: (E, 7) on the payload, see `team_model.accelerations`; None for none.
+            shapes: (E, K + 1, 3, N, 3) the formation's nominal forces, see `flatness.set_flat_state`; None: as at rest.
         """
         loads = self._unloaded if loads is None else loads
-        given = states, loads, (positions, rotations, offsets)
+        given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
         settings = elapsed, self.settings.step, self.settings.iterations or 1
         plan_teams(given, settings, (self._flat, self.objective), self.plans, self._work)
         return self.plans
@@ -140,7 +142,8 @@ def plan_teams(given, settings, team, plans, work):
     """See `TeamPlanner.plan`.
 
     Args:
-        given: states, loads, and positions, rotations and offsets of the motion.
+        given: states, loads, and positions, rotations, shapes and offsets of the motion; one shape may do for all
+            steps, or for all teams.
         settings: time since the last plan [s], length of a step [s], iterations.
         team: FlatTeam, Objective.
         plans: Plans, overwritten.
@@ -166,13 +169,15 @@ def plan_teams(given, settings, team, plans, work):
 @kernel
 def prepare_team(e, given, times, flat, plans, work):
     """Write targets and inputs asked for to `work`, and a guess to the plan of team e: the last one, moved on."""
-    starts, loads, (positions, rotations, offsets) = given
+    starts, loads, (positions, rotations, shapes, offsets) = given
     elapsed, h = times
     states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
     steps, size, nu = inputs.shape[0], states.shape[1], inputs.shape[1]
     f = size - nu
+    shape = shapes[min(e, shapes.shape[0] - 1)]
     for k in range(steps + 1):
-        set_flat_state(positions[e, k], rotations[e, k], starts[e, 5], loads[e], flat, work.flat, targets[k])
+        at = min(k, shape.shape[0] - 1)
+        set_flat_state(positions[e, k], rotations[e, k], shape[at], starts[e, 5], loads[e], flat, work.flat, targets[k])
     q = 6 + 2 * (nu // 3)
     for k in range(steps + 1):
         for i in range(6):

@@ -15,6 +15,7 @@ import numpy as np
 from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.approach import Approach, begin_approaches, write_approaches
+from multilift_marl.planning.flatness import SAMPLES, SHAPES
 from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.hard_planner import HardPlanner
 from multilift_marl.planning.team_observer import TeamObserver
@@ -25,8 +26,11 @@ from multilift_marl.policies.last_plan import LastPlan
 from multilift_marl.sensing.load_sensing import CAMERA_DELAY, CAMERAS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from multilift_marl.envs.core import MultiliftVec
 
+    Preview = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
 
 SHARE = 0.6  # of what filters of sensors say beside the prediction, by which states are corrected
 UNFILTERED = 0.35  # of what `randomization.observation_noise` leaves, which no filter has smoothed
@@ -44,12 +48,16 @@ class TeamMpc:
 
     Args:
         vec: environments with one of the interfaces; read at every `act`.
+        preview: where targets come from, see the attribute.
 
     Class attributes:
         INTERFACE, INTERFACES: by which it acts, and those by which it can.
 
     Attributes:
         planner: TeamPlanner.
+        preview: function of times (E, M) since the start of the episode [s] that returns the payload's places
+            (E, M, 3) [m] and attitudes (E, M, 3, 3), and the formation's shape there: nominal cable forces
+            (E, M, N, 3) [N], see `flatness.set_flat_state`, or None for that at rest. None: `Task.preview_targets`.
 
     Raises:
         ConfigError: a task that it cannot fly, see `Task.CAN_PLAN`; a payload on one point
@@ -59,7 +67,7 @@ class TeamMpc:
     INTERFACE: ClassVar[str] = "acc_rates"
     INTERFACES: ClassVar[tuple[str, ...]] = ("acc_rates", "full_state")
 
-    def __init__(self, vec: MultiliftVec):
+    def __init__(self, vec: MultiliftVec, preview: Preview | None = None):
         system, config, n = vec.world.system, vec.config, vec.num_drones
         if not vec.task.CAN_PLAN:
             raise ConfigError(
@@ -74,7 +82,7 @@ class TeamMpc:
                 f"policy=mpc estimates unknown forces, which control.disturbance={rejection} would reject a second "
                 "time; set control.disturbance=none, or planner.estimate=false"
             )
-        self._vec, settings = vec, config.planner
+        self._vec, settings, self.preview = vec, config.planner, preview
         self.planner = (HardPlanner if settings.limits == "hard" else TeamPlanner)(system, settings, vec.num_envs)
         self._dt = vec.task.dt
         exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
@@ -156,14 +164,13 @@ class TeamMpc:
             planned = self._correct_plans(states, payload_rotation, following)
         now = vec.task.time[:, None]
         last = np.maximum(now - self._dt, 0.0)
-        preview = vec.task.preview_targets
-        targets = _arrays(preview(now + [0.0, self._dt])), _arrays(preview(last))
+        targets = self._look_ahead(now + [0.0, self._dt])[:2], self._look_ahead(last)[:2]
         begin_approaches(vec.task.time, self._dt, states, payload_rotation, targets, self._fresh, self._approach)
         times = now + ahead + planner.times.ravel()
-        positions, rotations = _arrays(preview(times))
+        positions, rotations, shapes = self._look_ahead(times)
         poses = (len(times), *planner.times.shape)
         rotations = rotations.reshape(*poses, 3, 3)
-        middle = planner.times.shape[1] // 2
+        middle = SAMPLES // 2
         at = np.ascontiguousarray(times.reshape(poses)[:, :, middle])
         write_approaches(at, np.ascontiguousarray(rotations[:, :, middle]), self._approach, self._offsets)
         planner.plans.fresh[self._fresh] = True
@@ -177,7 +184,9 @@ class TeamMpc:
             start[~following] = states[~following]  # they begin
         self._starts = [*self._starts[1:], states.copy()]
         self._acted = vec.task.time.copy()
-        plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads)
+        if shapes is not None:
+            shapes = np.ascontiguousarray(shapes.reshape(*poses, -1, 3)[:, :, SHAPES])
+        plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads, shapes)
         late = (perf_counter() - begin) / shape[0] > self._deadline
         self._last.keep(plans, late, plans.failed | unknown)
         rate = self._last.inputs().reshape(*shape, 3)
@@ -194,6 +203,13 @@ class TeamMpc:
             action[lost] = self._without_plan.act(observation)[lost]
             self._fresh |= lost  # its next plan begins where the team is then
         return action
+
+    def _look_ahead(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Return places, attitudes and shapes at times (E, M), see `preview`, as arrays that can be written."""
+        preview = self._vec.task.preview_targets if self.preview is None else self.preview
+        position, rotation, *shape = preview(times)
+        forces = shape[0] if shape else None
+        return np.array(position), np.array(rotation), None if forces is None else np.array(forces)
 
     def _unknown(self, fresh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the estimates of loads (E, 7) and of forces on drones (E, 3 N), live; zero for fresh teams (E,)."""
@@ -290,9 +306,3 @@ class TeamMpc:
         action[..., 3] = (cosine * roll - sine * pitch) / fastest
         action[..., 4] = (sine * roll + cosine * pitch) / fastest
         return np.clip(action, -1.0, 1.0)
-
-
-def _arrays(preview: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `Task.preview_targets` returned as arrays that can be written."""
-    position, rotation = preview
-    return np.array(position), np.array(rotation)

@@ -6,9 +6,14 @@ from collections import deque
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
+
+from multilift_marl.rig.obstacles import BOX, CYLINDER, HULL, SPHERE
+from multilift_marl.sim.obstacle_bodies import geom_size, hull_name
+from multilift_marl.tasks.scenery import Box
 
 _GEOM = mujoco.mjtGeom
+_FORMS = {BOX: _GEOM.mjGEOM_BOX, CYLINDER: _GEOM.mjGEOM_CYLINDER, SPHERE: _GEOM.mjGEOM_SPHERE}
+_UPRIGHT = np.eye(3).ravel()
 # sRGB of cables at 0, 1/4, ... 2 times the resting tension: light grey, blue, red, in perceptually equal steps (equal
 # distances in OKLab; B. Ottosson, 2020). Grey, blue and red differ for every kind of colour blindness.
 TENSION_COLOURS = np.array(
@@ -34,9 +39,24 @@ def tension_colours(tension: np.ndarray, resting: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(ratio, at, channel) for channel in TENSION_COLOURS.T], axis=1)
 
 
-def add_box(scene: mujoco.MjvScene, size: ArrayLike, position: ArrayLike, rgba: ArrayLike) -> None:
-    """Add an upright box of half edges `size` (3,) at `position` (3,) [m]; where the scene is full, nothing."""
-    _add(scene, _GEOM.mjGEOM_BOX, np.asarray(size, float), np.asarray(position, float), np.asarray(rgba, np.float32))
+def add_box(scene: mujoco.MjvScene, box: Box, model: mujoco.MjModel) -> None:
+    """Add a box, cylinder, sphere or hull of a model; where the scene is full, nothing."""
+    size, place = np.array(box.size, float), np.array(box.position, float)
+    turned, rgba = np.array(box.rotation, float), np.array(box.rgba, np.float32)
+    if box.kind != HULL:
+        _add(scene, _FORMS[box.kind], geom_size(box.kind, size), place, rgba, turned)
+        return
+    mesh = model.mesh(hull_name(box.hull)).id
+    # The compiler has moved the mesh to its principal axes: back.
+    own = np.zeros(9)
+    mujoco.mju_quat2Mat(own, model.mesh_quat[mesh])
+    frame = turned.reshape(3, 3)
+    geom = _add(
+        scene, _GEOM.mjGEOM_MESH, np.ones(3), place + frame @ model.mesh_pos[mesh], rgba,
+        (frame @ own.reshape(3, 3)).ravel(),
+    )  # fmt: skip
+    if geom is not None:
+        geom.dataid = 2 * mesh  # the odd numbers are the hulls that MuJoCo computes
 
 
 def add_lines(
@@ -51,13 +71,18 @@ def add_lines(
 
 
 def _add(
-    scene: mujoco.MjvScene, kind: int, size: np.ndarray, position: np.ndarray, rgba: np.ndarray
+    scene: mujoco.MjvScene,
+    kind: int,
+    size: np.ndarray,
+    position: np.ndarray,
+    rgba: np.ndarray,
+    rotation: np.ndarray = _UPRIGHT,
 ) -> mujoco.MjvGeom | None:
     """Add a geom that casts no shadow, and return it; None where the scene is full."""
     if scene.ngeom == scene.maxgeom:
         return None
     geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, kind, size, position, np.eye(3).ravel(), rgba)
+    mujoco.mjv_initGeom(geom, kind, size, position, rotation, rgba)
     # mjv_initGeom leaves these unchanged
     geom.objtype = mujoco.mjtObj.mjOBJ_UNKNOWN
     geom.objid = -1

@@ -122,7 +122,7 @@ class Stage:
                 points = self._vec.world.cable_points(env, n)
                 add_lines(scene, points[:-1], points[1:], radius, np.tile(colour, (len(points) - 1, 1)), _GLOW)
         for box in task.scenery(env):
-            add_box(scene, *box)
+            add_box(scene, box, self.model)
         if len(path):
             starts, ends = dashes(path, dash)
             add_lines(scene, starts, ends, line, np.tile(np.array(_PATH_COLOUR, np.float32), (len(starts), 1)))

@@ -9,6 +9,7 @@ from multilift_marl.physical import GRAVITY
 from multilift_marl.rig import plausible
 from multilift_marl.rig.balance import formation_forces, nominal_forces
 from multilift_marl.rig.feasibility import check_possible, check_resolved
+from multilift_marl.rig.obstacles import resolve_scenery
 from multilift_marl.rig.payload import (
     check_body,
     find_mesh,
@@ -176,6 +177,7 @@ def build_system(config: SystemConfig, draft: bool = False) -> System:
         air=config.wind,
         push=config.push,
         contact=config.contact,
+        scenery=resolve_scenery(config.scene),
         timestep=config.sim.timestep,
         control_interval=whole_ratio(
             1 / config.sim.timestep, config.sim.control_hz, "sim.control_hz", "1/sim.timestep"

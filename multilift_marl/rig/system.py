@@ -9,6 +9,7 @@ import numpy as np
 from multilift_marl.math3d import quat_to_mat, thrust_frame
 from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.mesh import Mesh
+from multilift_marl.rig.obstacles import Scenery
 from multilift_marl.rig.vehicle import Vehicle
 from multilift_marl.schema.sections import ContactConfig, PushConfig, WindConfig
 
@@ -45,6 +46,7 @@ class System:
         air: what else the air does.
         push: pushes of its bodies.
         contact: friction and restitution.
+        scenery: obstacles.
         timestep: physics step [s].
         control_interval: physics steps for each control step.
         varied: keys of `randomization` by which environments differ.
@@ -80,6 +82,7 @@ class System:
     air: WindConfig
     push: PushConfig
     contact: ContactConfig
+    scenery: Scenery
     timestep: float
     control_interval: int
     varied: frozenset[str] = frozenset()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, create_model, field_validator, model_validator
 
 from multilift_marl.schema.files import pin_mesh, pin_vehicles
+from multilift_marl.schema.scene import SceneConfig
 from multilift_marl.schema.values import (
     Between,
     Delays,
@@ -389,3 +390,4 @@ class SystemConfig(_Imports):
     wind: WindConfig = WindConfig()
     push: PushConfig = PushConfig()
     contact: ContactConfig = ContactConfig()
+    scene: SceneConfig = SceneConfig()

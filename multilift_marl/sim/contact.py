@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, product
 
 import mujoco
 import numpy as np
@@ -10,9 +10,11 @@ from mujoco.batch import Batch
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import dot, norm, row, sub, vec
+from multilift_marl.rig.obstacles import NONE
 from multilift_marl.rig.restitution import contact_law
 from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicle import Vehicle
+from multilift_marl.sim.obstacle_bodies import box_distance, obstacle_names
 
 _FAST = 2.0  # [m/s] bodies that approach each other no faster meet before they can pass each other
 _SPECULATIVE = int(mujoco.mjtEnableBit.mjENBL_SPECULATIVE)
@@ -25,8 +27,8 @@ def drone_half_size(vehicle: Vehicle) -> np.ndarray:
     return vehicle.half_size
 
 
-def add_contact(spec: mujoco.MjSpec, system: System) -> None:
-    """Let ground, payload and drones touch each other, by pairs: cheaper than MuJoCo's sweep over all bodies.
+def add_contact(spec: mujoco.MjSpec, system: System, visuals: bool) -> None:
+    """Let ground, obstacles, payload and drones touch, by pairs: cheaper than MuJoCo's sweep over all bodies.
 
     The contacts' parameters are in the `pair_*` fields of the compiled model, not in those of its geoms. The cone of
     friction is round, so that it is the same in all directions.
@@ -34,11 +36,12 @@ def add_contact(spec: mujoco.MjSpec, system: System) -> None:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     stiffness, damping = contact_law(system.contact.restitution, system.timestep)
     friction = [system.contact.friction] * 2 + [0.005, 1e-4, 1e-4]  # the last three count for other kinds of contact
-    names = ("floor", "payload", *(f"drone_{i}" for i in range(system.num_drones)))
-    for name in names:
+    bodies = ["payload", *(f"drone_{i}" for i in range(system.num_drones))]
+    obstacles = [] if visuals else obstacle_names(system)
+    for name in ("floor", *bodies, *obstacles):
         # Without its bits a geom meets others by the pairs below alone.
         spec.geom(name).contype = spec.geom(name).conaffinity = 0
-    for one, other in combinations(names, 2):
+    for one, other in (*combinations(["floor", *bodies], 2), *product(obstacles, bodies)):
         # Direct stiffness and damping, over the mass that the contact moves: MuJoCo's negative solref.
         spec.add_pair(geomname1=one, geomname2=other, solref=[-stiffness, -damping], friction=friction)
 
@@ -50,11 +53,12 @@ def body_radii(system: System) -> np.ndarray:
 
 
 @kernel
-def find_close(lo, state, proximity, radii, timestep):
+def find_close(lo, state, proximity, radii, timestep, obstacles):
     """Find the environments in which bodies might touch: APART, NEAR, or FAST.
 
-    Contacts need not be searched where the spheres about bodies are apart from each other and above the ground, as in
-    most steps. FAST are bodies that would be behind each other within a step before a contact is found.
+    Contacts need not be searched where the spheres about bodies are apart from each other, above the ground and away
+    from obstacles, as in most steps. FAST are bodies that would be behind each other within a step before a contact is
+    found.
 
     Args:
         lo: the first of the environments.
@@ -62,6 +66,7 @@ def find_close(lo, state, proximity, radii, timestep):
         proximity: (environments,) int8, written.
         radii: `body_radii` (1 + N,) [m].
         timestep: [s].
+        obstacles: Obstacles.
 
     Returns:
         Whether any of `proximity` has changed.
@@ -98,9 +103,35 @@ def find_close(lo, state, proximity, radii, timestep):
                     reach += 2.0 * timestep * speed
                     if dot(offset, relative) < 0.0 and speed > _FAST and square < reach * reach:
                         found = FAST
+        if obstacles.kind.shape[1] > 0:
+            found = max(found, _find_obstacle(e, state, radii, timestep, obstacles))
         changed = changed or proximity[i] != found
         proximity[i] = found
     return changed
+
+
+@kernel
+def _find_obstacle(e, state, radii, timestep, obstacles):
+    """Return how near any body is to any obstacle: APART, NEAR or FAST."""
+    found, payload = APART, row(state.payload_position, e)
+    # First by a sphere about the whole team, with room for what a step may bring of 10 m/s.
+    team = radii[0]
+    for b in range(1, radii.shape[0]):
+        team = max(team, norm(sub(vec(state.drone_position, e, b - 1), payload)) + radii[b])
+    team += 20.0 * timestep
+    for m in range(obstacles.kind.shape[1]):
+        if obstacles.kind[e, m] == NONE or box_distance(e, m, payload, obstacles) > team:
+            continue
+        for b in range(radii.shape[0]):
+            position = payload if b == 0 else vec(state.drone_position, e, b - 1)
+            velocity = row(state.payload_velocity, e) if b == 0 else vec(state.drone_velocity, e, b - 1)
+            distance = box_distance(e, m, position, obstacles)
+            if distance < radii[b]:
+                found = max(found, NEAR)
+            speed = norm(sub(velocity, vec(obstacles.velocity, e, m)))
+            if speed > _FAST and distance < radii[b] + 2.0 * timestep * speed:
+                found = FAST
+    return found
 
 
 def search_contacts(batch: Batch, proximity: np.ndarray) -> None:

@@ -1,7 +1,7 @@
 """Obstacles among which teams fly: convex bodies, fixed or moving back and forth, each environment its own.
 
-Row m of an environment is one obstacle; rows of kind NONE are free. A wall with gaps is several boxes, a mesh its convex
-hull. Distances are in `obstacle_distance.py`, their bodies in MuJoCo's model in `obstacle_bodies.py`.
+Row m of an environment is one obstacle; rows of kind NONE are free. A wall with gaps is several boxes, a mesh its
+convex hull. Distances are in `obstacle_distance.py`, their bodies in MuJoCo's model in `obstacle_bodies.py`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.kernels.jit import kernel
+from multilift_marl.math3d import add, put, scale, vec
+from multilift_marl.rig.obstacles import BOX as BOX
+from multilift_marl.rig.obstacles import CYLINDER as CYLINDER
+from multilift_marl.rig.obstacles import HULL as HULL
+from multilift_marl.rig.obstacles import NONE as NONE
+from multilift_marl.rig.obstacles import SPHERE as SPHERE
+from multilift_marl.rig.obstacles import Scenery
 
-NONE, BOX, CYLINDER, SPHERE, HULL = range(5)
-KINDS = {"box": BOX, "cylinder": CYLINDER, "sphere": SPHERE, "hull": HULL}
 HIDDEN = (0.0, 0.0, -100.0)  # [m] where free rows are
 
 
@@ -40,8 +45,10 @@ class Obstacles(NamedTuple):
     """(E, M) [s]."""
     phase: np.ndarray
     """(E, M) [-]."""
+    clock: np.ndarray
+    """(E,) t, since `World.load` [s]."""
     hull: np.ndarray
-    """(E, M) int64, row of `System.hulls` with a HULL's vertices."""
+    """(E, M) int64, row of `make_hulls` with a HULL's vertices."""
 
     @classmethod
     def zeros(cls, num_envs: int, count: int) -> Obstacles:
@@ -58,31 +65,60 @@ class Obstacles(NamedTuple):
             travel=np.zeros((*shape, 3)),
             period=np.ones(shape),
             phase=np.zeros(shape),
+            clock=np.zeros(num_envs),
             hull=np.zeros(shape, np.int64),
         )
 
 
+def make_obstacles(scenery: Scenery, num_envs: int) -> Obstacles:
+    """Return the rows of E environments: those of the configuration, then free ones for the task."""
+    made = Obstacles.zeros(num_envs, scenery.count)
+    hulls = 0
+    for m, each in enumerate(scenery.obstacles):
+        made.kind[:, m], made.size[:, m], made.rotation[:, m] = each.kind, each.size, each.rotation
+        made.center[:, m], made.travel[:, m] = each.position, each.travel
+        made.position[:, m] = each.position
+        made.period[:, m], made.phase[:, m] = each.period, each.phase
+        if each.kind == HULL:
+            made.hull[:, m] = hulls
+            hulls += 1
+    for e in range(num_envs):
+        move_obstacles(e, made)
+    return made
+
+
+def make_hulls(scenery: Scenery) -> np.ndarray:
+    """Return the vertices (H, V, 3) of the hulls, from their middles [m]; the last of a shorter list repeated."""
+    found = [each.vertices for each in scenery.obstacles if each.vertices is not None]
+    longest = max((len(vertices) for vertices in found), default=1)
+    hulls = np.zeros((len(found), longest, 3))
+    for row, vertices in zip(hulls, found, strict=True):
+        row[:] = vertices[-1]
+        row[: len(vertices)] = vertices
+    return hulls
+
+
 @kernel
-def move_obstacles(e, t, obstacles):
-    """Write positions and velocities of environment e at a time [s]; return whether any obstacle moves."""
+def move_obstacles(e, obstacles):
+    """Write places and velocities of what moves in environment e at its clock's time; return whether anything does."""
     moving = False
     for m in range(obstacles.kind.shape[1]):
+        travel = vec(obstacles.travel, e, m)
+        if travel[0] == 0.0 and travel[1] == 0.0 and travel[2] == 0.0:
+            continue
+        moving = True
         rate = 2.0 * pi / obstacles.period[e, m]
-        angle = rate * t + 2.0 * pi * obstacles.phase[e, m]
-        share, change = sin(angle), rate * cos(angle)
-        for i in range(3):
-            travel = obstacles.travel[e, m, i]
-            moving = moving or travel != 0.0
-            obstacles.position[e, m, i] = obstacles.center[e, m, i] + share * travel
-            obstacles.velocity[e, m, i] = change * travel
+        angle = rate * obstacles.clock[e] + 2.0 * pi * obstacles.phase[e, m]
+        put(obstacles.position[e, m], add(vec(obstacles.center, e, m), scale(sin(angle), travel)))
+        put(obstacles.velocity[e, m], scale(rate * cos(angle), travel))
     return moving
 
 
-def clear_obstacles(env: int, obstacles: Obstacles) -> None:
-    """Make all rows of one environment free."""
-    obstacles.kind[env] = NONE
-    obstacles.center[env] = obstacles.position[env] = HIDDEN
-    obstacles.travel[env] = obstacles.velocity[env] = 0.0
+def clear_obstacles(env: int, obstacles: Obstacles, first: int = 0) -> None:
+    """Make the rows of one environment from `first` on free."""
+    obstacles.kind[env, first:] = NONE
+    obstacles.center[env, first:] = obstacles.position[env, first:] = HIDDEN
+    obstacles.travel[env, first:] = obstacles.velocity[env, first:] = 0.0
 
 
 def place_obstacle(

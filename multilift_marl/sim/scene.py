@@ -14,6 +14,7 @@ from multilift_marl.rig.system import System
 from multilift_marl.rig.vehicle import Vehicle
 from multilift_marl.sim.cables import CABLE_MODELS
 from multilift_marl.sim.contact import add_contact, drone_half_size
+from multilift_marl.sim.obstacle_bodies import add_hulls, add_obstacles
 from multilift_marl.sim.state_io import Layout
 
 _GEOM = mujoco.mjtGeom
@@ -45,7 +46,11 @@ def build_spec(system: System, visuals: bool = False) -> mujoco.MjSpec:
         body.add_freejoint(name=f"drone_{i}")
         _add_drone(body, system, i, visuals)
         CABLE_MODELS[system.cable_model].add_cable(spec, system, i)
-    add_contact(spec, system)
+    if visuals:  # there obstacles are scenery
+        add_hulls(spec, system)
+    else:
+        add_obstacles(spec, system)
+    add_contact(spec, system, visuals)
     if visuals:
         _add_light(spec.body("payload"))
         margin = 0.04 * system.payload_size.min()

@@ -23,6 +23,8 @@ from multilift_marl.sim.cables.chain_arrays import Nodes
 from multilift_marl.sim.contact import NEAR, body_radii, find_close, search_contacts
 from multilift_marl.sim.dynamics import apply_loads
 from multilift_marl.sim.gusts import start_turbulence
+from multilift_marl.sim.obstacle_bodies import ShardObstacles
+from multilift_marl.sim.obstacles import make_obstacles
 from multilift_marl.sim.parameters import (
     Parameters,
     make_inertias,
@@ -67,6 +69,8 @@ class Shard:
     """(hi - lo,) int8, whether bodies might touch."""
     find_warnings: Callable[[], None]
     """`find_warnings` of these environments."""
+    obstacles: ShardObstacles | None
+    """Of these environments, where there are any."""
 
 
 class World:
@@ -87,6 +91,7 @@ class World:
         rig: RigArrays, nominal numbers of the team.
         air: turbulence, gusts and downwash.
         pushes: when bodies are pushed next; None where they are not.
+        obstacles: live; rows from `len(system.scenery.obstacles)` on are the task's, placed before `load`.
         stats: statistics since the reset.
         diverged: (E,) bool, until reset.
         cable_model, cables: module of the cable model and its numbers.
@@ -119,6 +124,7 @@ class World:
         self.air = Air.zeros(num_envs, self.num_drones)
         self._pushing = make_pushes(system, num_envs)
         self.pushes: Pushes | None = None if self._pushing is None else self._pushing[0]
+        self.obstacles = make_obstacles(system.scenery, num_envs)
         self.stats = EpisodeStats.zeros(num_envs)
         self.diverged = np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
@@ -189,6 +195,8 @@ class World:
             shard.apply()
             if shard.push is not None:
                 shard.push()
+            if shard.obstacles is not None:
+                shard.obstacles.step()
             # Few steps change a flag: only those write to the models.
             if shard.find_close():
                 search_contacts(shard.batch, shard.proximity)
@@ -267,6 +275,7 @@ class World:
         """
         self.state.cable_broken[mask] = self.hidden_loads.motors_off[mask] = False
         self.air.gust[mask] = self.air.downwash[mask] = self.air.steps[mask] = 0
+        self.obstacles.clock[mask] = 0.0
         for shard in self.shards:
             local = mask[shard.lo : shard.hi]
             if local.any():
@@ -274,6 +283,8 @@ class World:
                 self._sync_broken(shard)
                 shard.batch.reset(local, stage=mujoco.mjtStage.mjSTAGE_NONE)
                 self.cable_model.write_state(shard.rows, mask, self._data, self.cables)
+                if shard.obstacles is not None:
+                    shard.obstacles.load(local)
         self.diverged[mask] = False
 
     def check_warnings(self) -> None:
@@ -328,11 +339,14 @@ class World:
             shard.batch.state[:] = saved["rows"][shard.lo : shard.hi]
             shard.batch.warning[:] = saved["warning"][shard.lo : shard.hi]
             self._sync_broken(shard)
+            if shard.obstacles is not None:
+                shard.obstacles.load(np.ones(shard.hi - shard.lo, bool))
         self.diverged[:] = saved["diverged"]
 
-    def _groups(self) -> dict[str, SystemState | HiddenLoads | Parameters | Air | EpisodeStats | Nodes | Pushes]:
+    def _groups(self) -> dict[str, Any]:
         names = ("state", "hidden_loads", "parameters", "air", "stats", "nodes", "pushes")
-        return {name: group for name in names if (group := getattr(self, name)) is not None}
+        groups = {name: group for name in names if (group := getattr(self, name)) is not None}
+        return groups | ({"obstacles": self.obstacles} if self.system.scenery.count else {})
 
     def _sync_broken(self, shard: Shard) -> None:
         """Bring the shard's models into line with `state.cable_broken`."""
@@ -364,10 +378,15 @@ class World:
             advance, read = self.cable_model.bind_steps(batch, rows, self._data, self.cables)
             # As the compiled model is: contacts are searched. Flags are only written where this changes.
             proximity = np.full(hi - lo, NEAR, np.int8)
-            find = bind(find_close, lo, self.state, proximity, radii, self.system.timestep)
+            find = bind(find_close, lo, self.state, proximity, radii, self.system.timestep, self.obstacles)
             broken = np.zeros((hi - lo, self.num_drones), bool)
             warnings = bind(find_warnings, lo, batch.warning, self.diverged)
-            shards.append(Shard(lo, hi, batch, rows, apply, push, advance, read, broken, find, proximity, warnings))
+            obstacles = None
+            if self.system.scenery.count:
+                obstacles = ShardObstacles(batch, self.model, lo, self.system, self.obstacles)
+            shards.append(
+                Shard(lo, hi, batch, rows, apply, push, advance, read, broken, find, proximity, warnings, obstacles)
+            )
         return shards
 
 

@@ -14,6 +14,7 @@ from multilift_marl.tasks.gate import Gate
 from multilift_marl.tasks.hover import Hover
 from multilift_marl.tasks.land import Land
 from multilift_marl.tasks.loss import Loss
+from multilift_marl.tasks.navigate import Navigate
 from multilift_marl.tasks.pose import Pose
 from multilift_marl.tasks.recover import Recover
 from multilift_marl.tasks.takeoff import Takeoff
@@ -25,6 +26,7 @@ TASKS: dict[str, type[Task]] = {
     "hover": Hover,
     "land": Land,
     "loss": Loss,
+    "navigate": Navigate,
     "pose": Pose,
     "recover": Recover,
     "takeoff": Takeoff,

@@ -14,7 +14,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import inlined, is_plain, prebind
 from multilift_marl.mdp.criteria import Criterion, rest_criteria
 from multilift_marl.mdp.env_data import INTEGRAL_LIMIT, Errors, View, reduce_view, true_load
-from multilift_marl.mdp.failures import CAUSES, FIRST_OWN, FailureMask, make_limits
+from multilift_marl.mdp.failures import CAUSES, FIRST_OWN, MAX_DISTANCE, SIGHT, FailureMask, make_limits
 from multilift_marl.mdp.global_state import state_components
 from multilift_marl.mdp.initial_states import true_equilibrium
 from multilift_marl.mdp.numpy_functions import NumpyFunctions
@@ -27,13 +27,15 @@ from multilift_marl.rig.constants import RigArrays
 from multilift_marl.schema.validate import check_magnitudes, validate
 from multilift_marl.schema.values import Section
 from multilift_marl.sensing.measurement import Sensing
+from multilift_marl.sim.obstacles import make_hulls
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.scenery import Box as Box
+from multilift_marl.tasks.scenery import draw_obstacles
 
 _HANDED_ON = (
-    "action", "cause", "errors", "goal", "good_time", "limits", "mask", "min_separation", "own", "planned", "previous",
-    "rig", "settings", "terms", "time",
+    "action", "cause", "clearance", "errors", "goal", "good_time", "limits", "mask", "min_clearance", "min_separation",
+    "own", "planned", "previous", "rig", "settings", "terms", "time",
 )  # fmt: skip
 """Attributes of a task that its kernels read and write as fields of the view."""
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
@@ -91,6 +93,7 @@ class Task:
             them, or a dict with what finds each: an inlined kernel of (e, View) that returns a truth value, or a NumPy
             function of (View) that returns truth values (E,). They count where nothing else has failed.
         MIN_DRONES: with fewer it makes no sense.
+        MAX_DISTANCE: of the payload from its target, beyond which it is out of range [m].
         CAN_PLAN: whether planners can fly it: all cables taut throughout, no drone lost, nothing in the way.
 
     Args:
@@ -123,6 +126,7 @@ class Task:
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = ()
     FAILURES: ClassVar[tuple[str, ...] | dict[str, Callable[..., Any]]] = ()
     MIN_DRONES: ClassVar[int] = 1
+    MAX_DISTANCE: ClassVar[float] = MAX_DISTANCE
     CAN_PLAN: ClassVar[bool] = True
     own: Any
     settings: Any
@@ -139,7 +143,7 @@ class Task:
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)
         self.planned = self.goal
         self.rig = self.equilibrium = world.rig
-        self.limits, self.mask = make_limits(system), FailureMask.zeros(e, n)
+        self.limits, self.mask = make_limits(system, self.MAX_DISTANCE), FailureMask.zeros(e, n)
         size = sensing.action_size
         self.action, self.previous = np.zeros((2, e, n, size))
         self.observation = np.zeros((e, n, sensing.observation_size), np.float32)
@@ -148,6 +152,7 @@ class Task:
         self.drone_numbers = self._state.drone_numbers(n, size)
         self.critic = np.zeros((e, self._state.size(n, size)), np.float32)
         self.cause, self.time, self.good_time, self.min_separation = np.zeros(e, np.int64), *np.zeros((3, e))
+        self.clearance, self.min_clearance = np.full((2, e), SIGHT)
         self.terms = np.zeros((e, len(self.REWARD)))
         self.rmse_after = 0.0
         self.own, self.settings = (), ()
@@ -180,6 +185,11 @@ class Task:
             cause=self.cause,
             good_time=self.good_time,
             min_separation=self.min_separation,
+            obstacles=world.obstacles,
+            hulls=make_hulls(system.scenery),
+            nodes=world.nodes,
+            clearance=self.clearance,
+            min_clearance=self.min_clearance,
             terms=self.terms,
             dt=self.dt,
             control_dt=self.control_dt,
@@ -289,8 +299,8 @@ class Task:
         return np.zeros((0, 3))
 
     def scenery(self, env: int) -> list[Box]:
-        """Return what stands around in environment `env`, to draw it; what may be touched is `failures`' business."""
-        return []
+        """Return what stands around in environment `env`, to draw it: its obstacles."""
+        return draw_obstacles(env, self.world.obstacles)
 
     def draw_start(self, env: int, rng: np.random.Generator, parameters: Parameters) -> bool:
         """Draw a start of environment `env`, whose team has true `parameters`; return whether it is sound.
@@ -313,6 +323,7 @@ class Task:
         """Reset the measurements of one environment to its drawn start; return whether that start is sound."""
         self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
         self.good_time[env], self.min_separation[env], self.terms[env], self.time[env] = 0.0, 1e9, 0.0, 0.0
+        self.clearance[env] = self.min_clearance[env] = SIGHT
         self.cause[env] = 0
         self.stages["measure"](env, env + 1)
         self.numpy.find_failures(env, env + 1)
@@ -339,7 +350,8 @@ class Task:
 
     def _arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays that outlive a step, by dotted name."""
-        names = ("cause", "good_time", "min_separation", "time", "action", "observation", "critic")
+        names = ["cause", "good_time", "min_separation", "time", "action", "observation", "critic"]
+        names += ["clearance", "min_clearance"] if self.world.system.scenery.count else []
         arrays = {name: getattr(self, name) for name in names}
         groups = {"goal": self.goal, "errors": self.errors, "mask": self.mask}
         groups |= {"planned": self.planned} if self.planned is not self.goal else {}
@@ -359,7 +371,7 @@ class Task:
             observe = _follow(observe, prebind(scale_numbers, self.observation, factors))
         own = enumerate(self.own_failures().values(), FIRST_OWN)
         failures = {number: has_failed for number, has_failed in own if not is_plain(has_failed)}
-        check = compose_check(kernels.check, kernels.plan is None, failures)
+        check = compose_check(kernels.check, kernels.plan is None, failures, self.world.system.scenery.count > 0)
         stages = {
             "measure": self._bind(check, v, 0.0),
             "check": self._bind(check, v, self.dt),

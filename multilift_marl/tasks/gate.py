@@ -389,9 +389,9 @@ class Gate(Task):
         return points
 
     def scenery(self, env: int) -> list[Box]:
-        """Return the walls; see `Task.scenery`."""
+        """Return the walls and obstacles; see `Task.scenery`."""
         half, top = 2.5, self.settings.gap_height
-        boxes = []
+        boxes = super().scenery(env)
         for x, y, gap in zip(self.settings.x, self.own.gap_y[env], self.own.half_width[env], strict=True):
             for side in (-1, 1):
                 boxes.append(Box((THICKNESS / 2, half / 2, top / 2), (x, y + side * (gap + half / 2), top / 2), _WALL))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
-from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state
+from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.model_slopes import slopes
 from multilift_marl.planning.team_model import ModelWork, accelerations, euler_rates, make_model, state_size, step_state
 
@@ -129,9 +129,12 @@ def circle(t):
     )
 
 
+@pytest.mark.parametrize("change", [0.0, 0.3])
 @pytest.mark.parametrize("n", [3, 4])
-def test_flat_states_are_the_motion_of_the_model_under_their_thrusts(n):
+def test_flat_states_are_the_motion_of_the_model_under_their_thrusts(n, change):
     """Flown open loop for half a second by the thrusts alone, with Runge and Kutta's steps, a team is where they say.
+
+    So it is while the formation's shape changes: it narrows across and grows longer, and a cable takes another's load.
 
     Flat states are extrapolated to poses that are infinitely near: what remains is the map itself.
     """
@@ -145,7 +148,11 @@ def test_flat_states_are_the_motion_of_the_model_under_their_thrusts(n):
         for x, team in zip(found, teams, strict=True):
             poses = [circle(t + team.step * k) for k in range(-2, 3)]
             positions, rotations = (np.array(part) for part in zip(*poses, strict=True))
-            set_flat_state(positions, rotations, 0.4 * t, loads, team, FlatWork.of(n), x)
+            shape = steady_shape(team)
+            for forces, at in zip(shape, (t - team.step, t, t + team.step), strict=True):
+                forces *= 1 + change * np.sin(3 * at) * np.array([0.7, -1.0, 0.0])
+                forces[:2, 2] += change * np.cos(2 * at) * np.array([0.8, -0.8])
+            set_flat_state(positions, rotations, shape, 0.4 * t, loads, team, FlatWork.of(n), x)
         near = (4 * found[1:] - found[:-1]) / 3
         return (16 * near[1] - near[0]) / 15
 
@@ -175,7 +182,8 @@ def test_a_team_at_rest_is_its_own_flat_state():
     model, n = make_model(system), 4
     x, w, still = np.zeros(state_size(n)), ModelWork.of(n), np.zeros(7)
     positions, rotations = np.tile([1.0, 2.0, 3.0], (5, 1)), np.tile(np.eye(3), (5, 1, 1))
-    set_flat_state(positions, rotations, 0.0, still, make_flat_team(model, system), FlatWork.of(n), x)
+    team = make_flat_team(model, system)
+    set_flat_state(positions, rotations, steady_shape(team), 0.0, still, team, FlatWork.of(n), x)
     accelerations(x, model, still, w)
     assert abs(w.acceleration).max() < 1e-9
     assert w.tension == pytest.approx(np.linalg.norm(system.formation_force, axis=1))

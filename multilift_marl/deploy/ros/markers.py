@@ -11,6 +11,9 @@ from rosbags.typesys.store import Typestore
 
 from multilift_marl.deploy.ros.types import WORLD, make_header
 from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.math3d import mat_to_quat
+from multilift_marl.rig import obstacles as kinds
+from multilift_marl.sim.obstacle_bodies import hull_name
 from multilift_marl.sim.scene import build_model
 
 MARKER, MARKERS = "visualization_msgs/msg/Marker", "visualization_msgs/msg/MarkerArray"
@@ -38,7 +41,8 @@ class Scene:
     def __init__(self, vec: MultiliftVec, store: Typestore, frames: list[str]):
         self._vec, self._store = vec, store
         bodies = {"payload": "payload"} | {f"drone_{n}": frame for n, frame in enumerate(frames)}
-        model, _ = build_model(vec.world.system, visuals=True)
+        self._model, _ = build_model(vec.world.system, visuals=True)
+        model = self._model
         self._bodies = [
             marker
             for geom in range(model.ngeom)
@@ -60,11 +64,7 @@ class Scene:
     def bodies(self, time_ns: int) -> Any:
         """Return the MarkerArray of payload, drones and scenery, in place of all that was drawn."""
         self._sent = int(self._vec.seeds[0]), int(self._vec.episodes[0]), time_ns
-        scenery = [
-            self._marker(WORLD, CUBE, 2 * np.array(box.size), box.rgba, box.position, ns="scenery")
-            for box in self._vec.task.scenery(0)
-        ]
-        self._number_markers(scenery)
+        scenery = self._scenery()
         clear = self._marker(WORLD, CUBE, np.ones(3), (0, 0, 0, 0))
         clear.action = _DELETE_ALL
         markers = [clear, *self._bodies, *scenery]
@@ -73,7 +73,7 @@ class Scene:
         return self._store.types[MARKERS](markers=markers)
 
     def cables(self, time_ns: int) -> Any:
-        """Return the MarkerArray of the cables as they are, in the world."""
+        """Return the MarkerArray of cables and moving obstacles as they are, in the world."""
         world = self._vec.world
         ends = []
         for n in range(self._vec.num_drones):
@@ -81,8 +81,28 @@ class Scene:
             ends.append(np.stack([points[:-1], points[1:]], axis=1).reshape(-1, 3))
         lines = self._marker(WORLD, LINES, np.array([_CABLE, 0.0, 0.0]), _CABLE_COLOUR, ns="cables")
         lines.points = self._points(np.concatenate(ends))
-        lines.header.stamp = make_header(self._store, time_ns).stamp
-        return self._store.types[MARKERS](markers=[lines])
+        moving = self._scenery() if self._vec.world.obstacles.travel[0].any() else []
+        for marker in (lines, *moving):
+            marker.header.stamp = make_header(self._store, time_ns).stamp
+        return self._store.types[MARKERS](markers=[lines, *moving])
+
+    def _scenery(self) -> list[Any]:
+        """Return the markers of all that stands around, as it is now."""
+        forms, model, markers = {kinds.BOX: CUBE, kinds.CYLINDER: CYLINDER, kinds.SPHERE: SPHERE}, self._model, []
+        for box in self._vec.task.scenery(0):
+            turned = mat_to_quat(box.rotation)
+            if box.kind != kinds.HULL:
+                kind, scale = forms[box.kind], 2 * np.array(box.size)
+                markers.append(self._marker(WORLD, kind, scale, box.rgba, box.position, turned, ns="scenery"))
+                continue
+            marker = self._marker(WORLD, TRIANGLES, np.ones(3), box.rgba, box.position, turned, ns="scenery")
+            mesh = model.mesh(hull_name(box.hull)).id
+            own = np.zeros(9)
+            mujoco.mju_quat2Mat(own, model.mesh_quat[mesh])  # back from the principal axes
+            marker.points = self._points(_triangles(model, mesh) @ own.reshape(3, 3).T + model.mesh_pos[mesh])
+            markers.append(marker)
+        self._number_markers(markers)
+        return markers
 
     def _draw(self, model: mujoco.MjModel, geom: int, frame: str) -> list[Any]:
         """Return the markers of a geom in the frame of its body."""

@@ -1,0 +1,221 @@
+"""Navigate: the team carries its payload from a start to a goal, among obstacles that nothing may touch."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from multilift_marl.control.formation import place_formation
+from multilift_marl.errors import ConfigError
+from multilift_marl.kernels.jit import drawing, inlined
+from multilift_marl.math3d import IDENTITY, add, ease, norm, put, putmat, row, scale, sub
+from multilift_marl.mdp.criteria import Criterion, rest_criteria
+from multilift_marl.mdp.failures import RANGE
+from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
+from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.rewards import (
+    RestBounds,
+    Term,
+    action_rate,
+    attitude,
+    body_rate,
+    distance,
+    failure,
+    is_at_rest,
+    tolerance,
+    update_peak_tension,
+    velocity,
+)
+from multilift_marl.planning.maps import CAPACITY, Map, draw_map, place_map
+from multilift_marl.schema.values import Between, Float, Int, Section
+from multilift_marl.tasks.base import Kernels, Task
+
+SPARE = 0.10  # [m] of clearance that the reward asks for
+PEAK = 35.0 / 16.0  # of an eased motion's speed over its mean, see `math3d.ease`
+
+
+class NavigateOptions(Section):
+    """The map, the target's motion along the straight line, and what counts as success."""
+
+    level: Literal["sparse", "dense", "narrow", "unknown"] = Field("sparse", description="of the maps")
+    map: Int | None = Field(None, ge=0, lt=2**31, description="seed of the one map; None: drawn for each episode")
+    speed: Annotated[Float, Between(0.01, 100, "m/s")] = Field(1.0, description="[m/s] peak speed of the target")
+    start_radius: Float = Field(0.05, ge=0, description="[m] start within a ball of this radius about the map's")
+    success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of the goal ...")
+    success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, heading included ...")
+    success_speed: Float = Field(0.1, gt=0, description="[m/s] ... no faster than this ...")
+    success_body_rate: Float = Field(0.2, gt=0, description="[rad/s] ... and turning no faster than this ...")
+    success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout the last seconds, and ...")
+    success_tension: Float = Field(
+        3.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
+    )
+
+
+class NavigateArrays(NamedTuple):
+    """What an episode holds beside its goal."""
+
+    map: np.ndarray
+    """(E,) int64 seed of the map."""
+    start: np.ndarray
+    """(E, 3) of the target [m]."""
+    goal: np.ndarray
+    """(E, 3) [m]."""
+    low: np.ndarray
+    """(E, 3) of the space that the payload may use [m]."""
+    high: np.ndarray
+    """(E, 3)."""
+    peak_tension: np.ndarray
+    """(E,) largest tension in the episode over that at rest [-]."""
+
+
+class NavigateSettings(NamedTuple):
+    """Constants of the task."""
+
+    speed: float
+    radius: float
+    bounds: RestBounds
+
+
+@inlined
+def move_target(e, t, v):
+    """Write the goal of environment e at a time: straight from the start to the goal."""
+    begin, way = row(v.own.start, e), sub(row(v.own.goal, e), row(v.own.start, e))
+    share, first, second, third = ease(t, 0.0, PEAK * norm(way) / v.settings.speed)
+    goal = v.goal
+    put(goal.position[e], add(begin, scale(share, way)))
+    put(goal.velocity[e], scale(first, way))
+    put(goal.acceleration[e], scale(second, way))
+    put(goal.jerk[e], scale(third, way))
+    place_formation(e, goal, v.rig)
+
+
+@drawing
+def start_at_rest(e, rng, v, equilibrium):
+    """Write goal and team at the start of the map."""
+    goal = v.goal
+    putmat(goal.rotation[e], IDENTITY)
+    move_target(e, 0.0, v)
+    moved = in_ball(rng, v.settings.radius)
+    pose = add(row(goal.position, e), moved), IDENTITY
+    set_equilibrium(e, v, goal, equilibrium, pose, (0.0, 0.0, 0.0), moved)
+
+
+@inlined
+def advance_target(e, v):
+    """Move the goal on; note the largest tension."""
+    update_peak_tension(e, v, v.own.peak_tension)
+    move_target(e, v.time[e], v)
+
+
+@inlined
+def has_arrived(e, v):
+    """Payload at rest at the goal, where the target has arrived."""
+    return norm(sub(row(v.goal.position, e), row(v.own.goal, e))) < 1e-6 and is_at_rest(e, v, v.settings.bounds)
+
+
+@inlined
+def find_outside(e, v):
+    """Count a payload that leaves the map as a failure."""
+    for i in range(3):
+        place = v.state.payload_position[e, i]
+        if v.cause[e] == 0 and not v.own.low[e, i] <= place <= v.own.high[e, i]:
+            v.cause[e] = RANGE
+
+
+@inlined
+def clearance(e, v, margin):
+    """Drones, cables and payload away from obstacles."""
+    return tolerance(max(SPARE - v.clearance[e], 0.0), margin)
+
+
+@inlined
+def to_goal(e, n, v):
+    """Goal minus where the payload is, as the drone knows it."""
+    return sub(row(v.own.goal, e), row(v.goal.position, e))
+
+
+@inlined
+def target_velocity(e, n, v):
+    """Velocity of the target."""
+    return row(v.goal.velocity, e)
+
+
+@inlined
+def least_clearance(e, n, v):
+    """Least distance of drones, cables and payload from obstacles, at most 2 m."""
+    return v.clearance[e]
+
+
+class Navigate(Task):
+    """Carry the payload to the goal among obstacles; see docs/navigate.md."""
+
+    name: ClassVar[str] = "navigate"
+    Options: ClassVar[type[Section]] = NavigateOptions
+    options: NavigateOptions
+    own: NavigateArrays
+    settings: NavigateSettings
+    MAX_DISTANCE: ClassVar[float] = 1e4  # the map's bounds count instead
+    REWARD: ClassVar[dict[str, Term]] = {
+        "position": Term(0.4, distance, 0.5, "m"),
+        "clearance": Term(0.4, clearance, 0.05, "m"),
+        "velocity": Term(0.2, velocity, 0.3, "m/s"),
+        "attitude": Term(0.1, attitude, 10.0, "deg"),
+        "stillness": Term(0.1, body_rate, 0.3, "rad/s"),
+        "failure": Term(-20.0, failure),
+        "action_rate": Term(-0.05, action_rate),
+    }
+    KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, check=find_outside)
+    EXTRA: ClassVar[tuple[Component, ...]] = (
+        Component("to_goal", 3, "slot", "m", "goal minus the target's present place", to_goal),
+        Component("target_velocity", 3, "slot", "m/s", "velocity of the target", target_velocity),
+    )
+    EXTRA_STATE: ClassVar[tuple[Component, ...]] = (
+        Component("to_goal", 3, "world", "m", "goal minus the target's present place", to_goal),
+        Component("target_velocity", 3, "world", "m/s", "velocity of the target", target_velocity),
+        Component("clearance", 1, "-", "m", "least distance from obstacles, at most 2", least_clearance),
+    )
+
+    def prepare(self) -> None:
+        """See `Task.prepare`."""
+        option, e, scenery = self.options, self.world.num_envs, self.world.system.scenery
+        if scenery.reserved < CAPACITY:
+            raise ConfigError(f"task navigate places up to {CAPACITY} obstacles; set scene.reserved={CAPACITY} or more")
+        self._first, self._maps = len(scenery.obstacles), dict[int, Map]()
+        start, goal, low, high = (np.zeros((e, 3)) for _ in range(4))
+        self.own = NavigateArrays(np.zeros(e, np.int64), start, goal, low, high, np.zeros(e))
+        self.settings = NavigateSettings(option.speed, option.start_radius, RestBounds.of(option))
+
+    def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
+        """Draw the map, and where the team starts; see `Task.start`."""
+        option, own = self.options, self.own
+        seed = int(rng.integers(2**31)) if option.map is None else option.map
+        drawn = draw_map(option.level, seed, self.world.system)
+        place_map(env, drawn, self.world.obstacles, self._first)
+        own.map[env], own.start[env], own.goal[env] = seed, drawn.start, drawn.goal
+        own.low[env], own.high[env], own.peak_tension[env] = drawn.low, drawn.high, 0.0
+        start_at_rest(env, rng, self.view_for(start_at_rest), self.equilibrium)
+
+    def succeeded(self) -> np.ndarray:
+        """At rest at the goal throughout the last moments, and never too large a tension."""
+        return super().succeeded() & (self.own.peak_tension <= self.options.success_tension)
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """See `Task.criteria`."""
+        bound = self.options.success_tension
+        found = rest_criteria(self.settings.bounds, self.errors, self.world.state)
+        return (*found, Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False))
+
+    def preview_targets(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `Task.preview_targets`."""
+        way = self.own.goal - self.own.start
+        duration = PEAK * np.linalg.norm(way, axis=1, keepdims=True) / self.settings.speed
+        s = np.clip(times / duration, 0.0, 1.0)
+        share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
+        position = self.own.start[:, None] + share[..., None] * way[:, None]
+        return position, np.broadcast_to(np.eye(3), (*times.shape, 3, 3))
+
+    def target_path(self, env: int) -> np.ndarray:
+        """Return the ends of the straight line; see `Task.target_path`."""
+        return np.stack([self.own.start[env], self.own.goal[env]])

@@ -1,0 +1,139 @@
+"""Whole routes among obstacles: clear of them by another measure, smooth, the same each time; what has none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import make_system
+from test_team_clearance import exact_clearance
+
+from multilift_marl.errors import ConfigError
+from multilift_marl.navigation.formation_shapes import drone_places, find_breach
+from multilift_marl.navigation.planner import RouteSettings, find_route
+from multilift_marl.planning.maps import draw_map, place_map
+from multilift_marl.planning.route import NoRoute
+from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
+
+START, GOAL = np.array([-3.0, 0.0, 1.5, 0.0]), np.array([3.0, 0.0, 1.5, 0.0])
+ROOM = RouteSettings(low=(-4.5, -3.0, 0.5), high=(4.5, 3.0, 3.2))
+PILLARS = [
+    (CYLINDER, (0.3, 0.3, 2.0), (-1.0, 0.2, 2.0), 0.0),
+    (BOX, (0.2, 0.2, 2.0), (0.3, -1.2, 2.0), 0.6),
+    (SPHERE, (0.3, 0.3, 0.3), (1.2, 0.5, 2.0), 0.0),
+]
+WALL = [(BOX, (0.1, 2.0, 4.0), (0.0, side * 2.4, 4.0), 0.0) for side in (-1.0, 1.0)]  # a gap of 0.8 m
+WINDOW = [
+    *[(BOX, (0.1, 2.0, 2.0), (0.0, side * 2.6, 2.0), 0.0) for side in (-1.0, 1.0)],
+    (BOX, (0.1, 0.7, 0.55), (0.0, 0.0, 0.55), 0.0),
+    (BOX, (0.1, 0.7, 0.7), (0.0, 0.0, 3.6), 0.0),
+]
+
+
+def placed(rows):
+    obstacles = Obstacles.zeros(1, max(len(rows), 1))
+    for row, each in enumerate(rows):
+        place_obstacle(0, row, obstacles, *each)
+    return obstacles
+
+
+def least_clearance(route, system, rows, count=120):
+    """Return the distance of the shape at rest from obstacles, by points of all bodies [m]."""
+    times = np.linspace(0, route.times[-1], count)
+    positions, rotations, forces = route.evaluate(times)
+    found = []
+    for position, rotation, force in zip(positions, rotations, forces, strict=True):
+        place = np.append(position, np.arctan2(rotation[1, 0], rotation[0, 0]))
+        found.append(exact_clearance(system, place, drone_places(system, force) - system.anchors, rows))
+    return min(found)
+
+
+@pytest.mark.parametrize("rows", [PILLARS, WALL, WINDOW], ids=["pillars", "gap", "window"])
+def test_a_route_keeps_away_from_obstacles_and_within_the_limits_of_shapes(rows):
+    system = make_system(4)
+    route = find_route(system, placed(rows), 0, START, GOAL, ROOM)
+    assert least_clearance(route, system, rows) >= ROOM.least_clearance
+    straight = np.linspace(START, GOAL, 50)
+    arms = drone_places(system, system.formation_force) - system.anchors
+    assert min(exact_clearance(system, place, arms, rows) for place in straight) <= 0.0
+    _, _, forces = route.evaluate(np.linspace(0, route.times[-1], 200))
+    for force in forces:
+        assert force.sum(axis=0) == pytest.approx(system.formation_force.sum(axis=0))
+        assert find_breach(force, system) is None
+    assert route.report.expanded > 0 and 6.0 <= route.report.length < 8.0
+
+
+@pytest.mark.parametrize("num_drones", [1, 2, 3, pytest.param(6, marks=pytest.mark.slow), 8])
+def test_teams_of_every_size_pass_the_gaps_of_a_narrow_map(num_drones):
+    system = make_system(num_drones)
+    scale = make_system(4) if num_drones == 1 else system  # the payload of one drone is wider than the gaps of its maps
+    drawn = draw_map("narrow", 2, scale)
+    obstacles = Obstacles.zeros(1, 16)
+    place_map(0, drawn, obstacles)
+    settings = RouteSettings(low=tuple(drawn.low), high=tuple(drawn.high))
+    route = find_route(system, obstacles, 0, np.append(drawn.start, 0), np.append(drawn.goal, 0.3), settings)
+    rows = [(each.kind, each.size, each.position, each.yaw) for each in drawn.obstacles]
+    assert least_clearance(route, system, rows, 60) >= settings.least_clearance
+    place, rotation, force = route.evaluate(np.array([0.0, route.times[-1], 1e3]))
+    assert place == pytest.approx(np.stack([drawn.start, drawn.goal, drawn.goal]), abs=1e-9)
+    assert np.arctan2(rotation[1:, 1, 0], rotation[1:, 0, 0]) == pytest.approx(0.3)
+    assert force == pytest.approx(np.tile(system.formation_force, (3, 1, 1)), abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def route():
+    return find_route(make_system(4), placed(WALL), 0, START, GOAL, ROOM)
+
+
+def test_pose_and_shape_are_smooth_and_begin_and_end_at_rest(route):
+    """Differences to both sides of each knot agree up to the third derivative, so that all are continuous there."""
+    step = 1e-4
+    for order in range(3):
+        left, right = route.sample(route.times[1:-1] - step), route.sample(route.times[1:-1] + step)
+        higher = route.sample(route.times[1:-1])[order + 1]
+        slope = (right[order] - left[order]) / (2 * step)
+        np.testing.assert_allclose(slope, higher, atol=2e-3 * max(1.0, np.abs(higher).max()))
+    ends = route.sample(route.times[[0, -1]])
+    assert ends[1:3] == pytest.approx(np.zeros_like(ends[1:3]), abs=1e-9)
+
+
+def test_speed_and_acceleration_are_within_their_limits(route):
+    _, velocity, acceleration, _ = route.sample(np.linspace(0, route.times[-1], 500))
+    assert 0.5 < np.linalg.norm(velocity[:, :3], axis=1).max() <= ROOM.speed + 1e-6
+    assert np.linalg.norm(acceleration[:, :3], axis=1).max() <= ROOM.acceleration + 1e-6
+
+
+def test_the_same_map_has_the_same_route_bit_for_bit(route):
+    again = find_route(make_system(4), placed(WALL), 0, START, GOAL, ROOM)
+    assert (again.table == route.table).all() and (again.modes == route.modes).all()
+
+
+def test_a_route_goes_on_with_the_motion_of_another(route):
+    for share in (0.15, 0.3, 0.5):
+        departure = route.sample(np.array([share * route.times[-1]]))[:3, 0]
+        onward = find_route(make_system(4), placed(WALL), 0, START, GOAL, ROOM, departure)
+        assert onward.sample(np.zeros(1))[:3, 0] == pytest.approx(departure, abs=1e-9)
+        assert least_clearance(onward, make_system(4), WALL, 60) >= ROOM.least_clearance
+        assert onward.times[-1] < 1.1 * (1 - share) * route.times[-1] + 0.2
+
+
+CLOSED = [(BOX, (0.1, 4.0, 4.0), (0.0, 0.0, 2.0), 0.0)]
+TIGHT = [(BOX, (0.1, 2.0, 4.0), (0.0, side * 2.23, 4.0), 0.0) for side in (-1.0, 1.0)]  # the payload fits by 1 cm
+IN_A_PILLAR = [(CYLINDER, (0.3, 0.3, 2.0), (-3.0, 0.4, 2.0), 0.0)]
+AT_THE_GOAL = [(CYLINDER, (0.3, 0.3, 2.0), (3.0, -0.54, 2.0), 0.0)]
+
+
+@pytest.mark.parametrize(
+    "rows, goal, words",
+    [
+        (CLOSED, GOAL, "no route from the start to the goal"),
+        (TIGHT, GOAL, "no route from the start to the goal"),
+        (IN_A_PILLAR, GOAL, r"at the start \(-3.00, 0.00, 1.50\) m the team is in an obstacle"),
+        (AT_THE_GOAL, GOAL, r"at the goal .* m from an obstacle, and has to keep 0.03 m"),
+        ([], [3.0, 0.0, 0.1, 0.0], "the goal is 0.10 m high, and the payload has to be at least 0.50 m high"),
+        ([], [9.0, 0.0, 1.5, 0.0], r"the goal \(9.00, 0.00, 1.50\) m is outside the space"),
+    ],
+)
+def test_what_has_no_route_is_refused_in_a_sentence(rows, goal, words):
+    with pytest.raises(NoRoute, match=words) as refused:
+        find_route(make_system(4), placed(rows), 0, START, np.array(goal), ROOM)
+    assert isinstance(refused.value, ConfigError) and "\n" not in str(refused.value)

@@ -1,0 +1,147 @@
+"""Task navigate: maps from seeds, the straight line, what counts as a failure and as a success."""
+
+import numpy as np
+import pytest
+from conftest import make, refusal, zeros
+
+from multilift_marl.planning.maps import CAPACITY, LEVELS, draw_map, formation_width, unit_length
+from multilift_marl.rig.obstacles import BOX, CYLINDER, NONE
+from multilift_marl.sim.obstacles import clear_obstacles, place_obstacle
+from multilift_marl.tasks.navigate import PEAK
+
+
+def reset(num_envs: int = 2, **options):
+    """Return environments at their starts; options of the task by name."""
+    vec = make("navigate", num_envs=num_envs, **{f"task_options.{key}": value for key, value in options.items()})
+    vec.reset(seed=0)
+    return vec
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("drones", [1, 2, 4, 8])
+def test_maps_keep_starts_free_and_repeat(level, drones):
+    system = make("hover", num_envs=1, num_drones=drones).world.system
+    unit, width = unit_length(system), formation_width(system)
+    for seed in range(20):
+        drawn = draw_map(level, seed, system)
+        again = draw_map(level, seed, system)
+        assert drawn.obstacles == again.obstacles and np.array_equal(drawn.start, again.start)
+        assert 0 < len(drawn.obstacles) <= CAPACITY
+        for place in (drawn.start, drawn.goal):
+            assert (drawn.low < place).all() and (place < drawn.high).all()
+            for kind, size, position, _ in drawn.obstacles:
+                # Walls are far along x; pillars may be anywhere in the field.
+                away = abs(place[0] - position[0]) if kind == BOX and size[1] > unit else 9.0
+                assert min(away, np.hypot(*(place - position)[:2])) > 0.5 * width
+    assert draw_map(level, 0, system).obstacles != draw_map(level, 1, system).obstacles
+
+
+def test_environments_hold_the_maps_of_their_seeds():
+    vec = reset(4)
+    obstacles, own = vec.world.obstacles, vec.task.own
+    assert len(set(own.map.tolist())) == 4
+    for e, seed in enumerate(own.map.tolist()):
+        drawn = draw_map("sparse", seed, vec.world.system)
+        assert (obstacles.kind[e] != NONE).sum() == len(drawn.obstacles)
+        for m, each in enumerate(drawn.obstacles):
+            assert obstacles.kind[e, m] == each.kind
+            assert np.array_equal(obstacles.position[e, m], each.position)
+    only = reset(3, map=7).task.own
+    assert (only.map == 7).all() and (only.start == only.start[0]).all()
+
+
+def test_an_episode_is_the_same_in_any_batch():
+    many, one = make("navigate", num_envs=5), make("navigate", num_envs=1, first_env=3)
+    first = [vec.reset(seed=11)[0] for vec in (many, one)]
+    assert np.array_equal(first[0][3], first[1][0])
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        action = rng.uniform(-0.2, 0.2, zeros(many).shape)
+        seen = many.step(action)[0][3], one.step(action[3:4])[0][0]
+        assert np.array_equal(*seen)
+    assert np.array_equal(many.task.clearance[3], one.task.clearance[0])
+
+
+def test_the_target_moves_straight_at_its_speed():
+    vec = reset(2, speed=1.0)
+    clear_all(vec)
+    own, task = vec.task.own, vec.task
+    times = 0.02 * np.arange(1, 470)
+    planned, _ = task.preview_targets(np.tile(times, (2, 1)))
+    places = []
+    for _ in times:
+        vec.step(zeros(vec))
+        places.append(task.goal.position.copy())
+    np.testing.assert_allclose(np.array(places), planned.transpose(1, 0, 2), atol=1e-9)
+    speed = np.linalg.norm(np.diff(places, axis=0), axis=2) / 0.02
+    assert speed.max() == pytest.approx(1.0, abs=2e-3)
+    way = own.goal - own.start
+    assert np.allclose(np.cross(np.array(places) - own.start, way), 0, atol=1e-9)
+    duration = PEAK * np.linalg.norm(way, axis=1)
+    ends, _ = task.preview_targets(np.stack([np.zeros(2), duration], axis=1))
+    np.testing.assert_allclose(ends, np.stack([own.start, own.goal], axis=1), atol=1e-12)
+
+
+def clear_all(vec):
+    """Take all obstacles away."""
+    for e in range(vec.num_envs):
+        clear_obstacles(e, vec.world.obstacles)
+    vec.world.load(np.ones(vec.num_envs, bool))
+
+
+def test_what_touches_fails_and_says_so():
+    vec = reset(3)
+    clear_all(vec)
+    state, obstacles = vec.world.state, vec.world.obstacles
+    drone, payload = state.drone_position[0, 1], state.payload_position[1]
+    cable = 0.5 * (
+        state.drone_position[2, 2] + state.payload_position[2] + state.payload_rotation[2] @ vec.task.rig.anchors[2]
+    )
+    for e, place in enumerate((drone, payload, cable)):
+        place_obstacle(e, 3, obstacles, CYLINDER, (0.02, 0.02, 0.02), tuple(place))
+    _, _, terminated, _, info = vec.step(zeros(vec))
+    assert terminated.all()
+    assert [vec.failure_causes[cause] for cause in info["failure_cause"]] == ["obstacle"] * 3
+    assert (vec.task.min_clearance == 0.0).all()
+
+
+def test_clearance_is_the_least_distance():
+    vec = reset(2)
+    clear_all(vec)
+    lowest = vec.world.state.payload_position[0, 2] - vec.world.system.payload_size[2] / 2
+    place_obstacle(0, 0, vec.world.obstacles, BOX, (5, 5, 0.1), (-4, 0, lowest - 0.4))
+    vec.step(zeros(vec))
+    assert vec.task.clearance[0] == pytest.approx(0.3, abs=5e-3)
+    assert vec.task.clearance[1] == 2.0
+
+
+def test_a_payload_outside_the_map_is_out_of_range():
+    vec = reset(2)
+    vec.task.own.high[0, 1] = vec.task.own.start[0, 1] - 0.5
+    _, _, terminated, _, info = vec.step(zeros(vec))
+    assert terminated.tolist() == [True, False]
+    assert vec.failure_causes[info["failure_cause"][0]] == "out_of_range"
+
+
+def test_scenes_without_room_for_a_map_are_refused():
+    assert "scene.reserved=16" in refusal(make, "navigate", **{"scene.reserved": 3})
+
+
+def test_configured_obstacles_stay_beside_those_of_maps():
+    beam = {"shape": "box", "size": [0.1, 0.1, 0.1], "position": [0, 0, 9]}
+    vec = make("navigate", num_envs=2, **{"scene.obstacles": [beam]})
+    for seed in (0, 1):
+        vec.reset(seed=seed)
+        assert (vec.world.obstacles.position[:, 0] == [0, 0, 9]).all()
+        assert (vec.world.obstacles.kind[:, 1:6] != NONE).all()
+
+
+def test_a_straight_flight_without_obstacles_succeeds():
+    vec = reset(2)
+    clear_all(vec)
+    for _ in range(vec.max_steps):
+        _, _, terminated, truncated, info = vec.step(zeros(vec))
+        if (terminated | truncated).any():
+            break
+    assert truncated.all() and vec.task.own.peak_tension.max() < 1.5
+    assert info["success"].all()
