@@ -56,7 +56,8 @@ def measure(config: Config, repeats: int) -> tuple[np.ndarray, np.ndarray]:
     start = rest.copy()
     start[0] += 0.1
     states, inputs = np.tile(rest, (steps + 1, 1)), np.zeros((steps, 3 * n))
-    problem = Problem(states.copy(), inputs.copy(), settings.step, planner.model, still, planner.objective)
+    targets = states.copy(), inputs.copy()
+    problem = Problem(*targets, settings.step, planner.model, still, planner.objective, planner.around)
     work = IterationWork.of(steps, n)
 
     def iterate() -> None:

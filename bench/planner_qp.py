@@ -16,7 +16,8 @@ def dynamics(expert: TeamExpert, rest: np.ndarray, h: float) -> tuple[np.ndarray
     """Return A and B of a step at rest, and the derivatives (N, 12 + 7 N) of the tensions."""
     n, size = len(expert.model.anchors), len(rest)
     w, inputs, states = IterationWork.of(1, n), np.zeros((1, 3 * n)), np.tile(rest, (2, 1))
-    linearise(0, states, inputs, Problem(states, inputs, h, expert.model, np.zeros(7), expert.objective), w)
+    problem = Problem(states, inputs, h, expert.model, np.zeros(7), expert.objective, expert.around)
+    linearise(0, states, inputs, problem, w)
     a = np.zeros((size, size))
     for i in range(size):
         pull_back(0, np.eye(size)[i], a[i], 6 + 2 * n, size, h, w)

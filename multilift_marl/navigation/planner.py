@@ -123,9 +123,23 @@ def find_route(
         if route is not None:
             return route._replace(report=route.report._replace(expanded=expanded, planning_time=thread_time() - begun))
     raise NoRoute(
-        f"no route from the start to the goal was found with {len(shapes.choices)} shapes of the formation that keeps "
-        f"{settings.least_clearance:g} m from all obstacles: widen a gap, or lower least_clearance"
+        f"no route that keeps {settings.least_clearance:g} m from all obstacles was found, with any of "
+        f"{len(shapes.choices)} shapes of the formation: widen a gap, lower least_clearance, or raise most"
     )
+
+
+def measure_route(
+    system: System, obstacles: Obstacles, env: int, route: Route, enough: float = RouteSettings.comfort
+) -> RouteMotion:
+    """Return a team's motion along a route and its distances from obstacles as they are now, such as new ones.
+
+    Args:
+        system: the team.
+        obstacles, env: those of one environment.
+        route: of the team.
+        enough: distance beyond which it is not measured [m].
+    """
+    return move_team(route, system, make_body(system, route.rest, route.modes), make_scene(obstacles, env), enough)
 
 
 def _space(start: np.ndarray, goal: np.ndarray, scene: Scene, body: TeamBody, settings: RouteSettings) -> np.ndarray:

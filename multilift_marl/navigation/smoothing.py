@@ -94,7 +94,7 @@ def space_knots(states: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, fl
 
 def smooth_knots(knots: np.ndarray, band: Band) -> np.ndarray:
     """Return knots (K, D) of least cost; the first and the last stay."""
-    works = [_make_work(knots, band) for _ in range(2)]
+    works = [make_work(knots, band) for _ in range(2)]
     fixed = len(knots) - 2
     cost = assemble(knots, band, works[0])
     damping = 1e-3
@@ -116,7 +116,8 @@ def smooth_knots(knots: np.ndarray, band: Band) -> np.ndarray:
     return knots
 
 
-def _make_work(knots: np.ndarray, band: Band) -> BandWork:
+def make_work(knots: np.ndarray, band: Band) -> BandWork:
+    """Return the arrays of a band with knots (K, 4 + J)."""
     count, size = knots.shape
     inner, drones = (count - 2) * size, len(band.limits.length)
     return BandWork(

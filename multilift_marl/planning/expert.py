@@ -37,7 +37,7 @@ from multilift_marl.planning.hard_planner import (
     solve_teams,
 )
 from multilift_marl.planning.team_model import make_model, state_size
-from multilift_marl.planning.team_planner import Plans, make_objective
+from multilift_marl.planning.team_planner import Plans, make_objective, make_surroundings
 
 COSTS = "position", "attitude", "cable", "velocity", "body_rates", "cable_rates", "thrust", "thrust_rate"
 STEEPEST = 0.99  # horizontal component of a cable's unit vector that a state may have
@@ -109,6 +109,7 @@ class TeamExpert:
         self.limit_names = limit_names(n)
         self._settings, self._tolerance, self._size = settings, tolerance, state_size(n)
         self._flat = make_flat_team(self.model, system)
+        self.around = make_surroundings(settings, system, self.model)
         self._shape = steady_shape(self._flat)
 
     def rest_states(self, positions: np.ndarray, rotations: np.ndarray | None = None) -> np.ndarray:
@@ -189,7 +190,7 @@ class TeamExpert:
             hard.multipliers.push[:] = last.multipliers
         given = states, loads, (positions, rotations, self._shape[None, None], np.zeros((count, steps + 1, 12)))
         settings = elapsed, self._settings.step, self._settings.iterations or MOST_ITERATIONS, self._tolerance
-        team = self._flat, self.objective, self.limits
+        team = self._flat, self.objective, self.limits, self.around
 
         def solve(lo: int, hi: int) -> None:
             work = HardWork.of(steps, n)

@@ -94,7 +94,7 @@ class HardPlanner(TeamPlanner):
         loads = self._unloaded if loads is None else loads
         given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
         settings = elapsed, self.settings.step, self.settings.iterations or MOST_ITERATIONS, TOLERANCE
-        team = self._flat, self.objective, self.limits
+        team = self._flat, self.objective, self.limits, self.around
         solve_teams((0, len(states)), given, settings, team, self.plans, self.hard, self._newton)
         return self.plans
 
@@ -107,13 +107,13 @@ def solve_teams(bounds, given, settings, team, plans, hard, w):
         bounds: the first of the teams, and the first after them.
         given: see `team_planner.plan_teams`.
         settings: time since the last plan [s], length of a step [s], most iterations, largest KKT residual.
-        team: FlatTeam, Objective, Limits.
+        team: FlatTeam, Objective, Limits, Surroundings: none.
         plans: Plans, overwritten.
         hard: HardPlans, overwritten.
         w: HardWork.
     """
     elapsed, h, iterations, tolerance = settings
-    flat, objective, limits = team
+    flat, objective, limits, around = team
     starts, loads, _ = given
     all_multipliers, report = hard
     for e in range(bounds[0], bounds[1]):
@@ -123,7 +123,7 @@ def solve_teams(bounds, given, settings, team, plans, hard, w):
             all_multipliers.values[e], all_multipliers.dual[e], all_multipliers.push[e], all_multipliers.stiffness[e]
         )
         _move_on(m.push, 0.0 if plans.fresh[e] else 1.0, elapsed / h, m.dual)
-        task = LimitedProblem(Problem(targets, asked, h, flat.model, loads[e], objective), limits)
+        task = LimitedProblem(Problem(targets, asked, h, flat.model, loads[e], objective, around), limits)
         path, wanted = Trajectory(states, inputs), (tolerance, iterations)
         status, count = solve_team(starts[e], path, task, m, wanted, w.newton, report.residual[e])
         report.status[e], report.iterations[e] = status, count

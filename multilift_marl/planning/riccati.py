@@ -18,7 +18,13 @@ import numpy as np
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.planning.model_slopes import slopes
-from multilift_marl.planning.soft_limits import add_separations, add_tensions, add_thrusts
+from multilift_marl.planning.soft_limits import (
+    Surroundings,
+    add_clearances,
+    add_separations,
+    add_tensions,
+    add_thrusts,
+)
 from multilift_marl.planning.team_model import (
     ModelWork,
     TeamModel,
@@ -62,6 +68,7 @@ class Problem(NamedTuple):
     load: np.ndarray
     """(7,) see `team_model.accelerations`."""
     objective: Objective
+    around: Surroundings
 
 
 class IterationWork(NamedTuple):
@@ -203,6 +210,7 @@ def recur(k, states, inputs, problem, damping, w):
     add_tensions(k, q, size, h, objective, w)
     add_thrusts(states[k], q, h, objective, quadratic, linear)
     add_separations(states[k], q, problem, w)
+    add_clearances(k, states[k], q, problem, w)
 
     factorise(curvature, nu)
     for i in range(nu):

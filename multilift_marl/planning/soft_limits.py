@@ -6,10 +6,58 @@ Kernels add to `linear` and to the lower triangle of `quadratic` of an Iteration
 from __future__ import annotations
 
 from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
 
 from multilift_marl.kernels.jit import kernel
-from multilift_marl.math3d import row, sub
-from multilift_marl.planning.team_model import set_rotation
+from multilift_marl.math3d import add, dot, matrow, mul, row, scale, sub, vec
+from multilift_marl.planning.team_model import TeamModel, set_rotation
+from multilift_marl.rig.system import System
+from multilift_marl.schema.planner import PlannerConfig
+from multilift_marl.sim.obstacle_bodies import box_distance
+from multilift_marl.sim.obstacle_distance import point_distance
+from multilift_marl.sim.obstacles import NONE, Obstacles
+
+CABLE_POINTS = 0.25, 0.5, 0.75  # of a cable's length, where its distance from obstacles counts
+
+
+class TeamPoints(NamedTuple):
+    """Spheres on a team that are to stay clear of obstacles."""
+
+    corners: np.ndarray
+    """(8, 3) of the payload, its frame [m]."""
+    radius: np.ndarray
+    """(N,) of those about the drones; cables and corners have none [m]."""
+    reach: float
+    """From the payload's centre of mass, that no point is beyond [m]."""
+    clearance: float
+    """That each is to keep [m]."""
+    weight: float
+    """1/σ² of what is missing, in each second."""
+
+
+class Surroundings(NamedTuple):
+    """The obstacles of one team, which go on as they move."""
+
+    env: int
+    obstacles: Obstacles
+    hulls: np.ndarray
+    """See `obstacle_distance.py`."""
+    ahead: float
+    """[s] of the plan's start, from the time at which they are so."""
+    points: TeamPoints
+
+
+def make_points(settings: PlannerConfig, system: System, model: TeamModel) -> TeamPoints:
+    """Return the points of a team."""
+    half, signs = np.array(system.payload_size) / 2, np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
+    corners = np.array(system.payload_center) + signs * half
+    radius = np.array([np.linalg.norm(vehicle.half_size) for vehicle in system.vehicles])
+    radius += np.linalg.norm(system.hooks, axis=1)
+    far = (np.linalg.norm(model.anchors, axis=1) + model.length + radius).max()
+    reach = max(float(far), float(np.linalg.norm(corners, axis=1).max()))
+    return TeamPoints(corners, radius, reach, settings.clearance, settings.clearance_tolerance**-2.0)
 
 
 @kernel
@@ -100,3 +148,63 @@ def add_separations(x, q, problem, w):
                 w.linear[i] -= short * part
                 for j in range(i + 1):
                     w.quadratic[i, j] += part * lever[j]
+
+
+@kernel
+def add_clearances(k, x, q, problem, w):
+    """Add the cost of drones, cables and payload that come too close to obstacles, after `add_separations`."""
+    model, around = problem.model, problem.around
+    env, obstacles, points = around.env, around.obstacles, around.points
+    payload, r = (x[0], x[1], x[2]), w.model.rotation
+    attitude = r[0, 0], r[0, 1], r[0, 2], r[1, 0], r[1, 1], r[1, 2], r[2, 0], r[2, 1], r[2, 2]
+    for m in range(obstacles.kind.shape[1]):
+        if obstacles.kind[env, m] == NONE:
+            continue
+        # What has moved by `gone` then is as far from a point as it is now from the point less `gone`.
+        gone = scale(around.ahead + k * problem.step, vec(obstacles.velocity, env, m))
+        middle = sub(payload, gone)
+        if box_distance(env, m, middle, obstacles) > points.reach + points.clearance:
+            continue
+        for p in range(points.corners.shape[0]):
+            _add_clearance(m, (middle, attitude), row(points.corners, p), (0, 0.0, 0.0), problem, w)
+        for n in range(model.anchors.shape[0]):
+            anchor = row(model.anchors, n)
+            for share in CABLE_POINTS:
+                _add_clearance(m, (middle, attitude), anchor, (n, share, 0.0), problem, w)
+            _add_clearance(m, (middle, attitude), anchor, (n, 1.0, points.radius[n]), problem, w)
+
+
+@kernel
+def _add_clearance(m, pose, arm, sphere, problem, w):
+    """Add the cost of a sphere on the team: its centre is at `arm` on the payload, and a share of cable n from there.
+
+    Args:
+        m: the obstacle.
+        pose: of the payload: its place in a frame that moves with the obstacle [m], and its attitude.
+        arm: in the payload's frame [m].
+        sphere: n, the share, and its radius [m].
+        problem, w: see `riccati.recur`.
+    """
+    (middle, attitude), (n, share, radius) = pose, sphere
+    around, lever = problem.around, w.lever
+    cable = sub(row(w.place, n), mul(attitude, row(problem.model.anchors, n)))
+    point = add(middle, add(mul(attitude, arm), scale(share, cable)))
+    distance, nearest = point_distance(around.env, m, point, around.obstacles, around.hulls)
+    short = around.points.clearance + radius - distance
+    if short <= 0.0 or abs(distance) < 1e-9:
+        return
+    normal = scale(1.0 / distance, sub(point, nearest))
+    # By place (3), attitude (3) and the cable's c (2).
+    slope = w.place_slope[n]
+    for i in range(3):
+        lever[i] = normal[i]
+        lever[3 + i] = dot(normal, mul(matrow(w.model.turning, i), arm))
+    for i in range(2):
+        lever[6 + i] = share * (normal[0] * slope[0, 3 + i] + normal[1] * slope[1, 3 + i] + normal[2] * slope[2, 3 + i])
+    weight = problem.step * around.points.weight
+    for i in range(8):
+        a = i if i < 6 else 2 * n + i
+        part = weight * lever[i]
+        w.linear[a] -= short * part
+        for j in range(i + 1):
+            w.quadratic[a, j if j < 6 else 2 * n + j] += part * lever[j]

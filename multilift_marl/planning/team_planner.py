@@ -14,9 +14,11 @@ from multilift_marl.kernels.jit import kernel
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.flatness import SAMPLES, STEP, FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.riccati import IterationWork, Objective, Problem, find_gains, take_step
+from multilift_marl.planning.soft_limits import Surroundings, make_points
 from multilift_marl.planning.team_model import TeamModel, make_model, state_size, step_state
 from multilift_marl.rig.system import System
 from multilift_marl.schema.planner import PlannerConfig
+from multilift_marl.sim.obstacles import Obstacles, make_hulls
 
 LIMIT_TOLERANCES = 0.03, 0.1  # of thrust over the thrust at rest [-], of separation [m]
 
@@ -63,6 +65,16 @@ def make_objective(settings: PlannerConfig, system: System, model: TeamModel) ->
     )
 
 
+def make_surroundings(
+    settings: PlannerConfig, system: System, model: TeamModel, obstacles: Obstacles | None = None
+) -> Surroundings:
+    """Return what the first team is to stay clear of; None: nothing."""
+    if obstacles is None:
+        obstacles = Obstacles.zeros(1, 0)
+    hulls, points = make_hulls(system.scenery), make_points(settings, system, model)
+    return Surroundings(0, obstacles, hulls, settings.delay, points)
+
+
 class TeamPlanner:
     """Plans of E teams.
 
@@ -70,6 +82,7 @@ class TeamPlanner:
         system: of the teams, nominal.
         settings: section `planner` of the configuration.
         num_envs: E.
+        obstacles: of the teams, live; None: none.
 
     Attributes:
         model, objective: of the team.
@@ -77,7 +90,7 @@ class TeamPlanner:
         plans: Plans, live.
     """
 
-    def __init__(self, system: System, settings: PlannerConfig, num_envs: int):
+    def __init__(self, system: System, settings: PlannerConfig, num_envs: int, obstacles: Obstacles | None = None):
         self.settings, n, steps = settings, system.num_drones, settings.steps
         self.model = make_model(system)
         self.objective = make_objective(settings, system, self.model)
@@ -90,6 +103,7 @@ class TeamPlanner:
         self._flat = make_flat_team(self.model, system)
         self._work = PlannerWork.of(steps, n)
         self._unloaded = np.zeros((e, 7))
+        self.around = make_surroundings(settings, system, self.model, obstacles)
         self._steady = steady_shape(self._flat)[None, None]
 
     def plan(
@@ -111,7 +125,7 @@ class TeamPlanner:
         loads = self._unloaded if loads is None else loads
         given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
         settings = elapsed, self.settings.step, self.settings.iterations or 1
-        plan_teams(given, settings, (self._flat, self.objective), self.plans, self._work)
+        plan_teams(given, settings, (self._flat, self.objective, self.around), self.plans, self._work)
         return self.plans
 
     def predict(self, states: np.ndarray, thrusts: np.ndarray, dt: float, loads: np.ndarray | None = None) -> None:
@@ -145,17 +159,18 @@ def plan_teams(given, settings, team, plans, work):
         given: states, loads, and positions, rotations, shapes and offsets of the motion; one shape may do for all
             steps, or for all teams.
         settings: time since the last plan [s], length of a step [s], iterations.
-        team: FlatTeam, Objective.
+        team: FlatTeam, Objective, Surroundings.
         plans: Plans, overwritten.
         work: PlannerWork.
     """
     elapsed, h, iterations = settings
-    flat, objective = team
+    flat, objective, around = team
     starts, loads, _ = given
     for e in range(starts.shape[0]):
         states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
         prepare_team(e, given, (elapsed, h), flat, plans, work)
-        problem = Problem(targets, asked, h, flat.model, loads[e], objective)
+        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points)
+        problem = Problem(targets, asked, h, flat.model, loads[e], objective, here)
         _iterate(starts[e], states, inputs, problem, iterations, work)
         plans.failed[e] = not _is_finite(states, inputs)
         if plans.failed[e]:  # again from the flat states; at last these themselves

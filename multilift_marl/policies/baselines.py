@@ -28,6 +28,7 @@ from multilift_marl.policies.hold import (
 from multilift_marl.policies.mpc import TeamMpc
 from multilift_marl.policies.payload_geometric import PayloadGeometric
 from multilift_marl.policies.policy import OwnPolicy, Policy
+from multilift_marl.policies.route_mpc import RouteMpc
 from multilift_marl.policies.tuned import tuned_policy
 from multilift_marl.schema.training import TUNED
 
@@ -54,6 +55,7 @@ LINEAR: dict[str, type[Formation]] = {
 SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric] | type[TeamMpc]] = {
     **LINEAR,
     "mpc": TeamMpc,
+    "mpc_route": RouteMpc,
     "payload_geometric": PayloadGeometric,
 }
 _OTHERWISE = {
@@ -74,7 +76,7 @@ def fitting_scripts(vec: MultiliftVec) -> list[str]:
     """Return the names of the baselines that can act in the environments `vec`."""
     fitting = []
     for name, script in SCRIPTED.items():
-        if script is TeamMpc:
+        if issubclass(script, TeamMpc):
             continue
         known = not script.refusal(vec) if issubclass(script, Formation) else vec.config.env.sensing == "ideal"
         if known and script.INTERFACE == vec.config.control.action:

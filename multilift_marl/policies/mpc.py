@@ -83,7 +83,8 @@ class TeamMpc:
                 "time; set control.disturbance=none, or planner.estimate=false"
             )
         self._vec, settings, self.preview = vec, config.planner, preview
-        self.planner = (HardPlanner if settings.limits == "hard" else TeamPlanner)(system, settings, vec.num_envs)
+        team = system, settings, vec.num_envs
+        self.planner = HardPlanner(*team) if settings.limits == "hard" else TeamPlanner(*team, vec.world.obstacles)
         self._dt = vec.task.dt
         exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
         noise = settings.estimate_noise or (0.5 if exact else 1.0)

@@ -52,6 +52,12 @@ class PlannerConfig(Section):
     cables: Annotated[Float, Between(0, 10)] = Field(
         1.1, description="[-] least distance of cables, over that which counts as crossing, with hard limits"
     )
+    clearance: Annotated[Float, Between(0, 10, "m")] = Field(
+        0.1, description="[m] least distance of drones, cables and payload from obstacles, with soft limits"
+    )
+    clearance_tolerance: Annotated[Float, Between(1e-3, 10, "m")] = Field(
+        0.03, description="[m] tolerance of what is missing"
+    )
     estimate: bool = Field(
         True, description="whether forces on payload and drones, a moment and mass of the payload are estimated"
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import make_system
@@ -9,7 +11,7 @@ from test_team_clearance import exact_clearance
 
 from multilift_marl.errors import ConfigError
 from multilift_marl.navigation.formation_shapes import drone_places, find_breach
-from multilift_marl.navigation.planner import RouteSettings, find_route
+from multilift_marl.navigation.planner import RouteSettings, find_route, measure_route
 from multilift_marl.planning.maps import draw_map, place_map
 from multilift_marl.planning.route import NoRoute
 from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
@@ -116,8 +118,23 @@ def test_a_route_goes_on_with_the_motion_of_another(route):
         assert onward.times[-1] < 1.1 * (1 - share) * route.times[-1] + 0.2
 
 
+def test_a_new_obstacle_shows_where_a_route_is_no_longer_clear(route):
+    system = make_system(4)
+    motion = measure_route(system, placed(WALL), 0, route)
+    assert motion.clearance.min() == pytest.approx(route.report.clearance)
+    assert motion.tension.min() > 0.5 and motion.thrust.max() < 0.9
+    blocked = measure_route(system, placed([*WALL, (SPHERE, (0.2, 0.2, 0.2), (2.0, 0.0, 1.5), 0.0)]), 0, route)
+    at = blocked.places[blocked.clearance <= 0.0, 0]
+    assert len(at) and 1.4 < at.min() and at.max() < 2.6
+
+
 CLOSED = [(BOX, (0.1, 4.0, 4.0), (0.0, 0.0, 2.0), 0.0)]
 TIGHT = [(BOX, (0.1, 2.0, 4.0), (0.0, side * 2.23, 4.0), 0.0) for side in (-1.0, 1.0)]  # the payload fits by 1 cm
+SHELF = [  # which the payload could pass below, and the drones above
+    (BOX, (0.1, 4.0, 0.5), (0.0, 0.0, 0.5), 0.0),
+    (BOX, (1.2, 4.0, 0.1), (0.0, 0.0, 1.85), 0.0),
+    (BOX, (1.2, 4.0, 1.0), (0.0, 0.0, 3.9), 0.0),
+]
 IN_A_PILLAR = [(CYLINDER, (0.3, 0.3, 2.0), (-3.0, 0.4, 2.0), 0.0)]
 AT_THE_GOAL = [(CYLINDER, (0.3, 0.3, 2.0), (3.0, -0.54, 2.0), 0.0)]
 
@@ -125,8 +142,9 @@ AT_THE_GOAL = [(CYLINDER, (0.3, 0.3, 2.0), (3.0, -0.54, 2.0), 0.0)]
 @pytest.mark.parametrize(
     "rows, goal, words",
     [
-        (CLOSED, GOAL, "no route from the start to the goal"),
-        (TIGHT, GOAL, "no route from the start to the goal"),
+        (CLOSED, GOAL, "no route that keeps 0.03 m from all obstacles"),
+        (TIGHT, GOAL, "no route that keeps 0.03 m from all obstacles"),
+        (SHELF, GOAL, "no route that keeps 0.03 m from all obstacles"),
         (IN_A_PILLAR, GOAL, r"at the start \(-3.00, 0.00, 1.50\) m the team is in an obstacle"),
         (AT_THE_GOAL, GOAL, r"at the goal .* m from an obstacle, and has to keep 0.03 m"),
         ([], [3.0, 0.0, 0.1, 0.0], "the goal is 0.10 m high, and the payload has to be at least 0.50 m high"),
@@ -135,5 +153,5 @@ AT_THE_GOAL = [(CYLINDER, (0.3, 0.3, 2.0), (3.0, -0.54, 2.0), 0.0)]
 )
 def test_what_has_no_route_is_refused_in_a_sentence(rows, goal, words):
     with pytest.raises(NoRoute, match=words) as refused:
-        find_route(make_system(4), placed(rows), 0, START, np.array(goal), ROOM)
+        find_route(make_system(4), placed(rows), 0, START, np.array(goal), replace(ROOM, most=20_000))
     assert isinstance(refused.value, ConfigError) and "\n" not in str(refused.value)

@@ -9,6 +9,7 @@ import multilift_marl as ml
 from multilift_marl.planning.approach import Approach, begin_approaches, write_approaches
 from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.riccati import IterationWork, Objective, Problem, find_gains, take_step
+from multilift_marl.planning.soft_limits import CABLE_POINTS
 from multilift_marl.planning.team_model import (
     ModelWork,
     accelerations,
@@ -17,8 +18,9 @@ from multilift_marl.planning.team_model import (
     state_size,
     step_state,
 )
-from multilift_marl.planning.team_planner import TeamPlanner, make_objective
+from multilift_marl.planning.team_planner import TeamPlanner, make_objective, make_surroundings
 from multilift_marl.schema.planner import PlannerConfig
+from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
 
 N, STEPS, STEP = 3, 6, 0.05
 SIZE, Q, NU = state_size(N), 6 + 2 * N, 3 * N
@@ -51,6 +53,41 @@ def drones(x, model):
     return x[:3] + model.anchors @ rotation.T + model.length[:, None] * direction
 
 
+def obstacles_about():
+    """Return a box, a cylinder and a sphere, of which the last two move, near the team of environment 1."""
+    found = Obstacles.zeros(2, 5)
+    place_obstacle(1, 0, found, BOX, (0.3, 0.2, 0.4), (1.0, 0.3, 1.6), 0.6)
+    place_obstacle(1, 2, found, CYLINDER, (0.2, 0.2, 2.0), (-0.9, 0.5, 1.4))
+    place_obstacle(1, 3, found, SPHERE, (0.4, 0.4, 0.4), (0.1, -0.2, 0.4))
+    place_obstacle(1, 4, found, SPHERE, (0.4, 0.4, 0.4), (9.0, 0.0, 1.0))
+    found.velocity[1, 2], found.velocity[1, 3] = (0.5, -0.2, 0.0), (0.0, 0.0, -0.3)
+    return found
+
+
+def outside(point, m, obstacles):
+    """Return how far a point is from an obstacle: closed forms outside of it."""
+    local, size = obstacles.rotation[1, m].T @ (point - obstacles.position[1, m]), obstacles.size[1, m]
+    if obstacles.kind[1, m] == SPHERE:
+        return np.linalg.norm(local) - size[0]
+    if obstacles.kind[1, m] == CYLINDER:
+        return np.hypot(max(np.hypot(*local[:2]) - size[0], 0), max(abs(local[2]) - size[2], 0))
+    return np.linalg.norm(np.maximum(np.abs(local) - size, 0))
+
+
+def distances(x, after, model, around):
+    """Return how far each point of a team is from each obstacle `after` [s] beyond the sphere about it."""
+    rotation, turning = np.zeros((3, 3)), np.zeros((3, 3, 3))
+    set_rotation(x, rotation, turning)
+    anchors, corners = (x[:3] + points @ rotation.T for points in (model.anchors, around.points.corners))
+    hooks = drones(x, model)
+    points = [(point, 0.0) for point in corners]
+    for n in range(N):
+        points += [(anchors[n] + share * (hooks[n] - anchors[n]), 0.0) for share in CABLE_POINTS]
+        points.append((hooks[n], around.points.radius[n]))
+    moved, used = after * around.obstacles.velocity[1], (0, 2, 3, 4)
+    return np.array([outside(p - moved[m], m, around.obstacles) - radius for m in used for p, radius in points])
+
+
 def test_a_step_solves_the_linearised_problem_with_active_limits_of_every_kind(system):
     """Against one dense system: all states and inputs, gaps and limits, derivatives by differences."""
     model, rest = at_rest(system)
@@ -63,7 +100,9 @@ def test_a_step_solves_the_linearised_problem_with_active_limits_of_every_kind(s
         np.tile([0.0, 5.0], (N, 1)), np.full((N, N), 2.5), np.array([3.0, 2.0, 40.0]),
     )  # fmt: skip
     load = np.array([0.1, 0.2, -0.3, 0.01, 0.0, -0.01, 0.1])
-    problem, w = Problem(targets, asked, STEP, model, load, objective), IterationWork.of(STEPS, N)
+    settings = PlannerConfig(clearance=0.3, clearance_tolerance=0.2, delay=0.1)
+    around = make_surroundings(settings, system, model, obstacles_about())._replace(env=1)
+    problem, w = Problem(targets, asked, STEP, model, load, objective, around), IterationWork.of(STEPS, N)
     scratch = ModelWork.of(N)
 
     def after(both):
@@ -74,7 +113,7 @@ def test_a_step_solves_the_linearised_problem_with_active_limits_of_every_kind(s
     count = (STEPS + 1) * SIZE + STEPS * NU
     hessian, gradient = np.zeros((count, count)), np.zeros(count)
     rows, wanted = [], []
-    excesses = [0, 0, 0]
+    excesses = [0, 0, 0, 0]
 
     def add(jacobian, value, weight):
         nonlocal hessian, gradient
@@ -102,6 +141,14 @@ def test_a_step_solves_the_linearised_problem_with_active_limits_of_every_kind(s
         row[:, (k + 1) * SIZE : (k + 2) * SIZE] += np.eye(SIZE)
         rows.append(row)
         wanted.append(value[:SIZE] - states[k + 1])
+        shorts = 0.3 - distances(states[k], 0.1 + k * STEP, model, around)
+        slopes = derivative(lambda y, t=0.1 + k * STEP: -distances(y, t, model, around), states[k], 1e-6)
+        for short, slope_of_short in zip(shorts, slopes, strict=True):
+            if short > 0:
+                jacobian = np.zeros(count)
+                jacobian[x] = slope_of_short
+                add(jacobian, short, STEP * 0.2**-2)
+                excesses[3] += 1
         for n in range(N):
             short = objective.tension[n] - value[SIZE + n]
             if short > 0:
@@ -142,8 +189,9 @@ def test_a_step_solves_the_linearised_problem_with_active_limits_of_every_kind(s
 def test_iterations_end_at_a_trajectory_of_the_model_that_no_change_improves(system):
     model, rest = at_rest(system)
     objective = make_objective(PlannerConfig(), system, model)
+    around = make_surroundings(PlannerConfig(), system, model)
     states, inputs = np.tile(rest, (STEPS + 1, 1)), np.zeros((STEPS, NU))
-    problem = Problem(states.copy(), inputs.copy(), STEP, model, np.zeros(7), objective)
+    problem = Problem(states.copy(), inputs.copy(), STEP, model, np.zeros(7), objective, around)
     start, w = rest.copy(), IterationWork.of(STEPS, N)
     start[:3] += [0.05, -0.03, 0.02]
     for _ in range(30):

@@ -12,7 +12,7 @@ from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_scripted
-from multilift_marl.policies.mpc import ENOUGH
+from multilift_marl.policies.mpc import ENOUGH, TeamMpc
 
 BY_RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
 FAST = {"task_options.speed": 2.0, "task_options.acceleration": 4.0, "task_options.rmse_from": 3.0}
@@ -78,6 +78,72 @@ def test_a_target_that_leaps_is_approached():
         observation, _, ended, *_ = vec.step(policy.act(observation))
         assert not ended.any()
     assert (np.linalg.norm(vec.world.state.payload_position - vec.task.goal.position, axis=1) < 2e-3).all()
+
+
+KNOWN = {"randomization.payload_mass": 0.0, "randomization.payload_force": 0.0}
+
+
+@pytest.mark.parametrize("n", [4, pytest.param(8, marks=pytest.mark.slow)])
+def test_drones_keep_to_a_shape_that_is_drawn_in(n):
+    """Within 2 s on 1 m the formation narrows to 0.55 of its width and turns by 40°; drones are within a centimetre."""
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1, **BY_RATES, **KNOWN, **{"env.num_drones": n})
+    observation, _ = vec.reset(seed=3)
+    system, state = vec.world.system, vec.world.state
+    rest = system.formation_force / np.linalg.norm(system.formation_force, axis=1, keepdims=True)
+    across = system.anchors[:, 1] + system.cable_length * rest[:, 1]
+
+    def preview(times):
+        s = np.clip((times - 2.0) / 2.0, 0.0, 1.0)
+        share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
+        position, rotation = np.zeros((*times.shape, 3)), np.zeros((*times.shape, 3, 3))
+        position[..., 0], position[..., 2] = share, 1.0
+        rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(0.7 * share)
+        rotation[..., 1, 0], rotation[..., 2, 2] = np.sin(0.7 * share), 1.0
+        rotation[..., 0, 1] = -rotation[..., 1, 0]
+        d = np.tile(rest, (*times.shape, 1, 1))
+        d[..., 1] = ((1.0 - 0.45 * share[..., None]) * across - system.anchors[:, 1]) / system.cable_length
+        d[..., 2] = np.sqrt(1.0 - d[..., 0] ** 2 - d[..., 1] ** 2)
+        return position, rotation, d * (system.formation_force[:, 2] / d[..., 2])[..., None]
+
+    policy = TeamMpc(vec, preview)
+    for _ in range(250):
+        observation, _, ended, *_ = vec.step(policy.act(observation))
+        assert not ended.any()
+        target = policy.planner.plans.targets[0, 0]
+        if vec.task.time[0] < 1.9:
+            continue
+        arms = state.payload_position[0] + system.anchors @ state.payload_rotation[0].T
+        hooks = state.drone_position[0] + np.einsum("nij,nj->ni", state.drone_rotation[0], system.hooks)
+        off = (hooks - arms)[:, :2] - policy.planner.model.length[:, None] * target[6 : 6 + 2 * n].reshape(n, 2)
+        assert np.abs(off).max() < 0.03  # a policy step's change included
+    (place,), _, (shape,) = (part[:, 0] for part in preview(vec.task.time[:, None]))
+    arms = place + system.anchors @ state.payload_rotation[0].T
+    turned = shape @ state.payload_rotation[0].T
+    planned = arms + policy.planner.model.length[:, None] * turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    assert np.linalg.norm(hooks - planned, axis=1).max() < 0.01
+    assert np.ptp((hooks - place) @ state.payload_rotation[0][:, 1]) == pytest.approx(0.55 * np.ptp(across), rel=0.03)
+
+
+def test_drones_keep_clear_of_what_stands_where_they_would_be():
+    """A pillar where a drone's body would be, 5 cm deep: it stays 9 cm away, the payload where it is to be."""
+    system = ml.load_config("hover").system
+    slot = system.anchors[0] + system.cable_length[0] * system.formation_force[0] / np.linalg.norm(
+        system.formation_force[0]
+    )
+    out = np.append(slot[:2] / np.linalg.norm(slot[:2]), 0.0)
+    goal = np.array([1.2, 0.9, 1.0])
+    pillar = goal + slot + (0.15 + system.vehicles[0].half_size[0] - 0.05) * out
+    scene = {"scene.obstacles": [{"shape": "cylinder", "size": [0.3, 6.0], "position": [*pillar[:2].tolist(), 3.0]}]}
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1, **BY_RATES, **KNOWN, **scene)
+    observation, _ = vec.reset(seed=3)
+    policy = make_scripted("mpc", vec)
+    vec.task.place_goal(0, goal)
+    for _ in range(250):
+        observation, _, ended, *_ = vec.step(policy.act(observation))
+        assert not ended.any()
+        assert vec.task.view.clearance[0] > 0.05
+    assert vec.task.view.clearance[0] > 0.09
+    assert np.linalg.norm(vec.world.state.payload_position[0] - goal) < 0.01
 
 
 @pytest.mark.parametrize("config", ["track", "pose"])
