@@ -78,6 +78,8 @@ def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[St
     after.append(Stage("observe state", on_shard["observe state"]))
     if sensing.measures:
         after.append(Stage("sense", partial(sensing.bind_sense(task.view), lo, hi)))
+    if sensing.obstacles is not None:
+        after.append(Stage("sense obstacles", partial(sensing.obstacles.sense, lo, hi)))
     after.append(Stage("observe", on_shard["observe"]))
     if own.observes:
         after.append(Stage("observe (NumPy)", partial(own.observe, *every), is_whole=True))

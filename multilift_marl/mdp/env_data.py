@@ -125,6 +125,8 @@ class View(NamedTuple):
     obstacles: Obstacles
     hulls: np.ndarray
     """(H, V, 3) vertices of obstacles from their middles, see `obstacles.make_hulls` [m]."""
+    obstacle_readings: np.ndarray | None
+    """(E, N, P) what drones observe of obstacles, see `sensing/obstacle_sensing.py` [m]; None if nothing."""
     nodes: Nodes | None
     """Of cables that are chains."""
     clearance: np.ndarray

@@ -11,8 +11,9 @@ from collections.abc import Set
 from typing import NamedTuple
 
 from multilift_marl.kernels.jit import inlined
-from multilift_marl.math3d import row
+from multilift_marl.math3d import row, sub, vec
 from multilift_marl.mdp.observations import (
+    NO_OBSTACLE,
     Component,
     body_rates,
     count_numbers,
@@ -30,6 +31,7 @@ from multilift_marl.mdp.observations import (
     thrust_axis,
     tracking_error,
 )
+from multilift_marl.sim.obstacle_distance import nearest_point
 
 
 @inlined
@@ -110,6 +112,20 @@ def cable_tension(e, n, v):
     return v.state.cable_tension[e, n] / v.resting_tension[n] - 1.0
 
 
+@inlined
+def payload_obstacle(e, n, v):
+    """From the payload to the nearest point of an obstacle."""
+    place = row(v.state.payload_position, e)
+    return sub(nearest_point(e, place, NO_OBSTACLE, v.obstacles, v.hulls), place)
+
+
+@inlined
+def drone_obstacle(e, n, v):
+    """From a drone to the nearest point of an obstacle."""
+    place = vec(v.state.drone_position, e, n)
+    return sub(nearest_point(e, place, NO_OBSTACLE, v.obstacles, v.hulls), place)
+
+
 STATE = (  # global state of a critic: what belongs to no drone, hidden quantities among it
     Component("payload_error", 3, "target", "m", "payload position minus target", payload_error),
     Component("payload_velocity", 3, "target", "m/s", "payload velocity", payload_velocity),
@@ -143,7 +159,7 @@ DRONE_STATE = (  # then of each drone, and its last action
 )
 
 
-HIDDEN = {  # what the global state holds beside, where `randomization` varies it
+HIDDEN = {  # what the global state holds beside, where `randomization` varies it, or drones sense obstacles
     "payload_inertia": Component(
         "payload_inertia", 1, "-", "-", "payload inertia over that of its mass, minus 1", payload_inertia
     ),
@@ -153,6 +169,9 @@ HIDDEN = {  # what the global state holds beside, where `randomization` varies i
     ),
     "action_delay": Component("action_delay", 1, "-", "policy steps", "delay of actions", action_delay),
     "gust": Component("gust", 3, "target", "m/s", "turbulence and gusts", gust),
+    "obstacles": Component(
+        "payload_obstacle", 3, "target", "m", "from the payload to the nearest point of an obstacle", payload_obstacle
+    ),
 }  # fmt: skip
 DRONE_HIDDEN = {  # the same of each drone
     "cable_length": Component("cable_length", 1, "-", "-", "cable length over the nominal one, minus 1", cable_length),
@@ -163,6 +182,9 @@ DRONE_HIDDEN = {  # the same of each drone
     "vehicle_rotor_time_constant": Component(
         "rotor_time_constant", 1, "-", "-", "time constant of the rotors over the nominal one, minus 1",
         rotor_time_constant,
+    ),
+    "obstacles": Component(
+        "nearest_obstacle", 3, "target", "m", "from the drone to the nearest point of an obstacle", drone_obstacle
     ),
 }  # fmt: skip
 
@@ -200,7 +222,7 @@ def state_components(varied: Set[str], extra: tuple[Component, ...] = ()) -> Sta
     """Return what the global state holds.
 
     Args:
-        varied: keys of `HIDDEN` and `DRONE_HIDDEN` by which environments differ.
+        varied: keys of `HIDDEN` and `DRONE_HIDDEN` by which environments differ; "obstacles" where they are sensed.
         extra: what the task adds.
     """
     hidden, of_drone = (tuple(part for key, part in table.items() if key in varied) for table in (HIDDEN, DRONE_HIDDEN))

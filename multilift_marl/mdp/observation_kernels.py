@@ -72,6 +72,11 @@ def _write(out: str, at: str, drone: str, parts: Sequence[Component], functions:
     for part in parts:
         if is_plain(part.value):
             continue  # these come last
+        if part.field is not None:
+            lines.append(f"for k in range({part.size}):")
+            lines.append(f"    {out}[{at}{size} + k] = v.{part.field}[e, {drone}, k]")
+            size += part.size
+            continue
         name = f"{part.name}_{len(functions)}"
         functions[name] = part.value
         call = f"{name}(e, {drone}, v)"

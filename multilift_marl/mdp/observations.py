@@ -18,12 +18,14 @@ from multilift_marl.control.actions import ACTIONS
 from multilift_marl.kernels.jit import inlined, is_plain
 from multilift_marl.math3d import add, column, heading, mat, matrow, mul, row, scale, sub, vec
 from multilift_marl.mdp.env_data import load_row
+from multilift_marl.schema.sections import EnvConfig
 
 FRAMES = {
     "world": "z up",
     "target": "the world, turned about z to the heading atan2(-R01, R11) of the payload's target attitude R",
     "slot": "x horizontal, outward from the target payload position through the drone's slot, y to the left, z up",
     "payload": "of the payload itself",
+    "heading": "level, x along the drone's heading, y to the left, z up",
     "body": "of the drone itself: x forward, y left, z along the thrust",
     "slot body": "the body's, turned about its z axis so that x points outward through the drone's slot",
 }
@@ -46,6 +48,8 @@ class Component(NamedTuple):
     turned: bool | None = None
     """Whether `value` is a vector in the world frame, to be turned into `frame`; None: three numbers in a slot or
     target frame are."""
+    field: str | None = None
+    """Of `View`, (E, N, size), that is copied in place of a value."""
 
     @property
     def is_turned(self) -> bool:
@@ -226,6 +230,31 @@ SENSED = {  # what levels of `env.sensing` add
         Component("measured_tension", 1, "-", "-", "measured tension over that at rest, minus 1", measured_tension),
     )
 }
+
+NO_OBSTACLE = 100.0
+"""[m] Straight above: where the nearest point of obstacles is observed that are not there."""
+
+
+def count_readings(env: EnvConfig) -> int:
+    """Return how many numbers a drone observes of obstacles."""
+    points, beams = 3 * env.obstacles.points, env.obstacles.beams
+    return {"none": 0, "map": points, "local": points, "ranges": beams}[env.obstacle_sensing]
+
+
+def sensed_components(env: EnvConfig) -> tuple[Component, ...]:
+    """Return what the sensors of `env.sensing` and `env.obstacle_sensing` add to observations."""
+    sensed = SENSED.get(env.sensing, ())
+    if env.obstacle_sensing == "none":
+        return sensed
+    meanings = {"points": "to the nearest points of the nearest obstacles", "ranges": "lengths of beams to obstacles"}
+    kind = "ranges" if env.obstacle_sensing == "ranges" else "points"
+    # `own_velocity` only fills the place of a value.
+    readings = Component(
+        f"obstacle_{kind}", count_readings(env), "heading", "m", meanings[kind], own_velocity, False,
+        "obstacle_readings",
+    )  # fmt: skip
+    return (*sensed, readings)
+
 
 _TURNED = {  # what interfaces that are about body rates observe in place of others
     "body_rates": Component("turned_rates", 3, "slot body", "rad/s", "own angular velocity", turned_rates)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, create_model, field_validator, model_validator
 
 from multilift_marl.schema.files import pin_mesh, pin_vehicles
+from multilift_marl.schema.obstacle_sensing import ObstacleSensingConfig
 from multilift_marl.schema.scene import SceneConfig
 from multilift_marl.schema.values import (
     Between,
@@ -57,6 +58,10 @@ class EnvConfig(Section):
     communication_range: Annotated[Float | None, Between(0, 1e6, "m")] = Field(
         None, description="[m] beyond which drones do not hear each other; None: no limit"
     )
+    obstacle_sensing: Literal["none", "map", "local", "ranges"] = Field(
+        "none", description="what drones observe of obstacles: nearest points, exact or of a sensor, or ranges"
+    )
+    obstacles: ObstacleSensingConfig = ObstacleSensingConfig()
     units: Literal["si", "cable"] = Field(
         "si", description="of observations and full actions; cable: those of the similar rig with cables of 1 m"
     )

@@ -23,6 +23,7 @@ from multilift_marl.rng import normal_vector
 from multilift_marl.sensing.communication import check_links, make_links
 from multilift_marl.sensing.estimator import StateEstimator
 from multilift_marl.sensing.load_sensing import LoadSensing
+from multilift_marl.sensing.obstacle_sensing import ObstacleSensing
 from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
@@ -68,6 +69,7 @@ class Sensing:
         memory: DelayBuffers.
         state: what drones know of themselves (SystemState; its payload, where that is measured, is in `load`).
         load: what they know of the payload.
+        obstacles: sensors of obstacles, or None.
         errors: the payload's errors as known, with their own integrals, (E, L, ...) as in `Load`; None: the true ones.
         measures, delays_observation, delays_action: whether what drones know is not the truth, whether there is a delay
             of observations, one of actions.
@@ -116,7 +118,8 @@ class Sensing:
         self.load = self._load_sensing.load if self._load_sensing else true_load(self.state)
         self.measures = has_noise or estimator is not None
         self.errors = Errors.zeros(e, self.load.position.shape[1]) if self.measures else None
-        self.enabled = self.measures or self.delays_observation or self.delays_action
+        self.obstacles = None if config.env.obstacle_sensing == "none" else ObstacleSensing(config, world)
+        self.enabled = self.measures or self.delays_observation or self.delays_action or self.obstacles is not None
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:
         """Begin an episode of one environment: draw its biases, forget what was sent and seen."""
@@ -125,6 +128,9 @@ class Sensing:
         draw_bias(env, memory, self.bias)
         memory.sent[env] = memory.seen[env] = 0
         memory.actions[env] = 0.0
+        if self.obstacles is not None:
+            # A third stream beside the two of `start_sensors`.
+            self.obstacles.start(env, np.random.SeedSequence(int(memory.generator[env])).spawn(3)[2])
         if self.errors is not None:
             self.errors.position_integral[env] = self.errors.rotation_integral[env] = 0.0
 
@@ -135,6 +141,8 @@ class Sensing:
             own, load = np.random.SeedSequence(int(self.memory.generator[env])).spawn(2)
             self._estimator.start(env, own)
             self._load_sensing.start(env, load)
+        if self.obstacles is not None:
+            self.obstacles.sense(env, env + 1)
 
     def bind_sense(self, view: View, first: bool = False) -> Call:
         """Return the call of (lo, hi) that measures what drones know; `first` of an episode, not to be integrated."""
@@ -173,6 +181,8 @@ class Sensing:
         if not self.enabled:
             return {}
         arrays = self.memory._asdict()
+        if self.obstacles is not None:
+            arrays |= {f"obstacle_{name}": array for name, array in self.obstacles.readings._asdict().items()}
         if self.errors is not None:
             arrays |= {f"errors_{name}": array for name, array in self.errors._asdict().items()}
         if self._estimator is not None and self._load_sensing is not None:

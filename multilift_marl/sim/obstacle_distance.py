@@ -58,6 +58,17 @@ def point_distance(e, m, point, obstacles, hulls):
 
 
 @kernel
+def nearest_point(e, point, most, obstacles, hulls):
+    """Return the point of an obstacle's surface that is nearest to a point; `most` [m] above it if none is nearer."""
+    found, least = add(point, (0.0, 0.0, most)), most
+    for m in range(obstacles.kind.shape[1]):
+        distance, nearest = point_distance(e, m, point, obstacles, hulls)
+        if distance < least:
+            found, least = nearest, distance
+    return found
+
+
+@kernel
 def _from_box(local, half):
     """Return the signed distance of a point from a box in its own frame, and the nearest point of its surface."""
     x, y, z = clip(local[0], -half[0], half[0]), clip(local[1], -half[1], half[1]), clip(local[2], -half[2], half[2])

@@ -19,7 +19,7 @@ from multilift_marl.mdp.global_state import state_components
 from multilift_marl.mdp.initial_states import true_equilibrium
 from multilift_marl.mdp.numpy_functions import NumpyFunctions
 from multilift_marl.mdp.observation_kernels import check_written, compose_observation, compose_state
-from multilift_marl.mdp.observations import SENSED, Component, kernels_first, list_components
+from multilift_marl.mdp.observations import Component, kernels_first, list_components, sensed_components
 from multilift_marl.mdp.rewards import RestBounds, Term, compose_reward, is_at_rest, resolve_reward
 from multilift_marl.mdp.rig_features import RIG, describe_rig, observed_units, scale_numbers
 from multilift_marl.mdp.stage_kernels import compose_check, compose_plan
@@ -148,6 +148,7 @@ class Task:
         self.action, self.previous = np.zeros((2, e, n, size))
         self.observation = np.zeros((e, n, sensing.observation_size), np.float32)
         varied = system.varied | ({"gust"} if config.wind.turbulence or any(config.wind.gust) else set())
+        varied |= {"obstacles"} if sensing.obstacles else set()
         self._state = state_components(varied, self.EXTRA_STATE)
         self.drone_numbers = self._state.drone_numbers(n, size)
         self.critic = np.zeros((e, self._state.size(n, size)), np.float32)
@@ -187,6 +188,7 @@ class Task:
             min_separation=self.min_separation,
             obstacles=world.obstacles,
             hulls=make_hulls(system.scenery),
+            obstacle_readings=sensing.obstacles.readings.observed if sensing.obstacles else None,
             nodes=world.nodes,
             clearance=self.clearance,
             min_clearance=self.min_clearance,
@@ -210,7 +212,7 @@ class Task:
     def extra(cls, config: Config) -> tuple[Component, ...]:
         """Return what observations have beside the common components: the task's own, and what only sensors tell."""
         rig = () if config.env.units == "si" else (RIG,)
-        return kernels_first((*cls.EXTRA, *SENSED.get(config.env.sensing, ()), *rig))
+        return kernels_first((*cls.EXTRA, *sensed_components(config.env), *rig))
 
     @classmethod
     def causes(cls) -> tuple[str, ...]:

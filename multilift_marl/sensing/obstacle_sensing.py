@@ -1,0 +1,216 @@
+"""Sensing of obstacles: each drone observes their nearest points, or a ring of ranges (`env.obstacle_sensing`).
+
+- `map`: the nearest point of each of the k nearest obstacles, exact, at any distance.
+- `local`: the same within the range and the field of view of a sensor with a rate, a delay and noise.
+- `ranges`: lengths of horizontal beams about the drone until they meet an obstacle, of such a sensor.
+
+Vectors and beams are in the drone's heading frame at the moment of the measurement. Sensors see obstacles alone,
+neither ground nor team; points are seen through other obstacles, and a point outside the field of view is not replaced
+by another of the same obstacle. Attitudes and places are true: `env.sensing` and its noise do not count here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import atan2, cos, inf, pi, radians, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl.config.config import Config
+from multilift_marl.kernels.jit import kernel, prebind
+from multilift_marl.math3d import add, heading, mat, norm, put, scale, sub, turn, vec
+from multilift_marl.mdp.observations import NO_OBSTACLE, count_readings
+from multilift_marl.rig.resolve import whole_ratio
+from multilift_marl.rng import normal_pair, normal_vector
+from multilift_marl.sim.obstacle_distance import point_distance, ray_distance
+from multilift_marl.sim.obstacles import NONE, Obstacles, make_hulls
+from multilift_marl.sim.world import World
+
+
+class ObstacleSensor(NamedTuple):
+    """Constants of the sensor."""
+
+    points: int
+    """k; 0 of a ring of beams."""
+    range: float
+    """[m]."""
+    half_view: float
+    """Half of the field of view [rad]."""
+    noise: float
+    """[m]."""
+    period: int
+    """Policy steps from one measurement to the next."""
+    delay: int
+    """[policy steps]."""
+
+
+class ObstacleReadings(NamedTuple):
+    """What the sensors have measured; P numbers of each drone, environment first."""
+
+    generator: np.ndarray
+    """(E,) uint64, state of the random numbers."""
+    steps: np.ndarray
+    """(E,) int64 policy steps since the reset."""
+    latest: np.ndarray
+    """(E, N, P) the last measurement [m]."""
+    held: np.ndarray
+    """(E, K, N, P) the last ones of the last policy steps, at their number modulo K [m]."""
+    observed: np.ndarray
+    """(E, N, P) what drones observe [m]."""
+
+
+class ObstacleSensing:
+    """The sensors of obstacles of E teams.
+
+    Args:
+        config: `env.obstacle_sensing`, not none, and `env.obstacles`.
+        world: the teams and obstacles.
+
+    Attributes:
+        readings: ObstacleReadings; live.
+        sense: call of (lo, hi), once at the start of an episode and in each policy step.
+
+    Raises:
+        ConfigError: a rate that does not divide `env.policy_hz`.
+    """
+
+    def __init__(self, config: Config, world: World):
+        mode, given, rate = config.env.obstacle_sensing, config.env.obstacles, config.env.policy_hz
+        period = 1 if given.rate is None else whole_ratio(rate, given.rate, "env.obstacles.rate", "env.policy_hz")
+        if mode == "map":
+            sensor = ObstacleSensor(given.points, NO_OBSTACLE, pi, 0.0, 1, 0)
+        else:
+            points = given.points if mode == "local" else 0
+            half_view = radians(given.field_of_view) / 2
+            sensor = ObstacleSensor(points, given.range, half_view, given.noise, period, given.delay)
+        e, n = world.num_envs, world.num_drones
+        shape = e, n, count_readings(config.env)
+        held = np.zeros((e, sensor.delay + 1, *shape[1:]))
+        self.readings = ObstacleReadings(
+            np.zeros(e, np.uint64), np.zeros(e, np.int64), np.zeros(shape), held, np.zeros(shape)
+        )
+        distances = np.zeros((e, n, max(sensor.points, 1)))
+        drones = world.state.drone_position, world.state.drone_rotation
+        obstacles = _needed(world.obstacles), make_hulls(world.system.scenery)
+        self.sense: Callable[[int, int], None] = prebind(
+            sense_obstacles, *drones, *obstacles, sensor, self.readings, distances
+        )
+
+    def start(self, env: int, seed: np.random.SeedSequence) -> None:
+        """Begin an episode of one environment: its next measurement is the first, and is observed until another is."""
+        self.readings.generator[env] = seed.generate_state(1, np.uint64)[0]
+        self.readings.steps[env] = 0
+
+
+def _needed(obstacles: Obstacles) -> Obstacles:
+    """Return the obstacles with None in place of what distances do not need: kernels compile faster."""
+    needed = ("kind", "size", "rotation", "position", "hull")
+    unknown = {name: None for name in Obstacles._fields if name not in needed}
+    return obstacles._replace(**unknown)  # type: ignore[arg-type]
+
+
+@kernel
+def sense_obstacles(lo, hi, position, rotation, obstacles, hulls, sensor, readings, distances):
+    """Measure in environments lo to hi where it is time, and observe what was measured `delay` steps ago.
+
+    Args:
+        lo, hi: the environments.
+        position, rotation: of the drones, true (E, N, 3) [m], (E, N, 3, 3).
+        obstacles, hulls: see `sim.obstacle_distance`.
+        sensor: ObstacleSensor.
+        readings: ObstacleReadings, written.
+        distances: (E, N, k) [m], written.
+    """
+    for e in range(lo, hi):
+        now = readings.steps[e]
+        count = readings.held.shape[1]
+        then = now - min(sensor.delay, now)  # at first the first
+        for n in range(position.shape[1]):
+            latest = readings.latest[e, n]
+            if now % sensor.period == 0:
+                drone, yaw = vec(position, e, n), heading(mat(rotation, e, n))
+                if sensor.points > 0:
+                    _find_points(e, drone, yaw, obstacles, hulls, sensor, latest, distances[e, n])
+                    _blur_points(e, sensor, readings, latest, distances[e, n])
+                else:
+                    _measure_ranges(e, drone, yaw, obstacles, hulls, sensor, latest)
+                    _blur_ranges(e, sensor, readings, latest)
+            # Held before it is read: without delay it is the present itself.
+            for k in range(latest.shape[0]):
+                readings.held[e, now % count, n, k] = latest[k]
+                readings.observed[e, n, k] = readings.held[e, then % count, n, k]
+        readings.steps[e] = now + 1
+
+
+@kernel
+def _find_points(e, drone, yaw, obstacles, hulls, sensor, points, distances):
+    """Write the nearest points (3 k) in the heading frame, nearest first, and their distances (k), inf where none is.
+
+    What is not seen is straight above at the sensor's range.
+    """
+    for j in range(distances.shape[0]):
+        distances[j] = inf
+        put(points[3 * j : 3 * j + 3], (0.0, 0.0, sensor.range))
+    c, s = cos(yaw), sin(yaw)
+    last = distances.shape[0] - 1
+    for m in range(obstacles.kind.shape[1]):
+        if obstacles.kind[e, m] == NONE:
+            continue
+        distance, nearest = point_distance(e, m, drone, obstacles, hulls)
+        if distance > sensor.range or distance >= distances[last]:
+            continue
+        point = turn(c, -s, sub(nearest, drone))
+        if abs(atan2(point[1], point[0])) > sensor.half_view:
+            continue
+        # Into its place among those found before; the farthest of k drops out.
+        j = last
+        while j > 0 and distances[j - 1] > distance:
+            distances[j] = distances[j - 1]
+            for i in range(3):
+                points[3 * j + i] = points[3 * j - 3 + i]
+            j -= 1
+        distances[j] = distance
+        put(points[3 * j : 3 * j + 3], point)
+
+
+@kernel
+def _blur_points(e, sensor, readings, points, distances):
+    """Add noise to the points that are seen."""
+    if sensor.noise > 0.0:
+        for j in range(distances.shape[0]):
+            if distances[j] < inf:
+                point = (points[3 * j], points[3 * j + 1], points[3 * j + 2])
+                put(points[3 * j : 3 * j + 3], add(point, scale(sensor.noise, normal_vector(e, readings))))
+
+
+@kernel
+def _measure_ranges(e, drone, yaw, obstacles, hulls, sensor, ranges):
+    """Write the lengths of the beams until they meet an obstacle, at most the range."""
+    for b in range(ranges.shape[0]):
+        ranges[b] = sensor.range
+    for m in range(obstacles.kind.shape[1]):
+        # Obstacles whose sphere is out of range, or above or below all beams, are met by none.
+        if obstacles.kind[e, m] == NONE:
+            continue
+        offset, radius = sub(vec(obstacles.position, e, m), drone), norm(vec(obstacles.size, e, m))
+        if norm(offset) - radius > sensor.range or abs(offset[2]) > radius:
+            continue
+        for b in range(ranges.shape[0]):
+            angle = yaw + 2.0 * pi * b / ranges.shape[0]
+            direction = (cos(angle), sin(angle), 0.0)
+            # Nor are those beams that pass the sphere, or point away from it.
+            along = offset[0] * direction[0] + offset[1] * direction[1]
+            across = offset[1] * direction[0] - offset[0] * direction[1]
+            if abs(across) <= radius and along >= -radius:
+                ranges[b] = min(ranges[b], ray_distance(e, m, drone, direction, obstacles, hulls))
+
+
+@kernel
+def _blur_ranges(e, sensor, readings, ranges):
+    """Add noise to the ranges of beams that have met something."""
+    if sensor.noise > 0.0:
+        for b in range(ranges.shape[0]):
+            if ranges[b] < sensor.range:
+                measured = ranges[b] + sensor.noise * normal_pair(e, readings)[0]
+                ranges[b] = min(max(measured, 0.0), sensor.range)
