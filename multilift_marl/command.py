@@ -75,11 +75,10 @@ def run_command(
     end_quiet_import()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     own = options.model_fields
-    texts = [key for key, field in own.items() if _is_text(field.annotation)]
     _open_streams()
     try:
         wanted = [argument for argument in arguments if argument not in ("-h", "--help")]
-        values = parse_overrides(wanted, texts)
+        values = parse_arguments(options, wanted)
         check_names(values, own)
         import_modules(values.get("import"))  # first of all: checkpoints, too, may need them
         with trusting(values.get("trust") is True):
@@ -111,6 +110,17 @@ def run_command(
             _give_up_output()
         place = "the output" if error.filename is None else str(error.filename)
         return _refuse(f"cannot read or write {place} ({reason(error)}); make room, or use another folder")
+
+
+def parse_arguments(options: type[CommandOptions], arguments: Iterable[str]) -> dict[str, Any]:
+    """Return the values by dotted name of arguments key=value, the reverse of `spell_arguments`.
+
+    Raises:
+        ConfigError: see `parse_overrides`.
+    """
+    return parse_overrides(
+        arguments, [key for key, field in options.model_fields.items() if _is_text(field.annotation)]
+    )
 
 
 def spell_command(name: str, *arguments: str) -> str:

@@ -43,7 +43,7 @@ class Draft:
         system = replace(drafted, cable_model="massless")
         self.num_envs, self.num_drones = 1, system.num_drones
         self.steps, self.seeds, self.episodes = np.zeros(1, int), np.zeros(1, int), np.zeros(1, int)
-        self.world: Any = _place(system)
+        self.world: Any = place_at_rest(system)
         position = self.world.state.payload_position
         goal = SimpleNamespace(position=position, rotation=np.eye(3)[None], yaw=np.zeros(1))
         self.task: Any = SimpleNamespace(
@@ -65,8 +65,8 @@ class Draft:
             site.size[:] = _MARK * edge
 
 
-def _place(system: System) -> SimpleNamespace:
-    """Return the team at rest, level, above the ground, with what is drawn of a `World`."""
+def place_at_rest(system: System) -> SimpleNamespace:
+    """Return the team at rest, level, above the ground, with what is drawn of a `World` of massless cables."""
     lowest = min(-system.payload_size.max(), system.anchors[:, 2].min(), system.slots[:, 2].min())
     position = np.array([0.0, 0.0, max(_HEIGHT, _CLEARANCE - lowest)])
     payload = position if system.payload_shape == "point" else [*position, 1.0, 0.0, 0.0, 0.0]

@@ -2,46 +2,45 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from typing import Annotated, Any
+from typing import Any
 
 from pydantic import Field
 
-from multilift_marl._interrupt import ending_at_once
+from multilift_marl._interrupt import Watch, ending_at_once, leave
 from multilift_marl.agents.policy import NamedPolicy, find_policy, load_policy
-from multilift_marl.command import CommandOptions, run_command, split_options
+from multilift_marl.command import run_command, split_options
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
+from multilift_marl.deploy.sitl.view import ViewOptions
 from multilift_marl.errors import ConfigError
 from multilift_marl.policies.baselines import SCRIPTED
-from multilift_marl.schema.values import Between, Int
+from multilift_marl.schema.values import Int
 from multilift_marl.viewer.draft import DraftSession
+from multilift_marl.viewer.live import LiveSession
 from multilift_marl.viewer.page import HOST, Page
 from multilift_marl.viewer.session import Session
 
 _USAGE = f"""Watch a team in the browser, at an address of this machine alone ({HOST}).
 
   python -m multilift_marl.view task=hover run=hover [key=value ...]
+  python -m multilift_marl.view live=true domain=7       # what others fly and publish on ROS 2 topics
 
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, cable.model=chain.
 A rig that is refused is shown at rest, what conflicts in red."""
 
+_NICE = 10  # of a live view: the flight on this machine goes first
 
-class Options(CommandOptions):
+
+class Options(ViewOptions):
     """Keys of the command beside those of the configuration."""
 
     task: str | None = Field(None, description="a configuration's name or path; None: the run's own, or hover")
-    config: str | None = Field(
-        None, description="a rig or other configuration for that task, see python train.py --help"
-    )
     run: str | None = Field(None, description='a run folder, "latest", or a shipped policy ("hover"); None: baselines')
-    policy: str | None = Field(
-        None, description="the first: run, a baseline, module:Class, .onnx, .pt; None: run, or formation"
-    )
     seed: Int = Field(1000, ge=0, lt=2**63, description="evaluation seed: the episodes are those of evaluate.py")
-    port: Annotated[Int, Between(0, 65535)] = Field(8080, description="of the address; 0 for any free one")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _view(values: dict[str, Any]) -> int:
     print("starting the viewer, which takes some seconds", flush=True)
+    if values.get("live") is True and hasattr(os, "nice"):
+        os.nice(_NICE)  # before there are threads, which have it from this one
     with ending_at_once():
         session, port = make_session(values)
         page = Page(session, port)
@@ -58,16 +59,20 @@ def _view(values: dict[str, Any]) -> int:
     if isinstance(session, DraftSession):
         print(f"error: {session.reason}", file=sys.stderr, flush=True)
     print(f"{'see what conflicts' if refused else 'watch'} at {page.address} (Ctrl-C ends it)", flush=True)
+    if isinstance(session, LiveSession):
+        with Watch(lambda number: leave(0)):  # nothing is lost, and a busy machine takes seconds to end page and DDS
+            page.run()
     with closing(page), suppress(KeyboardInterrupt):
         page.run()
     return 2 if refused else 0
 
 
-def make_session(values: dict[str, Any]) -> tuple[Session | DraftSession, int]:
+def make_session(values: dict[str, Any]) -> tuple[Session | LiveSession | DraftSession, int]:
     """Return the session and the port of key=value arguments; of a rig that is refused one that only shows it.
 
     Raises:
         ConfigError, CheckpointError: a wrong value, or there is no such task, run or policy.
+        FlightError: a flight cannot be heard, as DDS does not start.
     """
     options, overrides = split_options(Options, values)
     learned: dict[str, NamedPolicy] = {}
@@ -77,11 +82,23 @@ def make_session(values: dict[str, Any]) -> tuple[Session | DraftSession, int]:
     if policy is not None and policy not in ("run", *SCRIPTED):
         learned[policy] = find_policy(policy, others=learned)
     config = _find_config(options, learned, {**overrides, "env.num_envs": 1, "env.num_threads": 1})
+    if options.live:
+        return _listen(options, config), options.port
     try:
         _ = config.system
     except ConfigError:
         return DraftSession(config), options.port
     return Session(config, learned, policy, options.seed), options.port
+
+
+def _listen(options: Options, config: Config) -> LiveSession:
+    """Return a session that shows what is heard."""
+    from multilift_marl.deploy.ros.bag import DISTRIBUTIONS
+    from multilift_marl.deploy.ros.dds import Node, describe_reach
+
+    node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
+    print(f"listening {describe_reach(options.domain, options.allow_network, options.ros)}", flush=True)
+    return LiveSession(config, node, options.names)
 
 
 def _find_config(options: Options, learned: dict[str, NamedPolicy], overrides: dict[str, Any]) -> Config:

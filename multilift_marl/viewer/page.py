@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import socket
 import time
 from typing import Any
@@ -16,6 +17,7 @@ from multilift_marl.rendering import Stage
 from multilift_marl.viewer.draft import DraftSession
 from multilift_marl.viewer.guard import Guard, guarded_servers
 from multilift_marl.viewer.inputs import filter_inputs
+from multilift_marl.viewer.live import LiveSession
 from multilift_marl.viewer.session import Session
 
 HOST = "127.0.0.1"
@@ -32,7 +34,7 @@ class Page:
     """Serves a session on 127.0.0.1, to those who have its address.
 
     Args:
-        session: the simulation to watch, or a rig that is refused, which has no controls.
+        session: the simulation to watch, a flight elsewhere, or a rig that is refused, which has no controls.
         port: on which; 0 for any free one.
 
     Attributes:
@@ -44,7 +46,7 @@ class Page:
         RenderingError: viser is not installed, or the port is taken.
     """
 
-    def __init__(self, session: Session | DraftSession, port: int = 8080):
+    def __init__(self, session: Session | LiveSession | DraftSession, port: int = 8080):
         try:
             import trimesh
             import viser
@@ -55,6 +57,8 @@ class Page:
         self._stage = Stage(session.vec, trail=_TRAIL)
         _check_port(port)
         guard = Guard()
+        # Browsers open connections that they do not use, each of which would be a traceback.
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         with contextlib.redirect_stdout(io.StringIO()), guarded_servers(guard):  # stdout: viser's own greeting
             self._server = viser.ViserServer(HOST, port, label="multilift_marl", verbose=False)
         filter_inputs(self._server)
@@ -132,6 +136,9 @@ class Page:
         made: dict[str, Any] = {"status": gui.add_markdown(session.status())}
         if isinstance(session, DraftSession):
             return made
+        if isinstance(session, LiveSession):
+            made["follow"] = self._add_follow()
+            return made
         weight = session.vec.world.system.payload_mass * 9.81
         made["pause"] = gui.add_button("Pause")
         made["step"] = gui.add_button("One step")
@@ -139,7 +146,7 @@ class Page:
         made["next"] = gui.add_button("Next episode")
         made["speed"] = gui.add_dropdown("Speed", SPEEDS, initial_value="1")
         made["policy"] = gui.add_dropdown("Policy", session.policies, initial_value=session.policy)
-        made["follow"] = gui.add_checkbox("Follow the payload", initial_value=True)
+        made["follow"] = self._add_follow()
         with gui.add_folder("Push on the payload"):
             made["heading"] = gui.add_slider("Heading [°]", -180, 180, 5, 0)
             made["elevation"] = gui.add_slider("Elevation [°]", -90, 90, 5, 0)
@@ -150,14 +157,22 @@ class Page:
         for name in ("pause", "step", "reset", "next", "push"):
             # `name=name` keeps each button's own; a name looked up later would be the loop's last for all.
             made[name].on_click(lambda _, name=name: self.press(name))
-        for name in ("speed", "policy", "follow"):
+        for name in ("speed", "policy"):
             made[name].on_update(lambda _, name=name: self.press(name))
         return made
+
+    def _add_follow(self) -> Any:
+        box = self._server.gui.add_checkbox("Follow the payload", initial_value=True)
+        box.on_update(lambda _: self.press("follow"))
+        return box
 
     def press(self, name: str) -> None:
         """Execute the control `name` with the present values of the fields."""
         session = self._session
-        assert isinstance(session, Session)  # a draft has no controls
+        if name == "follow":
+            self._follow = self._value("follow")
+            return
+        assert isinstance(session, Session)  # others have no more controls
         if name == "pause":
             session.paused = not session.paused
             self.controls["pause"].label = "Go on" if session.paused else "Pause"
@@ -171,10 +186,8 @@ class Page:
             session.push(self._value("heading"), self._value("elevation"), self._value("force"))
         elif name == "speed":
             session.speed = float(self._value("speed"))
-        elif name == "policy":
-            session.choose(self._value("policy"))
         else:
-            self._follow = self._value("follow")
+            session.choose(self._value("policy"))
 
     def _value(self, field: str) -> Any:
         return self.controls[field].value

@@ -10,9 +10,11 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from conftest import EXAMPLES
+from page_peer import PagePeer
 
 from multilift_marl.config.load import parse_overrides
 from multilift_marl.schema.yaml_text import parse_yaml, write_yaml
@@ -66,6 +68,28 @@ def test_a_simulation_takes_the_place_of_the_flight(tmp_path):
     assert found["pilot"]["seed"] == 6 and "names" not in found["pilot"]
 
 
+@pytest.mark.parametrize("first", [{"flight": {"parameters": {"MPC_XY_P": 1.2}}}, {"simulation": {"speed": 2.0}}])
+def test_a_view_shows_the_rig_of_the_flight_on_its_topics(first, tmp_path):
+    kind = next(iter(first))
+    nodes = {"tick": {"role": "clock"}}
+    common = {"domain": 7, "config": "track", "env": {"num_drones": 3}, "ros": "humble"}
+    found = commands_of(tmp_path, first | {"nodes": nodes, "common": common, "view": {"port": 8012}})
+    assert list(found) == [kind, "tick", "view"]
+    rig = {"config": "track", "env.num_drones": 3}
+    assert found["view"] == {
+        "": "multilift_marl.view", "live": True, "names": "report", "ros": "humble", "domain": 7, "port": 8012, **rig
+    }  # fmt: skip
+    own = {"view": {"port": 0, "domain": 8, "env": {"num_drones": 2}}}
+    found = commands_of(tmp_path, FLOWN | own)["view"]
+    assert found == {"": "multilift_marl.view", "live": True, "port": 0} | TEAM | {"domain": 8, "env.num_drones": 2}
+
+
+def test_a_view_has_the_rig_of_a_trained_policy(tmp_path):
+    for policy, handed in (("hover", {"policy": "hover"}), ("formation", {})):
+        found = commands_of(tmp_path, {"simulation": {"policy": policy, "config": None}, "view": {}})["view"]
+        assert found == {"": "multilift_marl.view", "live": True, **handed}
+
+
 def test_the_example_is_that_of_the_help_and_can_be_started(tmp_path, capsys):
     text = (EXAMPLES / "sitl.yaml").read_text()
     found = commands_of(tmp_path, parse_yaml(text))
@@ -89,7 +113,10 @@ def test_the_example_is_that_of_the_help_and_can_be_started(tmp_path, capsys):
         (FLOWN, ["nodes.pilot.role=pilot"], "nodes.pilot: role must be .*'policy'"),
         (FLOWN, ["nodes.other={}"], "nodes.other needs a role"),
         (FLOWN, ["nodes.flight.role=clock"], "nodes.flight has the name of another process"),
+        (FLOWN, ["nodes.view.role=clock"], "nodes.view has the name of another process"),
         (FLOWN, ["nodes.A.role=clock"], "nodes.A"),
+        (FLOWN, ["view.prot=0"], "view: unknown key 'prot'; did you mean 'port'"),
+        (FLOWN, ["view.port=70000"], "view: port must be from 0 to 65535"),
         (FLOWN, ["simulation.domain=300"], "simulation: domain must be from 0 to 232"),
         (FLOWN, ["bag=flight"], "bag is of a flight"),
         (FLOWN, ["nodes=3"], "nodes .*must be a section"),
@@ -122,6 +149,7 @@ def test_a_file_that_is_none_is_named(text, words, tmp_path, capsys, monkeypatch
         {"common": {"trust": True}},
         {"nodes": {"pilot": {"role": "policy", "policy": "theirs:Policy"}}},
         {"simulation": {"train": {"residual": "theirs:Policy"}}},
+        {"view": {"policy": "theirs:Policy"}},
         {"simulation": None, "flight": {"px4": "/theirs"}},
     ],
 )
@@ -218,6 +246,22 @@ def test_a_simulation_is_flown_and_all_ends_with_it(tmp_path):
     rows = re.findall(r"^(\w+) +([\d.]+) +([\d.]+)  status 0$", output, re.M)
     assert [row[0] for row in rows] == ["simulation", "pilot"]
     assert all(6.0 < float(row[1]) < 100.0 and 0.5 < float(row[2]) < 50.0 for row in rows)
+
+
+@pytest.mark.slow
+def test_a_view_is_served_while_the_simulation_flies_and_ends_with_it(tmp_path):
+    pytest.importorskip("viser")
+    process = start(tmp_path, "simulation.seconds=12", "view.port=0")
+    address = next(line for line in process.stdout if "| watch at http" in line).split()[4]
+    peer = PagePeer(address)
+    before = peer.until(lambda: "tension" in peer.text()) and peer.positions()
+    assert peer.until(lambda: before.shape != peer.positions().shape or np.ptp([before, peer.positions()]) > 1e-3)
+    assert "heard" not in peer.text() and "live flight" in peer.text()
+    peer.close()
+    output = process.communicate(timeout=120)[0]
+    assert process.returncode == 0 and re.search(r"^view .* status 0$", output, re.M), output
+    with pytest.raises(OSError):
+        PagePeer(address)
 
 
 @pytest.mark.slow

@@ -85,6 +85,12 @@ class Bodies:
         position, velocity = (np.concatenate([drones, payload[None]]) for drones, payload in parts)
         return position, velocity
 
+    def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return position (3,) [m] and rotation (3, 3) of a body."""
+        if body < len(self.stamps) - 1:
+            return self.measured["drone_position"][body], self.measured["drone_rotation"][body]
+        return self.measured["payload_position"], self.measured["payload_rotation"]
+
     def missing(self, now: float, age: float) -> list[str]:
         """Return, in words, the bodies of which nothing has been heard for longer than `age` [s]."""
         last = len(self.stamps) - 1

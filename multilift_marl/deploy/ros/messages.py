@@ -37,7 +37,7 @@ from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.sim.state import SystemState
 
 ODOMETRY, POSE, BOOL = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "std_msgs/msg/Bool"
-PATH, INT64 = "nav_msgs/msg/Path", "std_msgs/msg/Int64"
+PATH, INT64, CABLES = "nav_msgs/msg/Path", "std_msgs/msg/Int64", "sensor_msgs/msg/JointState"
 ACTION, INT32 = "std_msgs/msg/Float32MultiArray", "std_msgs/msg/Int32"
 SYNC_EVERY = 0.05  # [s] of the report's clock
 _COVARIANCE = np.diag(np.full(6, EXACT)).ravel()
@@ -159,7 +159,7 @@ class FlightMessages:
             Topic("/target", POSE),
             Topic("/tf", "tf2_msgs/msg/TFMessage"),
             *(Topic(f"/{frame}/reference", POSE) for frame in self.frames),
-            Topic("/cables", "sensor_msgs/msg/JointState"),
+            Topic("/cables", CABLES),
             Topic("/markers", MARKERS),
             Topic("/scene", MARKERS, latched=True),
             *(Topic(f"/{frame}/action", ACTION) for frame in self.frames if self._acts),
@@ -274,6 +274,4 @@ class FlightMessages:
         ends = [self._vec.world.cable_points(0, n) for n in range(len(tension))]
         span = np.array([np.linalg.norm(points[-1] - points[0]) for points in ends])
         names = [f"cable_{n}" for n in range(len(tension))]
-        return self._new(
-            "sensor_msgs/msg/JointState", header=header, name=names, position=span, velocity=np.zeros(0), effort=tension
-        )
+        return self._new(CABLES, header=header, name=names, position=span, velocity=np.zeros(0), effort=tension)

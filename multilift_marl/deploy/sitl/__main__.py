@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from multilift_marl._interrupt import interrupted_by_signals
-from multilift_marl.command import make_folder, run_command
-from multilift_marl.deploy.sitl.pipeline import Options, list_commands, read_options
+from multilift_marl.command import run_command
+from multilift_marl.deploy.sitl.pipeline import Options, prepare_commands
 from multilift_marl.errors import ConfigError
 
 EXAMPLE = """\
@@ -23,6 +21,7 @@ nodes:                       # keys of python -m multilift_marl.ros; names are f
   planner: {role: trajectory_planner, config: track_circle, receiver: geometric_control}
   control: {role: geometric_control, config: track_circle, patience: 0.2}
   clock: {role: clock, patience: 60}
+# view: {port: 8012}         # in the browser
 common: {domain: 7, env.num_drones: 4}
 """
 _USAGE = f"""Start a flight of PX4s, or a simulation, and the nodes that fly it; end all when it has ended.
@@ -45,10 +44,7 @@ def _run(values: dict[str, Any]) -> int:
         raise ConfigError("pipelines run on Linux and macOS alone; use one of them, or WSL on Windows")
     from multilift_marl.deploy.sitl.running import Pipeline
 
-    options = read_options(values)
-    out = Path(options.out or f"runs/sitl-{time.strftime('%Y%m%d-%H%M%S')}").expanduser()
-    commands = list_commands(options, out)
-    make_folder(out)
+    commands, out = prepare_commands(values)
     with interrupted_by_signals():
         pipeline = Pipeline(commands, out)
         try:

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from multilift_marl.command import CommandOptions, spell_arguments, split_options
+from multilift_marl.command import CommandOptions, make_folder, spell_arguments, split_options
 from multilift_marl.config.load import check_names, load_config
 from multilift_marl.deploy.px4.__main__ import Options as FlightOptions
 from multilift_marl.deploy.ros.__main__ import USUAL
 from multilift_marl.deploy.ros.__main__ import Options as NodeOptions
+from multilift_marl.deploy.sitl.view import ViewOptions, of_flight
 from multilift_marl.errors import ConfigError, reason, shorten
 from multilift_marl.policies.baselines import SCRIPTED
 from multilift_marl.schema.files import as_mapping
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.yaml_text import read_yaml
+from multilift_marl.trust import trusting
 
 Keys = dict[str, Any]
 _RUN_CODE = {"import", "trust", "px4", "residual", "base_policy", "ray"}
@@ -39,9 +42,28 @@ class Options(CommandOptions):
     nodes: dict[Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,30}$")], Keys] = Field(
         {}, description="keys of multilift_marl.ros, of each a role; seed and domain as above unless they say otherwise"
     )
+    view: Keys | None = Field(
+        None, description="show it in the browser: keys of multilift_marl.view, such as port; the rig is the flight's"
+    )
     common: Keys = Field({}, description="keys of all processes, where they do not say otherwise")
     bag: str | None = Field(None, description="folder of a ROS 2 bag of the flight")
     out: str | None = Field(None, description="folder for a log of each process; None: runs/sitl-...")
+
+
+def prepare_commands(values: Mapping[str, Any]) -> tuple[dict[str, list[str]], Path]:
+    """Return the command of each process by its name, see `list_commands`, and the folder for logs, which is made.
+
+    Args:
+        values: arguments by dotted name, as `read_options` takes them.
+
+    Raises:
+        ConfigError: see `read_options` and `list_commands`, or the folder cannot be written to.
+    """
+    options = read_options(values)
+    out = Path(options.out or f"runs/sitl-{time.strftime('%Y%m%d-%H%M%S')}").expanduser()
+    with trusting(options.trust):
+        commands = list_commands(options, out)
+    return commands, make_folder(out)
 
 
 def read_options(values: Mapping[str, Any]) -> Options:
@@ -68,7 +90,7 @@ def read_options(values: Mapping[str, Any]) -> Options:
 
 
 def list_commands(options: Options, out: Path) -> dict[str, list[str]]:
-    """Return the command of each process by its name, that of the flight or simulation first.
+    """Return the command of each process by its name, that of the flight or simulation first, of the view last.
 
     Args:
         options: of the pipeline.
@@ -81,29 +103,37 @@ def list_commands(options: Options, out: Path) -> dict[str, list[str]]:
         raise ConfigError("give either flight or simulation, the team that nodes fly, in file=<YAML file>; see --help")
     common: Keys = {"trust": True} if options.trust else {}
     common |= options.common
-    if options.flight is not None:
-        kind = "flight"
-        usual = {"policy": "none", "live": True, "names": "report", "out": str(out / "flight"), "bag": options.bag}
-        first = _merge(FlightOptions, usual, common, options.flight)
-        commands = {kind: _command(kind, "px4", FlightOptions, first)}
+    usual = _usual(options, out)
+    if options.flight is None:
+        own: type[CommandOptions] = NodeOptions
+        first = _merge(own, usual, common, options.simulation or {})
+        commands = {"simulation": _command("simulation", "ros", own, first)}
     else:
-        if options.bag is not None:
-            raise ConfigError("bag is of a flight, and a simulation writes none; leave it out")
-        kind = "simulation"
-        usual = {"policy": "none"}
-        if any(values.get("role", "policy") != "policy" for values in options.nodes.values()):
-            usual["names"] = "report"  # of all roles but that
-        first = _merge(NodeOptions, usual, common, options.simulation or {})
-        commands = {kind: _command(kind, "ros", NodeOptions, first)}
+        own, first = FlightOptions, _merge(FlightOptions, usual, common, options.flight)
+        commands = {"flight": _command("flight", "px4", own, first)}
     shared = {key: first[key] for key in _SHARED if key in first}
     for name, values in options.nodes.items():
-        if name in ("flight", "simulation"):
+        if name in ("flight", "simulation", "view"):
             raise ConfigError(f"nodes.{name} has the name of another process; give it another one")
         if values.get("role", "simulation") == "simulation":
             raise ConfigError(f"nodes.{name} needs a role, such as policy; a simulation is a section of its own")
         merged = _merge(NodeOptions, common, shared, values)
         commands[name] = _command(f"nodes.{name}", "ros", NodeOptions, merged)
+    if options.view is not None:
+        merged = _merge(ViewOptions, of_flight(first, own.model_fields), options.view, {"live": True})
+        commands["view"] = _command("view", "view", ViewOptions, merged)
     return commands
+
+
+def _usual(options: Options, out: Path) -> Keys:
+    """Return values of the flight or simulation that its section need not give."""
+    if options.flight is not None:
+        return {"policy": "none", "live": True, "names": "report", "out": str(out / "flight"), "bag": options.bag}
+    if options.bag is not None:
+        raise ConfigError("bag is of a flight, and a simulation writes none; leave it out")
+    if any(values.get("role", "policy") != "policy" for values in options.nodes.values()):
+        return {"policy": "none", "names": "report"}  # those of all roles but that
+    return {"policy": "none"}
 
 
 def _command(name: str, module: str, options: type[CommandOptions], values: Keys) -> list[str]:
