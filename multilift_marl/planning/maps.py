@@ -26,8 +26,9 @@ LEVEL = 1.4  # height of start and goal, at least
 CEILING = 2.6  # of the payload
 PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # how many; least gaps between them
 RADIUS = 0.12, 0.32  # of pillars
-GAPS = 0.5, 0.8  # widths of the gaps of a narrow map over the resting formation's
-WALLS = 3
+GAPS = 0.5, 0.8  # range of the widths of a narrow map's gaps over the resting formation's
+WALLS = 3  # of a narrow map
+MAX_WALLS = CAPACITY // 2
 _DRAWS = 4000
 
 
@@ -56,7 +57,8 @@ class Map(NamedTuple):
 def formation_width(system: System) -> float:
     """Return the greatest horizontal extent of the resting formation along x or y, drones included [m]."""
     half = np.array([vehicle.half_size for vehicle in system.vehicles])[:, :2]
-    ends = np.vstack([system.slots[:, :2] + half, system.slots[:, :2] - half, system.payload_size[:2] / 2])
+    payload = system.payload_size[:2] / 2
+    ends = np.vstack([system.slots[:, :2] + half, system.slots[:, :2] - half, payload, -payload])
     return float((ends.max(axis=0) - ends.min(axis=0)).max())
 
 
@@ -65,8 +67,8 @@ def unit_length(system: System) -> float:
     return formation_width(system) / FALCONS
 
 
-def draw_map(level: str, seed: int, system: System) -> Map:
-    """Return the map of a level that belongs to a seed."""
+def draw_map(level: str, seed: int, system: System, gaps: tuple[float, float] = GAPS, walls: int = WALLS) -> Map:
+    """Return the map of a level that belongs to a seed; a narrow one has `walls` with `gaps`."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(LEVELS.index(level),)))
     unit = unit_length(system)
     height = max(LEVEL * unit, float(system.payload_size[2]) + 0.5)
@@ -74,7 +76,11 @@ def draw_map(level: str, seed: int, system: System) -> Map:
     goal = np.array([LENGTH / 2 * unit, rng.uniform(-0.8, 0.8) * unit, height])
     low = np.array([-(LENGTH / 2 + 1.0) * unit, -WIDTH * unit, 0.6 * height])
     high = np.array([(LENGTH / 2 + 1.0) * unit, WIDTH * unit, max(CEILING * unit, height + 0.5)])
-    placed = _walls(rng, unit, system) if level == "narrow" else _pillars(rng, unit, *PILLARS[level])
+    placed = (
+        _walls(rng, unit, formation_width(system), gaps, walls)
+        if level == "narrow"
+        else _pillars(rng, unit, *PILLARS[level])
+    )
     return Map(start, goal, low, high, tuple(placed))
 
 
@@ -109,14 +115,16 @@ def _pillars(rng: np.random.Generator, unit: float, count: int, apart: float) ->
     return placed
 
 
-def _walls(rng: np.random.Generator, unit: float, system: System) -> list[Obstacle]:
-    """Draw walls across the way, each with a gap that is narrower than the resting formation."""
+def _walls(
+    rng: np.random.Generator, unit: float, width: float, gaps: tuple[float, float], walls: int
+) -> list[Obstacle]:
+    """Draw walls across the way, each with a gap of a width between `gaps` over the formation's `width` [m]."""
     placed = []
     thick, end, top = 0.1 * unit, (WIDTH + 1.5) * unit, TALL * unit / 2
     middle = rng.uniform(-0.3, 0.3) * unit
-    for wall in range(WALLS):
-        x = (wall - (WALLS - 1) / 2) * 2.2 * unit + rng.uniform(-0.2, 0.2) * unit
-        half = 0.5 * rng.uniform(*GAPS) * formation_width(system)
+    for wall in range(walls):
+        x = (wall - (walls - 1) / 2) * min(2.2, 2 * FIELD / max(walls, 1)) * unit + rng.uniform(-0.2, 0.2) * unit
+        half = 0.5 * rng.uniform(*gaps) * width
         middle = float(np.clip(middle + rng.uniform(-1.4, 1.4) * unit, -2.0 * unit, 2.0 * unit))
         lean = rng.uniform(-0.15, 0.15)  # of the wall from the perpendicular [rad]
         for side in (-1.0, 1.0):

@@ -1,7 +1,8 @@
 """Model-predictive control along a route among obstacles, `policy=mpc_route`: a search over pose and formation shape.
 
 At the start of an episode a route is searched on the map (`navigation/planner.py`); the team's plans follow it. Where
-obstacles are known only from near, it is searched anew, from the motion under way, whenever one comes into sight.
+`env.obstacle_sensing` is local or ranges, an obstacle is known, as a whole, once it has been within its range of a
+drone or the payload, and the route is searched anew from the motion under way.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ from multilift_marl.tasks.navigate import Navigate
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
-SIGHT = 2.5  # [m] from a drone or the payload, within which obstacles of level `unknown` are seen
 INSIDE = 0.1  # [m] that routes keep from the bounds of the map, beyond which the payload is out of range
 AHEAD = 0.1  # [s] that a route which goes on begins later, as a search takes time
 RETRY = 0.2  # [s] after a search that found no way on
@@ -54,6 +54,8 @@ class RouteMpc(TeamMpc):
         self._seen = np.zeros(self.known.kind.shape, bool)
         self._due = np.zeros(e)
         self._new = np.ones(e, bool)
+        env = vec.config.env
+        self._range = env.obstacles.range if env.obstacle_sensing in ("local", "ranges") else np.inf
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """See `TeamMpc.reset`."""
@@ -69,9 +71,13 @@ class RouteMpc(TeamMpc):
         return super().act(observation)
 
     def metrics(self) -> dict[str, np.ndarray]:
-        """Return those of `TeamMpc`, and how long searches took (E,) [s], NaN where there was no later one."""
-        later = np.where(self.searches > 1, self.search_time[:, 1], np.nan)
-        return super().metrics() | {"route_search_s": self.search_time[:, 0].copy(), "route_replan_s": later}
+        """Return those of `TeamMpc`, how many searches there were (E,), and what they took, see `search_time` [s]."""
+        first, later = self.search_time.T.copy()
+        return super().metrics() | {
+            "searches": self.searches.copy(),
+            "search_s": first,
+            "longest_later_search_s": later,
+        }
 
     def _see(self, e: int) -> None:
         """Search a route where the episode is new, or an obstacle that was not known is in sight."""
@@ -100,12 +106,12 @@ class RouteMpc(TeamMpc):
         """Return which obstacles (M,) are known: all, or those that are or were near a drone or the payload."""
         obstacles, state = self._vec.world.obstacles, self._vec.world.state
         there: np.ndarray = obstacles.kind[e] != NONE
-        if self._task.options.level != "unknown":
+        if self._range == np.inf:
             return there
         points = [state.payload_position[e], *state.drone_position[e]]
         seen = self._seen[e].copy()
         for m in np.flatnonzero(there & ~seen).tolist():
-            seen[m] = min(box_distance(e, m, tuple(point), obstacles) for point in points) <= SIGHT
+            seen[m] = min(box_distance(e, m, tuple(point), obstacles) for point in points) <= self._range
         return seen
 
     def _search(self, e: int, departure: np.ndarray | None, begin: float) -> None:

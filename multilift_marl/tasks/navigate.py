@@ -28,8 +28,8 @@ from multilift_marl.mdp.rewards import (
     update_peak_tension,
     velocity,
 )
-from multilift_marl.planning.maps import CAPACITY, Map, draw_map, place_map
-from multilift_marl.schema.values import Between, Float, Int, Section
+from multilift_marl.planning.maps import CAPACITY, GAPS, MAX_WALLS, WALLS, draw_map, place_map
+from multilift_marl.schema.values import Between, Float, Int, Section, Span
 from multilift_marl.tasks.base import Kernels, Task
 
 SPARE = 0.10  # [m] of clearance that the reward asks for
@@ -40,6 +40,10 @@ class NavigateOptions(Section):
     """The map, the target's motion along the straight line, and what counts as success."""
 
     level: Literal["sparse", "dense", "narrow", "unknown"] = Field("sparse", description="of the maps")
+    gaps: Span = Field(
+        GAPS, description="[-] widths of the gaps of level narrow over the resting formation's, or their range"
+    )
+    walls: Int = Field(WALLS, ge=1, le=MAX_WALLS, description="of level narrow")
     map: Int | None = Field(None, ge=0, lt=2**31, description="seed of the one map; None: drawn for each episode")
     speed: Annotated[Float, Between(0.01, 100, "m/s")] = Field(1.0, description="[m/s] peak speed of the target")
     start_radius: Float = Field(0.05, ge=0, description="[m] start within a ball of this radius about the map's")
@@ -182,7 +186,7 @@ class Navigate(Task):
         option, e, scenery = self.options, self.world.num_envs, self.world.system.scenery
         if scenery.reserved < CAPACITY:
             raise ConfigError(f"task navigate places up to {CAPACITY} obstacles; set scene.reserved={CAPACITY} or more")
-        self._first, self._maps = len(scenery.obstacles), dict[int, Map]()
+        self._first = len(scenery.obstacles)
         start, goal, low, high = (np.zeros((e, 3)) for _ in range(4))
         self.own = NavigateArrays(np.zeros(e, np.int64), start, goal, low, high, np.zeros(e))
         self.settings = NavigateSettings(option.speed, option.start_radius, RestBounds.of(option))
@@ -191,7 +195,7 @@ class Navigate(Task):
         """Draw the map, and where the team starts; see `Task.start`."""
         option, own = self.options, self.own
         seed = int(rng.integers(2**31)) if option.map is None else option.map
-        drawn = draw_map(option.level, seed, self.world.system)
+        drawn = draw_map(option.level, seed, self.world.system, option.gaps, option.walls)
         place_map(env, drawn, self.world.obstacles, self._first)
         own.map[env], own.start[env], own.goal[env] = seed, drawn.start, drawn.goal
         own.low[env], own.high[env], own.peak_tension[env] = drawn.low, drawn.high, 0.0
