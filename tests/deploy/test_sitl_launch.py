@@ -91,7 +91,7 @@ def test_without_a_folder_px4_is_that_of_the_environment(description, tmp_path):
 
 def launch(tmp_path, arguments: str) -> subprocess.Popen:
     """Run the example by launch, in a group of its own."""
-    pytest.importorskip("launch.launch_service", reason="ROS 2's launch is not installed: it is in no registry of pip")
+    pytest.importorskip("launch.launch_service", reason="ROS 2's launch is not installed; it comes with ROS 2 alone")
     file = tmp_path / "sitl.yaml"
     file.write_text(write_yaml(FLOWN))
     given = json.dumps({"file": str(file), "arguments": f"out={tmp_path / 'out'} {arguments}"})

@@ -25,10 +25,10 @@ class ViewOptions(CommandOptions):
     live: bool = Field(
         False, description="whether a flight on ROS 2 topics is shown, of that configuration or a policy's"
     )
-    names: Literal["multilift", "report", "crazyswarm2"] = Field("multilift", description="of its topics")
-    ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="its distribution")
-    domain: Annotated[Int, Between(0, 232)] = Field(0, description="its ROS_DOMAIN_ID")
-    allow_network: bool = Field(False, description="whether it may fly on another machine, found by multicast")
+    names: Literal["multilift", "report", "crazyswarm2"] = Field("multilift", description="of a live flight's topics")
+    ros: Literal["humble", "jazzy", "kilted", "lyrical"] = Field("jazzy", description="of a live flight: distribution")
+    domain: Annotated[Int, Between(0, 232)] = Field(0, description="of a live flight: ROS_DOMAIN_ID")
+    allow_network: bool = Field(False, description="whether a live flight may be heard of other machines, by multicast")
 
 
 def of_flight(values: Mapping[str, Any], options: Collection[str]) -> dict[str, Any]:
