@@ -19,7 +19,7 @@ import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.kernels.jit import kernel, prebind
-from multilift_marl.math3d import add, heading, mat, norm, put, scale, sub, turn, vec
+from multilift_marl.math3d import add, heading, mat, norm, put, row, scale, sub, turn, vec
 from multilift_marl.mdp.observations import NO_OBSTACLE, count_readings
 from multilift_marl.rig.resolve import whole_ratio
 from multilift_marl.rng import normal_pair, normal_vector
@@ -31,6 +31,8 @@ from multilift_marl.sim.world import World
 class ObstacleSensor(NamedTuple):
     """Constants of the sensor."""
 
+    beams: np.ndarray
+    """(B, 3) their directions in the heading frame."""
     points: int
     """k; 0 of a ring of beams."""
     range: float
@@ -78,12 +80,14 @@ class ObstacleSensing:
     def __init__(self, config: Config, world: World):
         mode, given, rate = config.env.obstacle_sensing, config.env.obstacles, config.env.policy_hz
         period = 1 if given.rate is None else whole_ratio(rate, given.rate, "env.obstacles.rate", "env.policy_hz")
+        azimuth = 2 * pi * np.arange(given.beams) / given.beams
+        beams = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(given.beams)], axis=1)
         if mode == "map":
-            sensor = ObstacleSensor(given.points, NO_OBSTACLE, pi, 0.0, 1, 0)
+            sensor = ObstacleSensor(beams, given.points, NO_OBSTACLE, pi, 0.0, 1, 0)
         else:
             points = given.points if mode == "local" else 0
             half_view = radians(given.field_of_view) / 2
-            sensor = ObstacleSensor(points, given.range, half_view, given.noise, period, given.delay)
+            sensor = ObstacleSensor(beams, points, given.range, half_view, given.noise, period, given.delay)
         e, n = world.num_envs, world.num_drones
         shape = e, n, count_readings(config.env)
         held = np.zeros((e, sensor.delay + 1, *shape[1:]))
@@ -189,6 +193,7 @@ def _measure_ranges(e, drone, yaw, obstacles, hulls, sensor, ranges):
     """Write the lengths of the beams until they meet an obstacle, at most the range."""
     for b in range(ranges.shape[0]):
         ranges[b] = sensor.range
+    c, s = cos(yaw), sin(yaw)
     for m in range(obstacles.kind.shape[1]):
         # Obstacles whose sphere is out of range, or above or below all beams, are met by none.
         if obstacles.kind[e, m] == NONE:
@@ -197,8 +202,7 @@ def _measure_ranges(e, drone, yaw, obstacles, hulls, sensor, ranges):
         if norm(offset) - radius > sensor.range or abs(offset[2]) > radius:
             continue
         for b in range(ranges.shape[0]):
-            angle = yaw + 2.0 * pi * b / ranges.shape[0]
-            direction = (cos(angle), sin(angle), 0.0)
+            direction = turn(c, s, row(sensor.beams, b))
             # Nor are those beams that pass the sphere, or point away from it.
             along = offset[0] * direction[0] + offset[1] * direction[1]
             across = offset[1] * direction[0] - offset[0] * direction[1]
