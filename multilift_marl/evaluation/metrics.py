@@ -37,6 +37,9 @@ _ROWS = (  # metric, heading, factor, digits
     ("cable_tension_max_n", "largest tension [N]", 1, 2),
     ("slack_time_s", "slack [s]", 1, 2),
     ("min_separation_m", "least separation [m]", 1, 2),
+    ("min_clearance_m", "least clearance [m]", 1, 3),
+    ("arrival_time_s", "arrival [s]", 1, 2),
+    ("path_length_ratio", "way over straight line [-]", 1, 3),
     ("energy_j", "rotor energy [J]", 1, 0),
     ("action_rate", "action rate [rms/step]", 1, 4),
 )

@@ -124,7 +124,11 @@ def measure_episodes(
     result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
     previous = np.zeros((e, vec.num_drones, vec.action_size))
     meter = ShortfallMeter(vec)
-    own: Callable[[], dict[str, np.ndarray]] = getattr(policy, "metrics", dict)
+    of_policy: Callable[[], dict[str, np.ndarray]] = getattr(policy, "metrics", dict)
+
+    def own() -> dict[str, np.ndarray]:
+        return vec.task.metrics() | of_policy()
+
     result |= {name: np.zeros(e) for name in own()}
     for step in range(vec.max_steps):
         action = policy.act(observation)

@@ -71,7 +71,7 @@ class RouteMpc(TeamMpc):
         return super().act(observation)
 
     def metrics(self) -> dict[str, np.ndarray]:
-        """Return those of `TeamMpc`, how many searches there were (E,), and what they took, see `search_time` [s]."""
+        """Return those of `TeamMpc`, and searches so far and what they took (E,), see `search_time` [s]."""
         first, later = self.search_time.T.copy()
         return super().metrics() | {
             "searches": self.searches.copy(),

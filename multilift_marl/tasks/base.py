@@ -265,6 +265,10 @@ class Task:
         length = self.config.env.episode_seconds
         return ((length - min(getattr(self.options, "success_seconds", 0.0), length), length),)
 
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Return numbers (E,) of the episodes so far by name, which evaluation reports beside those of all tasks."""
+        return {"min_clearance_m": self.min_clearance.copy()} if self.world.system.scenery.count else {}
+
     def place_goal(self, env: int, position: ArrayLike, rotation: ArrayLike | None = None) -> None:
         """Put the target of one environment elsewhere, the formation with it, at a start or in flight.
 

@@ -70,6 +70,10 @@ class NavigateArrays(NamedTuple):
     """(E, 3) of the space that the payload may use [m]."""
     high: np.ndarray
     """(E, 3)."""
+    place: np.ndarray
+    """(E, 3) of the payload at the last policy step [m]."""
+    travelled: np.ndarray
+    """(E,) length of its way [m]."""
     peak_tension: np.ndarray
     """(E,) largest tension in the episode over that at rest [-]."""
 
@@ -120,11 +124,13 @@ def has_arrived(e, v):
 
 
 @inlined
-def find_outside(e, v):
-    """Count a payload that leaves the map as a failure."""
+def measure_way(e, v):
+    """Add to the length of the payload's way; count leaving the map as a failure."""
+    here = row(v.state.payload_position, e)
+    v.own.travelled[e] += norm(sub(here, row(v.own.place, e)))
+    put(v.own.place[e], here)
     for i in range(3):
-        place = v.state.payload_position[e, i]
-        if v.cause[e] == 0 and not v.own.low[e, i] <= place <= v.own.high[e, i]:
+        if v.cause[e] == 0 and not v.own.low[e, i] <= here[i] <= v.own.high[e, i]:
             v.cause[e] = RANGE
 
 
@@ -170,7 +176,7 @@ class Navigate(Task):
         "failure": Term(-20.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
-    KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, check=find_outside)
+    KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, check=measure_way)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("to_goal", 3, "slot", "m", "goal minus the target's present place", to_goal),
         Component("target_velocity", 3, "slot", "m/s", "velocity of the target", target_velocity),
@@ -187,8 +193,9 @@ class Navigate(Task):
         if scenery.reserved < CAPACITY:
             raise ConfigError(f"task navigate places up to {CAPACITY} obstacles; set scene.reserved={CAPACITY} or more")
         self._first = len(scenery.obstacles)
-        start, goal, low, high = (np.zeros((e, 3)) for _ in range(4))
-        self.own = NavigateArrays(np.zeros(e, np.int64), start, goal, low, high, np.zeros(e))
+        start, goal, low, high, place = (np.zeros((e, 3)) for _ in range(5))
+        lengths = np.zeros(e), np.zeros(e)
+        self.own = NavigateArrays(np.zeros(e, np.int64), start, goal, low, high, place, *lengths)
         self.settings = NavigateSettings(option.speed, option.start_radius, RestBounds.of(option))
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
@@ -200,10 +207,17 @@ class Navigate(Task):
         own.map[env], own.start[env], own.goal[env] = seed, drawn.start, drawn.goal
         own.low[env], own.high[env], own.peak_tension[env] = drawn.low, drawn.high, 0.0
         start_at_rest(env, rng, self.view_for(start_at_rest), self.equilibrium)
+        own.place[env], own.travelled[env] = self.world.state.payload_position[env], 0.0
 
     def succeeded(self) -> np.ndarray:
         """At rest at the goal throughout the last moments, and never too large a tension."""
         return super().succeeded() & (self.own.peak_tension <= self.options.success_tension)
+
+    def metrics(self) -> dict[str, np.ndarray]:
+        """See `Task.metrics`; `arrival_time_s` is the whole episode's where the payload is not at rest at the goal."""
+        straight = np.linalg.norm(self.own.goal - self.own.start, axis=1)
+        arrived = np.where(self.good_time > 0, self.time - self.good_time, self.config.env.episode_seconds)
+        return super().metrics() | {"arrival_time_s": arrived, "path_length_ratio": self.own.travelled / straight}
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""

@@ -1,0 +1,112 @@
+"""Success among obstacles: `python results/navigate.py [maps=1000] [rows=dense_4,...] [policies=mpc_route,mpc]`.
+
+Each row is a level and a number of drones, flown on held-out maps: evaluation episodes 0 to maps - 1 of seed 1000, the same
+for all policies. Finished episodes are kept in results/navigate and not flown again; without arguments that fly, as with
+maps=0, the table is written anew to docs/data/navigate.csv.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from multilift_marl.config.load import load_config
+from multilift_marl.evaluation.metrics import wilson
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.mdp.failures import CAUSES
+from multilift_marl.policies.baselines import make_scripted
+
+HERE = Path(__file__).parent / "navigate"
+TABLE = Path(__file__).parents[1] / "docs" / "data" / "navigate.csv"
+SEED, CHUNK = 1000, 50
+LEVELS = "sparse", "dense", "narrow", "unknown"
+ROWS: dict[str, dict[str, object]] = {
+    **{f"{level}_{n}": {"env.num_drones": n} for n in (4, 2, 3, 6, 8) for level in LEVELS},
+    **{f"half_{n}": {"env.num_drones": n, "task_options.gaps": 0.5} for n in (3, 4, 6, 8)},
+    "two_4": {"env.num_drones": 4, "task_options.walls": 2},
+    "three_4": {"env.num_drones": 4, "task_options.walls": 3},
+}
+"""Level and drones: half: gaps of half the formation's width; two, three: so many walls."""
+KEPT = (
+    "success_rate", "failure_cause", "arrival_time_s", "path_length_ratio", "min_clearance_m", "min_separation_m",
+    "cable_tension_max_n", "searches", "search_s", "longest_later_search_s",
+)  # fmt: skip
+
+
+def configuration(row: str) -> str:
+    """Return the configuration of a row."""
+    level = row.rsplit("_", 1)[0]
+    return {"sparse": "navigate", "unknown": "navigate_unknown", "dense": "navigate_dense"}.get(
+        level, "navigate_narrow"
+    )
+
+
+def fly(row: str, policy: str, maps: int) -> None:
+    """Fly what is left of a row's first maps, and keep it."""
+    path = HERE / f"{row}_{policy}.npz"
+    kept = dict(np.load(path)) if path.exists() else {}
+    config = load_config(configuration(row), ROWS[row] | {"control.action": "acc_rates", "env.num_threads": 1})
+    while (done := len(kept.get("success_rate", ()))) < maps:
+        count = min(CHUNK, maps - done)
+        found = run_episodes(config, lambda vec: make_scripted(policy, vec), count, SEED, first=done)
+        part = {name: found[name] for name in KEPT if name in found}
+        kept = {name: np.concatenate([kept[name], value]) if done else value for name, value in part.items()}
+        HERE.mkdir(exist_ok=True)
+        np.savez_compressed(path, **kept)
+        print(row, policy, done + count, f"{100 * kept['success_rate'].mean():.1f} %", flush=True)
+
+
+def summary(path: Path) -> dict[str, str]:
+    """Return the line of a row and a policy."""
+    level, drones, policy = path.stem.split("_", 2)
+    kept = dict(np.load(path))
+    good = kept["success_rate"].astype(bool)
+    low, high = wilson(int(good.sum()), len(good))
+    causes = {name: int((kept["failure_cause"] == i).sum()) for i, name in enumerate(CAUSES) if i}
+    causes["late"] = int((~good & (kept["failure_cause"] == 0)).sum())
+    line = {
+        "level": level, "drones": drones, "policy": policy, "maps": str(len(good)),
+        "success_percent": f"{100 * good.mean():.1f}", "ci95": f"{100 * low:.1f}-{100 * high:.1f}",
+        "failures": " ".join(f"{name}:{count}" for name, count in causes.items() if count),
+    }  # fmt: skip
+    if good.any():
+        line |= {
+            "arrival_s": f"{np.median(kept['arrival_time_s'][good]):.1f}",
+            "way_over_straight": f"{np.median(kept['path_length_ratio'][good]):.2f}",
+            "clearance_median_m": f"{np.median(kept['min_clearance_m'][good]):.3f}",
+            "clearance_least_m": f"{kept['min_clearance_m'][good].min():.3f}",
+        }
+    if "search_s" in kept:
+        later = kept["longest_later_search_s"][kept["searches"] > 1]
+        line["search_median_ms"] = f"{1e3 * np.median(kept['search_s']):.0f}"
+        line["search_largest_ms"] = f"{1e3 * kept['search_s'].max():.0f}"
+        line["replan_median_of_largest_ms"] = f"{1e3 * np.median(later):.0f}" if len(later) else ""
+    return line
+
+
+def write_table() -> None:
+    """Write the table of all that has been flown."""
+    order = [(row, path) for row in ROWS for path in sorted(HERE.glob(f"{row}_*.npz"))]
+    lines = [summary(path) for _, path in order]
+    columns = list(dict.fromkeys(name for line in lines for name in line))
+    with TABLE.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+def main(arguments: list[str]) -> None:
+    """Fly and write the table."""
+    values = {"maps": "1000", "rows": ",".join(ROWS), "policies": "mpc_route"}
+    values |= dict(argument.split("=", 1) for argument in arguments)
+    for row in values["rows"].split(","):
+        for policy in values["policies"].split(","):
+            fly(row, policy, int(values["maps"]))
+    write_table()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
