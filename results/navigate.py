@@ -1,8 +1,8 @@
 """Success among obstacles: `python results/navigate.py [maps=1000] [rows=dense_4,...] [policies=mpc_route,mpc]`.
 
-Each row is a level and a number of drones, flown on held-out maps: evaluation episodes 0 to maps - 1 of seed 1000, the same
-for all policies. Finished episodes are kept in results/navigate and not flown again; without arguments that fly, as with
-maps=0, the table is written anew to docs/data/navigate.csv.
+Each row is a level and a number of drones, flown on held-out maps: evaluation episodes 0 to maps - 1 of seed 1000, the
+same for all policies. Finished episodes are kept in results/navigate and not flown again; the table of all of them is
+docs/data/navigate.csv, with maps=0 it alone is written.
 """
 
 from __future__ import annotations
