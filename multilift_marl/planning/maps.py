@@ -21,9 +21,9 @@ LENGTH = 8.0  # from start to goal, like the next ones in units of length
 WIDTH = 3.0  # the payload may stray from the line between them
 FIELD = 2.6  # obstacles stand as far as this before and behind the middle, and ...
 SIDE = 2.8  # ... to its sides
-TALL = 4.0  # height of pillars and walls
+TALL = 3.0  # height of pillars and walls, more than a team under the ceiling reaches
 LEVEL = 1.4  # height of start and goal, at least
-CEILING = 2.6  # of the payload
+CEILING = 1.7  # of the payload
 PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # how many; least gaps between them
 RADIUS = 0.12, 0.32  # of pillars
 GAPS = 0.5, 0.8  # range of the widths of a narrow map's gaps over the resting formation's
@@ -75,7 +75,7 @@ def draw_map(level: str, seed: int, system: System, gaps: tuple[float, float] = 
     start = np.array([-LENGTH / 2 * unit, rng.uniform(-0.8, 0.8) * unit, height])
     goal = np.array([LENGTH / 2 * unit, rng.uniform(-0.8, 0.8) * unit, height])
     low = np.array([-(LENGTH / 2 + 1.0) * unit, -WIDTH * unit, 0.6 * height])
-    high = np.array([(LENGTH / 2 + 1.0) * unit, WIDTH * unit, max(CEILING * unit, height + 0.5)])
+    high = np.array([(LENGTH / 2 + 1.0) * unit, WIDTH * unit, max(CEILING * unit, height + 0.3)])
     placed = (
         _walls(rng, unit, formation_width(system), gaps, walls)
         if level == "narrow"

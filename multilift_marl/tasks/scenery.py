@@ -8,8 +8,8 @@ from multilift_marl.math3d import IDENTITY
 from multilift_marl.rig.obstacles import BOX, NONE
 from multilift_marl.sim.obstacles import Obstacles
 
-_GREY = (0.42, 0.47, 0.53, 1.0)
-_MOVING = (0.80, 0.45, 0.20, 1.0)
+_GREY = (0.42, 0.47, 0.53, 0.6)
+_MOVING = (0.80, 0.45, 0.20, 0.8)
 
 
 class Box(NamedTuple):
