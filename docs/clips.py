@@ -43,6 +43,17 @@ CLIPS = {
     "clip_hover": Clip("hover", "hover", 3, 0.0, 3.0),
     "clip_land": Clip("land", "land", 0, 2.0, 10.0, {}, "side", 2.5),
     "clip_loss": Clip("loss", "loss", 0, 2.5, 5.0),
+    "clip_navigate": Clip(
+        "navigate_dense",
+        "mpc_route",
+        1,
+        0.5,
+        9.5,
+        {"control.action": "acc_rates", "task_options.map": 3},
+        "chase",
+        2.0,
+        most=800_000,
+    ),  # fmt: skip
     "clip_pose": Clip("pose", "pose", 1, 0.0, 8.0, {}, "side", 2.0),
     "clip_recover": Clip("recover", "recover", 0, 0.0, 2.5, {}, "side", 0.5),
     "clip_takeoff": Clip("takeoff", "takeoff", 0, 2.0, 7.0, {}, "side", 2.0),

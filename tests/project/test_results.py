@@ -226,6 +226,10 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "task_options.file_offset",
         "task_options.waypoints",
         "task_options.waypoint_times",
+        "scene.obstacles",
+        "scene.reserved",
+        "env.obstacle_sensing",
+        *(key for key in later if key.startswith("env.obstacles.")),
     }
     stored["train.residual"] = check_base_policy(stored["train.residual"])  # tuned gains had no names once
     own |= {key for key in stored if stored[key] == {} and any(name.startswith(f"{key}.") for name in later)}
