@@ -19,6 +19,8 @@ from multilift_marl.rendering import Renderer
 COLOURS = 128  # of a palette that all frames share, so that what stands still takes no space
 TRAIL = 1.0  # [s]
 
+ROUTE = {"control.action": "acc_rates", "task_options.map": 3}
+
 
 class Clip(NamedTuple):
     """What a clip shows; the policy is a shipped one or a baseline."""
@@ -43,17 +45,7 @@ CLIPS = {
     "clip_hover": Clip("hover", "hover", 3, 0.0, 3.0),
     "clip_land": Clip("land", "land", 0, 2.0, 10.0, {}, "side", 2.5),
     "clip_loss": Clip("loss", "loss", 0, 2.5, 5.0),
-    "clip_navigate": Clip(
-        "navigate_dense",
-        "mpc_route",
-        1,
-        0.5,
-        9.5,
-        {"control.action": "acc_rates", "task_options.map": 3},
-        "chase",
-        2.0,
-        most=800_000,
-    ),  # fmt: skip
+    "clip_navigate": Clip("navigate_dense", "mpc_route", 1, 0.5, 9.5, ROUTE, "chase", 2.0, most=800_000),
     "clip_pose": Clip("pose", "pose", 1, 0.0, 8.0, {}, "side", 2.0),
     "clip_recover": Clip("recover", "recover", 0, 0.0, 2.5, {}, "side", 0.5),
     "clip_takeoff": Clip("takeoff", "takeoff", 0, 2.0, 7.0, {}, "side", 2.0),

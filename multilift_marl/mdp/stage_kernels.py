@@ -91,3 +91,13 @@ def compose_check(
         lines.append(f"            v.cause[e] = {number}")
         functions[f"failure_{number}"] = has_failed
     return compose("check", "\n".join(lines) + "\n", functions)
+
+
+def in_turn(first: Callable[[int, int], None], then: Callable[[int, int], None]) -> Callable[[int, int], None]:
+    """Return a call of (lo, hi) that makes both, one after the other."""
+
+    def call(lo: int, hi: int) -> None:
+        first(lo, hi)
+        then(lo, hi)
+
+    return call

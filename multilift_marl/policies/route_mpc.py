@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 INSIDE = 0.1  # [m] that routes keep from the bounds of the map, beyond which the payload is out of range
 AHEAD = 0.1  # [s] that a route which goes on begins later, as a search takes time
-RETRY = 0.2  # [s] after a search that found no way on
+RETRY = 0.2  # [s] after a search that found no way on for a team that moves
 
 
 class RouteMpc(TeamMpc):
@@ -126,7 +126,8 @@ class RouteMpc(TeamMpc):
             )
         except NoRoute as error:
             warn_once("no_route", f"policy=mpc_route: {error}")
-            self._due[e] = begin + RETRY
+            if departure is not None:  # at rest nothing changes until something else comes into sight
+                self._due[e] = begin + RETRY
             return
         took = route.report.planning_time
         if departure is None:

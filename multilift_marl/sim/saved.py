@@ -36,6 +36,15 @@ def _parts(value: Any) -> Iterator[str]:
         yield str(value)
 
 
+def flatten(record: Any, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Return the arrays of a named tuple, those of named tuples within it too, by dotted name."""
+    for name, value in record._asdict().items():
+        if isinstance(value, tuple):
+            yield from flatten(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
 def check_saved(saved: Mapping[str, Any], expected: Mapping[str, np.ndarray], diverged: str, *same: str) -> None:
     """Refuse a saved state that is none of these environments.
 

@@ -98,3 +98,18 @@ def write_bodies(e, line, state, rows):
         put(line[v + 3 : v + 6], vec(state.drone_body_rates, e, n))
         at += 7
         v += 6
+
+
+@kernel
+def find_warnings(lo, warning, diverged):
+    """Mark environments from `lo` on for which MuJoCo has counted a warning as diverged.
+
+    Args:
+        lo: the first of the environments.
+        warning: of each, what MuJoCo warned of last and how often it has (environments, kinds, 2).
+        diverged: (E,) bool, written.
+    """
+    for i in range(warning.shape[0]):
+        for kind in range(warning.shape[1]):
+            if warning[i, kind, 1] != 0:
+                diverged[lo + i] = True

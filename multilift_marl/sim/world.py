@@ -14,7 +14,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from multilift_marl._platform import cpu_count
-from multilift_marl.kernels.jit import bind, kernel
+from multilift_marl.kernels.jit import bind
 from multilift_marl.rig.constants import make_rig
 from multilift_marl.rig.system import System
 from multilift_marl.sim.air import make_air
@@ -39,7 +39,7 @@ from multilift_marl.sim.pushes import Pushes, apply_pushes, make_pushes, start_p
 from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.state import Air, EpisodeStats, HiddenLoads, SimData, SystemState, hover_drone
-from multilift_marl.sim.state_io import Rows, make_rows
+from multilift_marl.sim.state_io import Rows, find_warnings, make_rows
 
 _log = logging.getLogger("multilift_marl.mujoco")
 REST_HEIGHT = 1.5  # [m] of the payload after World.reset
@@ -388,21 +388,6 @@ class World:
                 Shard(lo, hi, batch, rows, apply, push, advance, read, broken, find, proximity, warnings, obstacles)
             )
         return shards
-
-
-@kernel
-def find_warnings(lo, warning, diverged):
-    """Mark environments from `lo` on for which MuJoCo has counted a warning as diverged.
-
-    Args:
-        lo: the first of the environments.
-        warning: of each, what MuJoCo warned of last and how often it has (environments, kinds, 2).
-        diverged: (E,) bool, written.
-    """
-    for i in range(warning.shape[0]):
-        for kind in range(warning.shape[1]):
-            if warning[i, kind, 1] != 0:
-                diverged[lo + i] = True
 
 
 def _quiet_mujoco() -> None:

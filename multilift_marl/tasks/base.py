@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -22,13 +22,14 @@ from multilift_marl.mdp.observation_kernels import check_written, compose_observ
 from multilift_marl.mdp.observations import Component, kernels_first, list_components, sensed_components
 from multilift_marl.mdp.rewards import RestBounds, Term, compose_reward, is_at_rest, resolve_reward
 from multilift_marl.mdp.rig_features import RIG, describe_rig, observed_units, scale_numbers
-from multilift_marl.mdp.stage_kernels import compose_check, compose_plan
+from multilift_marl.mdp.stage_kernels import compose_check, compose_plan, in_turn
 from multilift_marl.rig.constants import RigArrays
 from multilift_marl.schema.validate import check_magnitudes, validate
 from multilift_marl.schema.values import Section
 from multilift_marl.sensing.measurement import Sensing
 from multilift_marl.sim.obstacles import make_hulls
 from multilift_marl.sim.parameters import Parameters
+from multilift_marl.sim.saved import flatten
 from multilift_marl.sim.world import World
 from multilift_marl.tasks.scenery import Box as Box
 from multilift_marl.tasks.scenery import draw_obstacles
@@ -363,7 +364,7 @@ class Task:
         groups |= {"planned": self.planned} if self.planned is not self.goal else {}
         groups |= {"own": self.own} if self.own else {}
         for group, record in groups.items():
-            arrays |= {f"{group}.{name}": array for name, array in _flatten(record)}
+            arrays |= {f"{group}.{name}": array for name, array in flatten(record)}
         return arrays
 
     def _compose(self, true: View) -> dict[str, Call]:
@@ -374,7 +375,7 @@ class Task:
         if self.config.env.units != "si":
             units = [part.unit for part in list_components(action, extra) for _ in range(part.size)]
             factors = 1 / observed_units(self.config, units)
-            observe = _follow(observe, prebind(scale_numbers, self.observation, factors))
+            observe = in_turn(observe, prebind(scale_numbers, self.observation, factors))
         own = enumerate(self.own_failures().values(), FIRST_OWN)
         failures = {number: has_failed for number, has_failed in own if not is_plain(has_failed)}
         check = compose_check(kernels.check, kernels.plan is None, failures, self.world.system.scenery.count > 0)
@@ -396,22 +397,3 @@ class Task:
     @staticmethod
     def _bind(kernel: Callable[..., Any], view: View, *arguments: Any) -> Call:
         return prebind(kernel, reduce_view(view, kernel), *arguments)
-
-
-def _follow(first: Call, then: Call) -> Call:
-    """Return a call of (lo, hi) that makes both, one after the other."""
-
-    def call(lo: int, hi: int) -> None:
-        first(lo, hi)
-        then(lo, hi)
-
-    return call
-
-
-def _flatten(record: Any, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:
-    """Return the arrays of a named tuple, those of named tuples within it too, by dotted name."""
-    for name, value in record._asdict().items():
-        if isinstance(value, tuple):
-            yield from _flatten(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value

@@ -9,7 +9,7 @@ from conftest import bold_actions, make, mask, mixed_actions, same, zeros
 from multilift_marl.envs.step_kernels import ENDED, NOT_FINITE, TAKEN, Outcome, end_step, take_actions
 from multilift_marl.mdp.failures import DIVERGED
 from multilift_marl.sim.parameters import MASSES, make_inertias, nominal_parameters, update_inertias
-from multilift_marl.sim.world import find_warnings
+from multilift_marl.sim.state_io import find_warnings
 
 
 @pytest.mark.parametrize(
