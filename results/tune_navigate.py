@@ -12,7 +12,6 @@ planner.clearance=0.
 from __future__ import annotations
 
 import sys
-from itertools import product
 from time import process_time
 from typing import Any
 
@@ -24,9 +23,9 @@ from multilift_marl.policies.baselines import make_scripted
 
 LEVELS = {"sparse": "navigate", "dense": "navigate_dense", "narrow": "navigate_narrow", "unknown": "navigate_unknown"}
 CANDIDATES: dict[str, list[dict[str, float]]] = {
-    "mpc_payload": [{"RADIUS": r, "SPEED": v} for r, v in [*product((0.3, 0.45, 0.6, 0.75), (1.5,)), (0.45, 1.0)]],
-    "mpc_narrow": [{"RADIUS": r, "SPEED": v} for r, v in [*product((0.2, 0.3, 0.4, 0.55), (1.5,)), (0.3, 1.0)]],
-    "mpc_potential": [{"DISTANCE": d, "GAIN": g} for d, g in product((0.6, 0.9, 1.3), (0.05, 0.3))],
+    "mpc_payload": [{"RADIUS": r, "SPEED": v} for r, v in ((0.45, 1.5), (0.6, 1.5), (0.45, 1.0), (0.3, 1.5))],
+    "mpc_narrow": [{"RADIUS": r, "DRAWN": d} for r, d in ((0.4, 0.8), (0.3, 0.8), (0.4, 1.0), (0.5, 0.8))],
+    "mpc_potential": [{"DISTANCE": d, "GAIN": g} for d, g in ((0.9, 0.3), (0.9, 0.05), (1.3, 0.05), (0.6, 0.3))],
 }
 BARE = "mpc without clearance"
 POLICIES = ("mpc", BARE, *CANDIDATES, "mpc_route")

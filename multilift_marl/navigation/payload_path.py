@@ -30,6 +30,7 @@ from multilift_marl.planning.route import NoRoute, Route, RouteReport
 from multilift_marl.rig.system import System
 
 STEP = 0.15  # [m] of the grid
+SHARES = 1.0, 0.8, 0.6, 0.4  # of the radius by which obstacles are inflated, tried in turn
 STRIDE = 0.02  # [m] of a step through a potential field, at most
 NEAR = 0.3  # [m] from the goal, within which its attraction falls
 STUCK = 100  # steps in which a way through a field that has not moved on by ...
@@ -70,7 +71,7 @@ def shortest_path(
         start, goal: (4,) x, y, z [m] and yaw [rad].
         space: (2, 3) lowest and highest position [m].
         scene: the obstacles.
-        radius: by which they are inflated [m]; less where start or goal is closer.
+        radius: by which they are inflated [m]; less where start or goal is closer, or there is no way; see `SHARES`.
         departure: (3, 4) pose at the start, its rates and second rates; None: at rest.
 
     Raises:
@@ -79,18 +80,23 @@ def shortest_path(
     ends = np.empty(2)
     measure_clearance(np.array([start, goal]), np.zeros((2, 0, 3)), POINT, scene, radius, ends)
     radius = max(float(ends.min()) - _TIGHT, 0.0)
-    lattice = make_lattice(start, goal, space, np.full(3, STEP), POINT, _NO_SHAPES, (radius, radius + _TIGHT))
-    way, _ = search_route(lattice, start, 0, POINT, scene, RouteSettings.most)
-    if not len(way):
-        raise NoRoute(f"the payload alone finds no way {radius:.2f} m from all obstacles: lower the radius")
+    for share in SHARES:
+        inflated = share * radius
+        clearance = inflated, inflated + _TIGHT
+        lattice = make_lattice(start, goal, space, np.full(3, STEP), POINT, _NO_SHAPES, clearance)
+        way, _ = search_route(lattice, start, 0, POINT, scene, RouteSettings.most)
+        if len(way):
+            break
+    else:
+        raise NoRoute(f"the payload alone finds no way {inflated:.2f} m from all obstacles: lower the radius")
     states = states_at(way, lattice, _NO_SHAPES)
     states[0], states[-1] = start, goal
 
     weights = coordinate_scale(0)
     knots, spacing = space_knots(states, weights)
     lead, _ = moving_start(departure, weights, spacing)
-    safe = np.full(len(knots), radius)
-    return smooth_knots(knots, Band(POINT, scene, _NO_LIMITS, space, weights, safe, radius, spacing, lead))
+    safe = np.full(len(knots), inflated)
+    return smooth_knots(knots, Band(POINT, scene, _NO_LIMITS, space, weights, safe, inflated, spacing, lead))
 
 
 def field_path(

@@ -15,12 +15,13 @@ from multilift_marl.navigation.formation_shapes import drone_places, make_shapes
 from multilift_marl.navigation.payload_path import field_path, shortest_path, space_of, time_path
 from multilift_marl.navigation.planner import RouteSettings
 from multilift_marl.navigation.team_clearance import Scene, make_scene
-from multilift_marl.planning.route import Route
+from multilift_marl.planning.route import NoRoute, Route
 from multilift_marl.policies.route_mpc import RouteMpc
 from multilift_marl.rig.system import System
 
 BLEND = 1.0  # [m] of its path on which a team in motion comes to heading and shape
-_WINDOW = 5  # knots over which headings are means
+_STEADY = 0.02  # [1/s] of a shape's coordinate
+_WINDOW = 9  # knots over which headings are means
 
 
 class PayloadRouteMpc(RouteMpc):
@@ -56,13 +57,22 @@ class PayloadRouteMpc(RouteMpc):
 
 
 class NarrowRouteMpc(PayloadRouteMpc):
-    """The same path, along which the formation heads in its narrowest shape, drawn in at the start until the goal."""
+    """The same path, along which a narrow formation heads: drawn in at the start for good, at rest again at the goal.
+
+    While its shape changes the team keeps to its route.
+
+    Class attributes:
+        DRAWN: how far it is drawn in, from 0 at rest to 1 at the narrowest shape that keeps drones apart.
+    """
 
     NAME: ClassVar[str] = "mpc_narrow"
     RADIUS: float = 0.4
+    DRAWN: float = 0.8
 
     def make_route(self, e: int, start: np.ndarray, settings: RouteSettings, departure: np.ndarray | None) -> Route:
         """See `RouteMpc.make_route`."""
+        if departure is not None and np.abs(departure[1, 4:]).max(initial=0.0) > _STEADY:
+            raise NoRoute("a formation goes on once it has been drawn in")
         path = self._path(e, start, settings, departure)
         modes, turned = narrowest_mode(self._vec.world.system)
         away = np.diff(path[:, :2], axis=0, append=path[-1:, :2])
@@ -70,7 +80,7 @@ class NarrowRouteMpc(PayloadRouteMpc):
         heading = np.unwrap(np.append(path[0, 3], np.arctan2(away[:, 1], away[:, 0]) + turned))[1:]
         ends = _WINDOW // 2
         heading = np.convolve(np.pad(heading, ends, mode="edge"), np.full(_WINDOW, 1 / _WINDOW), mode="valid")
-        states = np.column_stack([path[:, :3], heading, np.ones((len(path), len(modes)))])
+        states = np.column_stack([path[:, :3], heading, np.full((len(path), len(modes)), self.DRAWN)])
         turns = 2 * np.pi * round(heading[-1] / (2 * np.pi))
         last = np.concatenate([path[-1, :3], [turns], np.zeros(len(modes))])
         if departure is None:
