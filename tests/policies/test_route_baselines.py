@@ -9,7 +9,7 @@ from conftest import make_system, refusal
 import multilift_marl as ml
 from multilift_marl.errors import ConfigError
 from multilift_marl.navigation.formation_shapes import drone_places, find_breach
-from multilift_marl.navigation.payload_path import POINT, STEP, field_path, shortest_path
+from multilift_marl.navigation.payload_path import POINT, SHARES, STEP, field_path, shortest_path
 from multilift_marl.navigation.team_clearance import make_scene, measure_clearance
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.route_baselines import narrowest_mode
@@ -124,7 +124,7 @@ def test_a_narrow_formation_heads_along_its_path():
     _, turned = narrowest_mode(vec.world.system)
     off = value[:, 3] - turned - np.arctan2(rate[:, 1], rate[:, 0])
     assert cruising.sum() > 50 and np.abs(off[cruising]).max() < np.deg2rad(15.0)
-    assert value[cruising, 4] == pytest.approx(1.0, abs=0.1)
+    assert value[cruising, 4] == pytest.approx(policy.DRAWN, abs=0.1)
     assert value[[0, -1], 3:] == pytest.approx(0.0, abs=1e-9)
 
 
@@ -156,6 +156,14 @@ def test_what_comes_in_sight_is_replanned_for(name):
 def test_other_tasks_are_refused(name):
     vec = ml.make_vec("hover", num_envs=1, num_threads=1, **BY_RATES)
     assert f"policy={name} needs the map of task navigate" in refusal(make_scripted, name, vec)
+
+
+def test_a_gap_that_is_too_narrow_for_the_radius_is_passed_at_a_share_of_it():
+    gap = scene_of([(BOX, (0.1, 2.0, 4.0), (0.0, side * 2.4 + 0.5, 4.0), 0.0) for side in (-1.0, 1.0)])  # of 0.8 m
+    path = shortest_path(START, GOAL, SPACE, gap, 0.6)
+    inside = np.abs(path[:, 0]) < 0.1
+    most = 0.4 - min(SHARES) * 0.6 + 0.02
+    assert inside.any() and np.abs(path[inside, 1] - 0.5).max() < most
 
 
 def test_a_payload_without_a_way_is_refused():
