@@ -24,7 +24,10 @@ from multilift_marl.policies.baselines import make_scripted
 LEVELS = {"sparse": "navigate", "dense": "navigate_dense", "narrow": "navigate_narrow", "unknown": "navigate_unknown"}
 CANDIDATES: dict[str, list[dict[str, float]]] = {
     "mpc_payload": [{"RADIUS": r, "SPEED": v} for r, v in ((0.45, 1.5), (0.6, 1.5), (0.45, 1.0), (0.3, 1.5))],
-    "mpc_narrow": [{"RADIUS": r, "DRAWN": d} for r, d in ((0.4, 0.8), (0.3, 0.8), (0.4, 1.0), (0.5, 0.8))],
+    "mpc_narrow": [
+        {"RADIUS": 0.3, "DRAWN": 0.8, "SPEED": 1.0},
+        *({"RADIUS": r, "DRAWN": d, "SPEED": 1.5} for r, d in ((0.3, 0.8), (0.4, 0.8), (0.4, 1.0), (0.5, 0.8))),
+    ],
     "mpc_potential": [{"DISTANCE": d, "GAIN": g} for d, g in ((0.9, 0.3), (0.9, 0.05), (1.3, 0.05), (0.6, 0.3))],
 }
 BARE = "mpc without clearance"
@@ -63,13 +66,13 @@ def main(arguments: list[str]) -> None:
     what, *pairs = arguments
     options = {"maps": "8" if what == "tune" else "40", "seed": "0"} | dict(pair.split("=") for pair in pairs)
     policies = options.get("policies", ",".join(CANDIDATES if what == "tune" else POLICIES)).split(",")
-    print(f"{'':56s}{''.join(f'{level:>9s}' for level in [*LEVELS, 'mean'])}", flush=True)
+    print(f"{'':74s}{''.join(f'{level:>9s}' for level in [*LEVELS, 'mean'])}", flush=True)
     for name in policies:
         for numbers in CANDIDATES[name] if what == "tune" else [{}]:
             begun = process_time()
             shares = [fly(level, name, numbers, int(options["maps"]), int(options["seed"])) for level in LEVELS]
             cells = "".join(f"{100 * share:9.1f}" for share in [*shares, np.mean(shares)])
-            print(f"{name:22s} {numbers or ''!s:32s} {cells}  {process_time() - begun:5.0f} s of CPU", flush=True)
+            print(f"{name:22s} {numbers or ''!s:50s} {cells}  {process_time() - begun:5.0f} s of CPU", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Simple routes among obstacles, to compare `policy=mpc_route` with: paths of the payload alone, and one fixed shape.
 
-They know what `RouteMpc` knows, replan when it does and are timed and flown alike. Their numbers are those of most
-successes on training maps of all levels of `navigate`, found by `results/tune_navigate.py`.
+They know what `RouteMpc` knows, replan when it does and are timed and flown alike. Numbers by candidates of
+`results/tune_navigate.py tune`: those with the most successes on 8 training maps of each level of `navigate`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class PayloadRouteMpc(RouteMpc):
     """
 
     NAME: ClassVar[str] = "mpc_payload"
-    RADIUS: float = 0.75
+    RADIUS: float = 0.45
     SPEED: float = 1.5
 
     def make_route(self, e: int, start: np.ndarray, settings: RouteSettings, departure: np.ndarray | None) -> Route:
@@ -66,7 +66,7 @@ class NarrowRouteMpc(PayloadRouteMpc):
     """
 
     NAME: ClassVar[str] = "mpc_narrow"
-    RADIUS: float = 0.4
+    RADIUS: float = 0.3
     DRAWN: float = 0.8
 
     def make_route(self, e: int, start: np.ndarray, settings: RouteSettings, departure: np.ndarray | None) -> Route:
