@@ -103,8 +103,8 @@ class PotentialRouteMpc(PayloadRouteMpc):
     """
 
     NAME: ClassVar[str] = "mpc_potential"
-    DISTANCE: float = 1.2
-    GAIN: float = 0.1
+    DISTANCE: float = 0.9
+    GAIN: float = 0.3
 
     def _find(
         self, start: np.ndarray, goal: np.ndarray, space: np.ndarray, scene: Scene, departure: np.ndarray | None
