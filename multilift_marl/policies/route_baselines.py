@@ -1,7 +1,7 @@
 """Simple routes among obstacles, to compare `policy=mpc_route` with: paths of the payload alone, and one fixed shape.
 
 They know what `RouteMpc` knows, replan when it does and are timed and flown alike. Numbers by candidates of
-`results/tune_navigate.py tune`: those with the most successes on 8 training maps of each level of `navigate`.
+`results/tune_navigate.py tune`, of which not all were flown: the most successes on 8 training maps of each level.
 """
 
 from __future__ import annotations
