@@ -34,7 +34,7 @@ CLOSER = 0.015  # [m] that a knot is to keep more, each time that it is too clos
 FADES = 1.0, 1.6, 2.2  # [s] in which a route comes to its curve from a moving start, tried in turn
 FIRMER = 1.25  # of acceleration where a moving start leaves little room to brake
 SLOWER = 0.75  # of speed and acceleration where they bring the team too close
-_TILTS = np.deg2rad([45.0, 60.0])  # of drones along a route from rest, and from a moving start
+TILTS = np.deg2rad([45.0, 60.0])  # of drones along a route from rest, and from a moving start
 _SPARE = 0.005  # [m] of the shapes' limits, for the curve
 _STILL = 0.05  # [m/s] below which a team is at rest
 _AHEAD = 1.0  # [s] before and after a time, in which the team is slower then
@@ -186,11 +186,7 @@ def _make_route(
     """Return the smooth route along states (S, 4 + J) of a lattice, None if it comes too close to obstacles."""
     weights = coordinate_scale(len(body.modes))
     knots, spacing = space_knots(states, weights)
-    lead, pace = np.zeros(len(weights)), (0.0, 0.0)
-    if departure is not None and (fast := float(np.linalg.norm(weights * departure[1]))) > _STILL:
-        lead = departure[1] * spacing / fast
-        gain = float((weights * departure[1]) @ (weights * departure[2])) / fast
-        pace = fast / spacing * SAMPLES, gain / spacing * SAMPLES
+    lead, pace = moving_start(departure, weights, spacing)
     limits = make_shape_limits(system)
     band = Band(
         body=body,
@@ -217,10 +213,10 @@ def _make_route(
         return None
 
     # Speeds: lower where obstacles are close, and again where inertia swings drones towards them.
-    points = _points(values, system, body)
+    points = team_points(values, system, body)
     care = np.clip(clearance / settings.comfort, _SLOWEST, 1.0)
     slow, firm = care, care
-    tilt = _TILTS[int(departure is not None)]
+    tilt = TILTS[int(departure is not None)]
     for attempt in range(REPAIRS):
         fade = FADES[attempt % len(FADES)]
         table = time_route(knots, points, slow * settings.speed, firm * settings.acceleration, pace, departure, fade)
@@ -236,6 +232,22 @@ def _make_route(
         share = _slower(values, motion, motion.feasible(tilt), settings)
         slow, firm = share * slow, share * firm
     return None
+
+
+def moving_start(
+    departure: np.ndarray | None, weights: np.ndarray, spacing: float
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """Return the lead (D,) of a band, see `Band`, and the pace of its samples, see `smooth_times`, at a start.
+
+    Args:
+        departure: see `find_route`.
+        weights: length of a unit of each coordinate (D,) [m].
+        spacing: of knots [m].
+    """
+    if departure is None or (fast := float(np.linalg.norm(weights * departure[1]))) <= _STILL:
+        return np.zeros(len(weights)), (0.0, 0.0)
+    gain = float((weights * departure[1]) @ (weights * departure[2])) / fast
+    return departure[1] * spacing / fast, (fast / spacing * SAMPLES, gain / spacing * SAMPLES)
 
 
 def _slower(values: np.ndarray, motion: RouteMotion, feasible: bool, settings: RouteSettings) -> np.ndarray:
@@ -263,7 +275,7 @@ def _measure(values: np.ndarray, body: TeamBody, scene: Scene, enough: float) ->
     return clearance
 
 
-def _points(values: np.ndarray, system: System, body: TeamBody) -> np.ndarray:
+def team_points(values: np.ndarray, system: System, body: TeamBody) -> np.ndarray:
     """Return where payload and drones are (M, 1 + N, 3) [m]."""
     c, s = np.cos(values[:, 3]), np.sin(values[:, 3])
     out = system.anchors + _arms(values, body)

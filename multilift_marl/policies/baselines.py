@@ -28,6 +28,7 @@ from multilift_marl.policies.hold import (
 from multilift_marl.policies.mpc import TeamMpc
 from multilift_marl.policies.payload_geometric import PayloadGeometric
 from multilift_marl.policies.policy import OwnPolicy, Policy
+from multilift_marl.policies.route_baselines import NarrowRouteMpc, PayloadRouteMpc, PotentialRouteMpc
 from multilift_marl.policies.route_mpc import RouteMpc
 from multilift_marl.policies.tuned import tuned_policy
 from multilift_marl.schema.training import TUNED
@@ -56,6 +57,9 @@ SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric] | type[TeamMpc]] = 
     **LINEAR,
     "mpc": TeamMpc,
     "mpc_route": RouteMpc,
+    "mpc_payload": PayloadRouteMpc,
+    "mpc_narrow": NarrowRouteMpc,
+    "mpc_potential": PotentialRouteMpc,
     "payload_geometric": PayloadGeometric,
 }
 _OTHERWISE = {

@@ -7,7 +7,7 @@ drone or the payload, and the route is searched anew from the motion under way.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -26,11 +26,14 @@ if TYPE_CHECKING:
 
 INSIDE = 0.1  # [m] that routes keep from the bounds of the map, beyond which the payload is out of range
 AHEAD = 0.1  # [s] that a route which goes on begins later, as a search takes time
-RETRY = 0.2  # [s] after a search that found no way on for a team that moves
+RETRY = 0.2  # [s] after a search that found no way on
 
 
 class RouteMpc(TeamMpc):
     """As `TeamMpc`, with the map of the task `navigate`.
+
+    Class attributes:
+        NAME: of the policy.
 
     Attributes:
         routes: of each environment (E,), None where none was found: there the team stays where it began.
@@ -40,9 +43,13 @@ class RouteMpc(TeamMpc):
         search_time: CPU time of the first search and of the longest later one, of each environment (E, 2) [s].
     """
 
+    NAME: ClassVar[str] = "mpc_route"
+
     def __init__(self, vec: MultiliftVec):
         if not isinstance(vec.task, Navigate):
-            raise ConfigError(f"policy=mpc_route needs the map of task navigate, not {vec.task.name}; take policy=mpc")
+            raise ConfigError(
+                f"policy={self.NAME} needs the map of task navigate, not {vec.task.name}; take policy=mpc"
+            )
         super().__init__(vec, self._follow)
         e = vec.num_envs
         self._task = vec.task
@@ -64,14 +71,23 @@ class RouteMpc(TeamMpc):
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """See `TeamMpc.act`."""
+        self.update_routes()
+        return super().act(observation)
+
+    def update_routes(self) -> None:
+        """Search routes where the episode is new, or an obstacle that was not known is in sight."""
         for known, true in zip(self.known, self._vec.world.obstacles, strict=True):
             known[:] = true
         for e in range(self._vec.num_envs):
             self._see(e)
-        return super().act(observation)
+
+    def make_route(self, e: int, start: np.ndarray, settings: RouteSettings, departure: np.ndarray | None) -> Route:
+        """Return a route from a start (4,) to the goal of environment e, see `find_route`; raise NoRoute."""
+        goal = np.append(self._task.own.goal[e], 0.0)
+        return find_route(self._vec.world.system, self.known, e, start, goal, settings, departure)
 
     def metrics(self) -> dict[str, np.ndarray]:
-        """Return those of `TeamMpc`, and searches so far and what they took (E,), see `search_time` [s]."""
+        """Return those of `TeamMpc`, how many searches there were (E,), and what they took, see `search_time` [s]."""
         first, later = self.search_time.T.copy()
         return super().metrics() | {
             "searches": self.searches.copy(),
@@ -121,13 +137,11 @@ class RouteMpc(TeamMpc):
         start = np.append(state.payload_position[e], heading(tuple(state.payload_rotation[e].ravel())))
         self.searches[e] += 1
         try:
-            route = find_route(
-                self._vec.world.system, self.known, e, start, np.append(own.goal[e], 0.0), settings, departure
-            )
+            route = self.make_route(e, start, settings, departure)
         except NoRoute as error:
-            warn_once("no_route", f"policy=mpc_route: {error}")
-            if departure is not None:  # at rest nothing changes until something else comes into sight
-                self._due[e] = begin + RETRY
+            warn_once("no_route", f"policy={self.NAME}: {error}")
+            # A team that rests would search the same again.
+            self._due[e] = np.inf if departure is None else begin + RETRY
             return
         took = route.report.planning_time
         if departure is None:

@@ -41,11 +41,10 @@ def test_a_team_goes_around_what_comes_into_sight():
 
     def look():
         seen.append((policy.known.kind != NONE).sum(axis=1))
-        far = np.linalg.norm(
-            vec.world.obstacles.position[..., :2] - vec.world.state.payload_position[:, None, :2], axis=-1
-        )
-        # The drones are at most 1.3 m from the payload, obstacles at most 0.35 m wide.
-        assert not ((policy.known.kind != NONE) & (far > 2.5 + 1.3 + 0.35)).any() or max(map(sum, seen)) > sum(seen[0])
+        if len(seen) == 1:  # the drones are within 1.3 m of the payload, obstacles within 0.35 m of their middles
+            offset = vec.world.obstacles.position - vec.world.state.payload_position[:, None]
+            far = np.hypot(offset[..., 0], offset[..., 1]) > 2.5 + 1.3 + 0.35
+            assert not (far & (policy.known.kind != NONE)).any()
 
     info, terminated, _ = fly(vec, policy, look=look)
     assert not terminated.any() and info["success"].all()
@@ -65,7 +64,7 @@ def test_without_a_way_the_team_waits():
     for _ in range(30):
         observation, _, terminated, _, _ = vec.step(policy.act(observation))
         assert not terminated[0]
-    assert policy.routes == [None] and policy.searches[0] > 1
+    assert policy.routes == [None] and policy.searches[0] == 1
     assert np.linalg.norm(vec.world.state.payload_position[0] - start) < 0.1
 
 
