@@ -122,10 +122,14 @@ def _read_latency(log: Path) -> dict[str, float]:
 
 
 def print_table(lines: list[dict[str, str]]) -> None:
-    """Print a row of the table for each row that was flown, and what the learned team gains over its baseline."""
+    """Print a row of the table for each row that was flown, and what the learned team gains over its baseline.
+
+    Flights whose take-off and landing had no margin are rows of their own.
+    """
     flown: dict[str, dict[str, dict[str, str]]] = {}
     for line in lines:
-        flown.setdefault(line["row"], {})[line["seed"]] = line
+        row = line["row"] + ("" if float(line["margin_m"] or 0) else ", no margin")
+        flown.setdefault(row, {})[line["seed"]] = line
     for row, flights in flown.items():
 
         def column(name: str, flights: dict[str, dict[str, str]] = flights) -> np.ndarray:
@@ -145,12 +149,13 @@ def print_table(lines: list[dict[str, str]]) -> None:
         print(
             f"{len(nodes)} flights by nodes, {name}: {np.median(values):.2f} ({values.min():.2f} to {values.max():.2f})"
         )
-    learned, base = flown.get("hover_learned", {}), flown.get("hover_conditions", {})
-    if both := sorted(learned.keys() & base.keys()):
-        for name in ("position_cm", "attitude_deg"):
+    for margin in ("", ", no margin"):
+        learned, base = flown.get(f"hover_learned{margin}", {}), flown.get(f"hover_conditions{margin}", {})
+        both = sorted(learned.keys() & base.keys())
+        for name in ("position_cm", "attitude_deg") if both else ():
             gain = np.array([float(learned[seed][name]) - float(base[seed][name]) for seed in both])
             low, high = bootstrap(gain)
-            print(f"hover_learned - hover_conditions, {name}: {gain.mean():.2f} ({low:.2f} to {high:.2f}), {len(both)}")
+            print(f"hover_learned - hover_conditions{margin}, {name}: {gain.mean():.2f} ({low:.2f} to {high:.2f})")
 
 
 def main(arguments: list[str]) -> int:
