@@ -20,6 +20,8 @@ from multilift_marl.schema.values import Between, Float
 from multilift_marl.sim.contact import drone_half_size
 
 FAR = 0.5  # [m] from its target, at which a payload's pose earns half
+CREEP = 0.006  # [m/s] at which a margin is gone through
+MAX_MARGIN = 0.2  # of a cable's length
 _SLACK_REACH = 0.9  # of its cable: the farthest that a drone stands from its anchor
 
 
@@ -186,9 +188,37 @@ def cable_rise(e, n, state, rig):
 Pace = Annotated[
     Float,
     Between(0.1, 1),
-    Field(description="[-] of the plan: with 0.5 it takes twice the time (raise env.episode_seconds, too)"),
+    Field(description="[-] of the plan: 0.5 takes twice the time"),
 ]
 """Option of tasks that begin or end on the ground."""
+
+Margin = Annotated[
+    Float,
+    Between(0, 0.3, "m"),
+    Field(description="[m] expected error of drones' places; makes contact slower"),
+]
+"""Option of tasks that begin or end on the ground."""
+
+
+def margin_ratio(margin: float, system: System) -> np.ndarray:
+    """Return a margin [m] over the length of each cable (N,) [-].
+
+    Raises:
+        ConfigError: it is too large for the shortest cable.
+    """
+    ratio = margin / system.cable_length
+    if ratio.max() > MAX_MARGIN:
+        raise ConfigError(
+            f"task_options.margin={margin:g} m is {ratio.max():.2f} of a cable's length, at most {MAX_MARGIN:g} may "
+            "be; lower it or raise cable.length"
+        )
+    return ratio
+
+
+def paced(phase: tuple[float, float], pace: float, later: float = 0.0, longer: float = 0.0) -> tuple[float, float]:
+    """Return begin and length [s] of a phase at some pace, then later and longer by some time [s]."""
+    return phase[0] / pace + later, phase[1] / pace + longer
+
 
 CARRIED = {
     "position": Term(0.4, position, 0.25, "m"),

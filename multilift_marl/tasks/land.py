@@ -15,11 +15,15 @@ from multilift_marl.mdp.criteria import CONDITION, Criterion, length
 from multilift_marl.mdp.failures import LOAD_GROUND, TOUCH, Limits, ignore, payload_height
 from multilift_marl.mdp.ground import (
     CARRIED,
+    CREEP,
     Ground,
+    Margin,
     Pace,
     cable_chord,
     make_ground,
+    margin_ratio,
     move_goal,
+    paced,
     pull_fraction,
     readiness,
     scale_cable_force,
@@ -38,7 +42,6 @@ DESCEND = (2.0, 2.8)  # down,
 SETTLE = (4.8, 1.6)  # slowly onto the ground,
 RELEASE = (6.4, 2.2)  # cable forces fade,
 LOWER = (8.6, 1.4)  # drones come closer
-DOWN = SETTLE[0] + SETTLE[1]  # [s] when the target is on the ground
 NEAR = 0.12  # [m] above the ground where the slow last part of the descent begins, for the span of a falcon
 SHORTER = 0.15  # of its length: how much nearer to its anchor a drone comes in the end
 AIRBORNE, LANDED, CRASHED = range(3)
@@ -59,6 +62,7 @@ class LandOptions(Section):
     )
     success_seconds: Float = Field(1.0, gt=0, description="[s] at rest, slack and clear throughout the last seconds")
     pace: Pace = 1.0
+    margin: Margin = 0.0
 
 
 class LandArrays(NamedTuple):
@@ -78,8 +82,12 @@ class LandSettings(NamedTuple):
     """Constants of the task, and what counts as landed."""
 
     ground: Ground
-    pace: float
-    """Of the plan [-]."""
+    approach: tuple[float, float]
+    """Begin and length [s], as of the next ones."""
+    descend: tuple[float, float]
+    settle: tuple[float, float]
+    release: tuple[float, float]
+    lower: tuple[float, float]
     radius: float
     """Payload within this of the pad's middle [m]."""
     speed: float
@@ -106,7 +114,7 @@ def start_above_origin(e, rng, v, equilibrium, ranges):
 @inlined
 def advance(e, v):
     """Move the goal on: to the pad, down, slowly onto it; then cable forces fade and drones come closer."""
-    goal, rig, own, ground, t, pace = v.goal, v.rig, v.own, v.settings.ground, v.time[e], v.settings.pace
+    goal, rig, own, ground, t, plan = v.goal, v.rig, v.own, v.settings.ground, v.time[e], v.settings
     course = row(own.course, e)
     # At every control step, and not only after a policy step, in which a payload could touch and bounce unseen.
     see_touchdown(e, v)
@@ -114,13 +122,13 @@ def advance(e, v):
     near = min(NEAR * ground.size, -course[2])
     # The start again, from the course alone; the three phases add up on it.
     set_resting_goal(e, goal, (0.0, 0.0, ground.payload - course[2]))
-    move_goal(e, goal, (course[0], course[1], 0.0), ease(t, APPROACH[0] / pace, APPROACH[1] / pace))
-    move_goal(e, goal, (0.0, 0.0, course[2] + near), ease(t, DESCEND[0] / pace, DESCEND[1] / pace))
-    move_goal(e, goal, (0.0, 0.0, -near), ease(t, SETTLE[0] / pace, SETTLE[1] / pace))
+    move_goal(e, goal, (course[0], course[1], 0.0), ease(t, plan.approach[0], plan.approach[1]))
+    move_goal(e, goal, (0.0, 0.0, course[2] + near), ease(t, plan.descend[0], plan.descend[1]))
+    move_goal(e, goal, (0.0, 0.0, -near), ease(t, plan.settle[0], plan.settle[1]))
     place_formation(e, goal, rig)
     # After the formation, which writes slots and full cable forces anew in each step: both are changed from there.
-    own.pull_fraction[e] = 1.0 - ease(t, RELEASE[0] / pace, RELEASE[1] / pace)[0]
-    lower = ease(t, LOWER[0] / pace, LOWER[1] / pace)
+    own.pull_fraction[e] = 1.0 - ease(t, plan.release[0], plan.release[1])[0]
+    lower = ease(t, plan.lower[0], plan.lower[1])
     for n in range(rig.slots.shape[0]):
         chord = cable_chord(e, n, goal, rig)
         put(goal.slots[e, n], add(vec(goal.slots, e, n), scale(-SHORTER * lower[0], chord)))
@@ -202,7 +210,7 @@ def slackness(e, v, margin):
 @inlined
 def time_to_touch(e, n, v):
     """Time until the target is on the ground."""
-    return DOWN / v.settings.pace - v.time[e]
+    return v.settings.settle[0] + v.settings.settle[1] - v.time[e]
 
 
 @inlined
@@ -248,11 +256,17 @@ class Land(Task):
         """See `Task.prepare`."""
         option, system, e = self.options, self.world.system, self.world.num_envs
         ground = make_ground(system)
+        margin_ratio(option.margin, system)  # of which cables have enough
+        creeping = option.margin / CREEP
         half = max((drone_half_size(vehicle) for vehicle in system.vehicles), key=np.linalg.norm)
         self.own = LandArrays(np.zeros((e, 3)), np.zeros(e, np.int64), np.zeros(e), np.zeros(e))
         self.settings = LandSettings(
             ground=ground,
-            pace=option.pace,
+            approach=paced(APPROACH, option.pace),
+            descend=paced(DESCEND, option.pace),
+            settle=paced(SETTLE, option.pace, longer=creeping),
+            release=paced(RELEASE, option.pace, later=creeping),
+            lower=paced(LOWER, option.pace, later=creeping),
             radius=option.pad_radius,
             speed=option.touch_speed,
             clearance=option.clearance * min(ground.size, 1.0),

@@ -15,12 +15,16 @@ from multilift_marl.mdp.criteria import Criterion, rest_criteria
 from multilift_marl.mdp.failures import BELOW, CABLE, GROUND, LOAD_GROUND, ignore, payload_height
 from multilift_marl.mdp.ground import (
     CARRIED,
+    CREEP,
     Ground,
+    Margin,
     Pace,
     cable_chord,
     cable_rise,
     make_ground,
+    margin_ratio,
     move_goal,
+    paced,
     place_on_ground,
     pull_fraction,
     readiness,
@@ -36,8 +40,7 @@ from multilift_marl.tasks.base import Kernels, Task
 RISE = (0.1, 1.6)  # begin and length of each phase [s], as of the next ones: drones rise,
 TIGHTEN = (1.7, 1.2)  # cables become taut,
 PULL = (2.9, 1.2)  # drones pull,
-LIFT = (4.1, 2.5)  # the target rises
-ARRIVED = LIFT[0] + LIFT[1]  # [s] from when on the target stays
+LIFT = (4.1, 2.5)  # the target rises, and stays
 SLACK = 0.006  # of a cable's length, short of taut after the rise
 TAUT = 0.002  # of a cable's length, beyond taut before the pull
 RESTING, FLYING, LIFTED = range(3)
@@ -59,6 +62,7 @@ class TakeoffOptions(Section):
     success_seconds: Float = Field(2.0, gt=0, description="[s] ... throughout the last seconds")
     success_tension: Float = Field(2.0, gt=1, description="[-] largest tension at any time, over the resting tension")
     pace: Pace = 1.0
+    margin: Margin = 0.0
 
 
 class TakeoffArrays(NamedTuple):
@@ -83,8 +87,13 @@ class TakeoffSettings(NamedTuple):
     bounds: RestBounds
     climb: float
     """Of the target [m]."""
-    pace: float
-    """Of the plan [-]."""
+    rise: tuple[float, float]
+    """Begin and length [s], as of the next ones."""
+    tighten: tuple[float, float]
+    pull: tuple[float, float]
+    lift: tuple[float, float]
+    margin: np.ndarray
+    """(N,) of each cable's length, beside `SLACK` and `TAUT` [-]."""
 
 
 @drawing
@@ -100,20 +109,22 @@ def start_on_ground(e, rng, v, ranges, distance):
 @inlined
 def advance(e, v):
     """Move the goal on, and find out who has left the ground."""
-    goal, rig, own, t, pace = v.goal, v.rig, v.own, v.time[e], v.settings.pace
+    goal, rig, own, t, plan = v.goal, v.rig, v.own, v.time[e], v.settings
     set_resting_goal(e, goal, row(own.place, e))
-    move_goal(e, goal, (0.0, 0.0, v.settings.climb), ease(t, LIFT[0] / pace, LIFT[1] / pace))
+    move_goal(e, goal, (0.0, 0.0, plan.climb), ease(t, plan.lift[0], plan.lift[1]))
     place_formation(e, goal, rig)
-    risen, tight = ease(t, RISE[0] / pace, RISE[1] / pace), ease(t, TIGHTEN[0] / pace, TIGHTEN[1] / pace)
-    pulled = ease(t, PULL[0] / pace, PULL[1] / pace)
+    risen, tight = ease(t, plan.rise[0], plan.rise[1]), ease(t, plan.tighten[0], plan.tighten[1])
+    pulled = ease(t, plan.pull[0], plan.pull[1])
+    # From -1 to 1 at a constant rate: wherever in the margin a cable becomes taut, it does so slowly.
+    crept = clip(2.0 * (t - plan.tighten[0]) / plan.tighten[1] - 1.0, -1.0, 1.0)
     own.pull_fraction[e] = pulled[0]
     for n in range(rig.slots.shape[0]):
         # along the cable: short of taut, a little beyond, then where the force puts the slot
         chord = cable_chord(e, n, goal, rig)
-        reach = -SLACK + (SLACK + TAUT) * tight[0] - TAUT * pulled[0]
+        reach = -SLACK + (SLACK + TAUT) * tight[0] - TAUT * pulled[0] + plan.margin[n] * (crept - pulled[0])
         slot = add(vec(goal.slots, e, n), scale(reach, chord))
         # from its place on the ground: up first, inward faster and faster
-        under = sub(vec(own.drone_place, e, n), add(vec(goal.slots, e, n), scale(-SLACK, chord)))
+        under = sub(vec(own.drone_place, e, n), add(vec(goal.slots, e, n), scale(-SLACK - plan.margin[n], chord)))
         put(goal.slots[e, n], add(slot, _stretched(under, 1.0 - risen[0] ** 2, 1.0 - risen[0])))
         # Derivatives of 1 - s² and 1 - s: of the way from the ground alone. What tightening the cable adds is not fed
         # forward.
@@ -150,7 +161,7 @@ def _stage(e, v):
 @inlined
 def is_lifted(e, v):
     """Payload at its final target."""
-    return v.time[e] >= ARRIVED / v.settings.pace and is_at_rest(e, v, v.settings.bounds)
+    return v.time[e] >= v.settings.lift[0] + v.settings.lift[1] and is_at_rest(e, v, v.settings.bounds)
 
 
 @inlined
@@ -168,7 +179,7 @@ def forget_peak(e, v):
 @inlined
 def time_to_lift(e, n, v):
     """Time until the target leaves the ground."""
-    return max(LIFT[0] / v.settings.pace - v.time[e], -4.0)
+    return max(v.settings.lift[0] - v.time[e], -4.0)
 
 
 @inlined
@@ -213,9 +224,17 @@ class Takeoff(Task):
         ground = make_ground(system)
         self._spread = option.start_spread * float(system.cable_length.min())
         self._distance = resting_distance(system, self._spread)
+        creeping = 2 * option.margin / CREEP
         self.own = TakeoffArrays(np.zeros((e, 3)), np.zeros((e, n, 3)), np.zeros(e, np.int64), np.zeros(e), np.zeros(e))
         self.settings = TakeoffSettings(
-            ground, RestBounds.of(option), option.target_height - ground.payload, option.pace
+            ground=ground,
+            bounds=RestBounds.of(option),
+            climb=option.target_height - ground.payload,
+            rise=paced(RISE, option.pace),
+            tighten=paced(TIGHTEN, option.pace, longer=creeping),
+            pull=paced(PULL, option.pace, later=creeping),
+            lift=paced(LIFT, option.pace, later=creeping),
+            margin=margin_ratio(option.margin, system),
         )
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:

@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -59,10 +60,10 @@ def make_fakes(system, first: int = FIRST, **changes) -> list[FakePX4]:
 class Airfield:
     """Fake autopilots and the team that they fly; a context that ends both."""
 
-    def __init__(self, system, timeout: float = 20.0, **changes):
+    def __init__(self, system, timeout: float = 20.0, suite: SensorSuite = EXACT, **changes):
         self.fakes = make_fakes(system, **changes)
         try:
-            self.team = AutopilotTeam(system, DT, Settings(first=FIRST, timeout=timeout, suite=EXACT))
+            self.team = AutopilotTeam(system, DT, Settings(first=FIRST, timeout=timeout, suite=suite))
         except Exception:
             self.__exit__()
             raise
@@ -166,6 +167,16 @@ def test_a_team_flies_from_the_ground_through_a_task_and_back(tmp_path):
     ours = flight.fly_ours(lambda vec: make_scripted("formation_integral", vec))
     np.testing.assert_allclose(ours.trace.payload_position[0], result.trace.payload_position[0], atol=0.02)
     assert ours.metrics["payload_position_error_m"][0] < 0.05
+
+
+@pytest.mark.slow
+def test_drones_that_miss_their_places_take_off_and_land_without_a_snatch():
+    suite = replace(EXACT, position=Sensor(50.0, offset=0.03))
+    config = config_of("hover", **{"randomization.payload_force": 0.0, "env.episode_seconds": 1.0})
+    with Airfield(config.system, suite=suite) as field:
+        result = Flight(config, field.team, 1000, lambda text: None).fly(find_policy("formation_integral").bind)
+    assert max(phase.tension for phase in result.phases) < 4 * config.system.resting_tension.max()
+    assert result.estimate_error > 0.02
 
 
 @pytest.mark.slow

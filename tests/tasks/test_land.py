@@ -8,8 +8,10 @@ from conftest import make, zeros
 from test_scripted_flights import fly_once
 
 from multilift_marl.config.load import load_config
+from multilift_marl.mdp.ground import CREEP
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.sim.contact import drone_half_size
+from multilift_marl.tasks import land
 from multilift_marl.tasks.land import AIRBORNE, CRASHED, LANDED, LOWER, NEAR, RELEASE, SETTLE
 
 CALM = {"randomization.payload_mass": 0.0}
@@ -178,6 +180,31 @@ def test_in_return_motors_off_lose_to_staying_high_to_the_formation_to_its_integ
     assert off < 0.2 * high
     assert high < 0.8 * formation
     assert formation < integral
+
+
+def test_with_a_margin_the_payload_settles_more_slowly_and_the_rest_is_later():
+    margin, more = 0.05, 0.05 / CREEP
+    usual, wide = (make("land", num_envs=1, **{"task_options.margin": value}) for value in (0.0, margin))
+    for vec in (usual, wide):
+        vec.reset(seed=0)
+
+    def at(vec, seconds: float):
+        vec.task.time[0] = seconds
+        land.advance(0, vec.task.view_for(land.advance))
+        return vec.task.goal
+
+    np.testing.assert_array_equal(at(wide, SETTLE[0]).position, at(usual, SETTLE[0]).position)
+    for share in (0.25, 0.5, 0.75):
+        slow, fast = (at(vec, SETTLE[0] + share * (SETTLE[1] + add)) for vec, add in ((wide, more), (usual, 0.0)))
+        np.testing.assert_allclose(slow.position, fast.position, atol=1e-12)
+        np.testing.assert_allclose(slow.velocity * (SETTLE[1] + more) / SETTLE[1], fast.velocity, atol=1e-12)
+    for seconds in (RELEASE[0] + 1.0, LOWER[0] + 0.5, LOWER[0] + LOWER[1]):
+        np.testing.assert_allclose(at(wide, seconds + more).slots, at(usual, seconds).slots, atol=1e-12)
+        np.testing.assert_allclose(wide.task.goal.cable_force, usual.task.goal.cable_force, atol=1e-9)
+    for vec, add in ((usual, 0.0), (wide, more)):
+        at(vec, 1.0)
+        left = land.time_to_touch(0, 0, vec.task.view_for(land.time_to_touch))
+        assert left == pytest.approx(SETTLE[0] + SETTLE[1] + add - 1.0)
 
 
 def test_the_slow_last_part_of_the_descent_scales_with_the_vehicle():

@@ -9,12 +9,13 @@ from test_scripted_flights import fly_once
 
 import multilift_marl as ml
 from multilift_marl.math3d import axis_angle
-from multilift_marl.mdp.ground import resting_distance
+from multilift_marl.mdp.ground import CREEP, resting_distance
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.tasks import land, takeoff
-from multilift_marl.tasks.takeoff import ARRIVED, FLYING, LIFT, LIFTED, PULL, RESTING, TIGHTEN
+from multilift_marl.tasks.takeoff import FLYING, LIFT, LIFTED, PULL, RESTING, TIGHTEN
 
+ARRIVED = LIFT[0] + LIFT[1]  # [s]
 CALM = {"randomization.payload_mass": 0.0}
 
 
@@ -104,6 +105,51 @@ def test_at_half_the_pace_the_plan_takes_twice_the_time(task, advance, until, bo
         left = [until(0, 0, vec.task.view_for(until)) for vec in (usual, slow)]
         assert left[1] == pytest.approx(max(2 * left[0], bound)) or left[0] == bound
     assert fastest > 0.2
+
+
+def at(vec, seconds: float):
+    """Return the goal of a plan at a time."""
+    vec.task.time[0] = seconds
+    takeoff.advance(0, vec.task.view_for(takeoff.advance))
+    return vec.task.goal
+
+
+def test_a_margin_is_gone_through_slowly_and_the_rest_of_the_plan_is_later():
+    margin, more = 0.05, 2 * 0.05 / CREEP
+    usual, wide = (make("takeoff", num_envs=1, **{"task_options.margin": value}) for value in (0.0, margin))
+    for vec in (usual, wide):
+        vec.reset(seed=0)
+    near, far = (at(vec, TIGHTEN[0]).slots.copy() for vec in (usual, wide))
+    np.testing.assert_allclose(np.linalg.norm(near - far, axis=-1), margin, rtol=0.01)  # short of taut
+    slots = np.array([at(wide, TIGHTEN[0] + share * more).slots[0].copy() for share in (0.2, 0.4, 0.6, 0.8)])
+    rates = np.linalg.norm(np.diff(slots, axis=0), axis=-1) / (0.2 * more)
+    assert (rates < 1.1 * CREEP).all() and (rates > 0.9 * CREEP).all()
+    near, far = (at(vec, PULL[0] + later).slots.copy() for vec, later in ((usual, 0.0), (wide, more)))
+    np.testing.assert_allclose(np.linalg.norm(near - far, axis=-1), margin, rtol=0.01)  # beyond taut
+    for seconds in (PULL[0] + PULL[1], LIFT[0] + 1.0, ARRIVED):
+        np.testing.assert_allclose(at(wide, seconds + more).slots, at(usual, seconds).slots, atol=1e-12)
+        np.testing.assert_allclose(wide.task.goal.cable_force, usual.task.goal.cable_force, atol=1e-9)
+
+
+def test_with_a_margin_drones_that_miss_their_places_snatch_less():
+    peaks = []
+    for margin in (0.0, 0.05):
+        slow = {"task_options.pace": 0.5, "task_options.margin": margin, "env.episode_seconds": 32.0}
+        vec = make("takeoff", num_envs=1, **CALM, **slow)
+        vec.reset(seed=0)
+        actions = zeros(vec)
+        actions[0, :, 2] = np.array([0.04, -0.04, 0.04, -0.04]) / vec.config.control.max_offset
+        for _ in range(vec.max_steps - 1):
+            vec.step(actions)
+        assert vec.task.own.stage[0] == LIFTED
+        peaks.append(float(vec.world.stats.tension_peak[0]))
+    assert peaks[0] > 3 * peaks[1] and peaks[1] < 2 * vec.world.system.resting_tension.max()
+
+
+@pytest.mark.parametrize("task", ["takeoff", "land"])
+def test_margins_beyond_a_fifth_of_a_cable_are_refused(task):
+    message = refusal(ml.make_vec, task, num_envs=1, **{"task_options.margin": 0.21, "cable.length": 1.0})
+    assert "task_options.margin=0.21 m is 0.21 of a cable's length" in message and "cable.length" in message
 
 
 def test_cables_are_slack_until_the_drones_close_them_and_taut_when_they_pull():

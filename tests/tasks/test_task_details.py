@@ -111,7 +111,7 @@ def test_a_loss_is_observed_by_those_who_know_of_it():
 def test_the_time_to_the_lift_is_observed(time, left):
     view = record(
         time=np.array([time]), goal=record(velocity=np.array([[0.1, 0.2, 0.3]])), own=record(peak=np.array([1.8])),
-        settings=record(pace=1.0),
+        settings=record(lift=(4.1, 2.5)),
     )  # fmt: skip
     assert plain(takeoff.time_to_lift)(0, 0, view) == pytest.approx(left)
     assert plain(takeoff.climb_rate)(0, 0, view) == 0.3
@@ -135,7 +135,7 @@ def landed_team():
         speed=0.3,
         clearance=0.3,
         drone_half=0.1,
-        pace=1.0,
+        settle=(4.8, 1.6),
         ground=record(cable_weight=np.array([0.5, 0.4])),
     )
     state.cable_tension[0] = [0.5, 0.4]

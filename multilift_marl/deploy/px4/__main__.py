@@ -171,7 +171,8 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     report = make_report(config, options.seed, result.metrics, {} if ours is None else {OURS: ours.metrics})
     report["px4"] = {
         "drone_error_m": None if bind is None else result.drone_error, "estimate_error_m": result.estimate_error,
-        "real_time_factor": factor, "lockstep_faults": sum(link.faults for link in team.links),
+        "margin_m": flight.margin, "real_time_factor": factor,
+        "lockstep_faults": sum(link.faults for link in team.links),
         "phases": [phase._asdict() for phase in result.phases if phase.seconds > 0.0], "ended": result.ended,
     }  # fmt: skip
     if options.speed:

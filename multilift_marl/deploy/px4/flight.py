@@ -24,13 +24,15 @@ from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, FlightError
 from multilift_marl.evaluation.rollout import Trace, Tracer, measure_episodes
 from multilift_marl.math3d import ease, heading
+from multilift_marl.mdp.ground import MAX_MARGIN
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
 from multilift_marl.sim.world import World
 
 SCRIPT = "formation_integral"  # of all parts but the task
 _TURNING = 0.5  # [rad/s] of drones about themselves there, on average
-_TAKEOFF, _LANDING = 10.0, 12.0  # [s]
+_TAKEOFF, _LANDING = 33.0, 30.0  # [s]
+_PACE, _MARGIN = 0.5, 0.05  # of these; [m] which PX4's estimates are off by
 LANDING_PACE = 0.5  # at most, of task `land`: at 1 drones are 8 cm late, and payloads have hit the ground
 _BY_AUTOPILOTS = {"randomization.action_delay": 0, "control.disturbance": "none"}  # they are late, and reject forces
 _OWN = ("task", "task_options", "reward")  # what take-off and landing have of their own
@@ -75,6 +77,7 @@ class Flight:
         start: state in which the task began; empty for `takeoff`, which begins as ever.
         phases: of the flight so far.
         stage: in which it is.
+        margin: of its take-off and landing, see the tasks of these names [m].
 
     Raises:
         ConfigError: what autopilots cannot fly.
@@ -89,7 +92,9 @@ class Flight:
         self._flown = build_config(self.config.model_dump(), _BY_AUTOPILOTS)
         self._task = self._make(self._flown)
         self._task.reset(seed=seed)
-        self._landing = self._make(self._part("land", _LANDING, {"pad_xy": 0.0, "pad_yaw": 0.0}))
+        self.margin = min(_MARGIN, MAX_MARGIN * float(self.config.system.cable_length.min()))
+        self._gently = {"pace": _PACE, "margin": self.margin}
+        self._landing = self._make(self._part("land", _LANDING, {"pad_xy": 0.0, "pad_yaw": 0.0, **self._gently}))
         self._landing.reset(seed=seed)
         self.start: dict[str, np.ndarray] = {}
         self.phases: list[Phase] = []
@@ -118,7 +123,7 @@ class Flight:
             if self.config.task == "takeoff":
                 observation = self._arm(self._task)
             else:
-                rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": begin.pose[2]}
+                rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": begin.pose[2], **self._gently}
                 takeoff = self._make(self._part("takeoff", _TAKEOFF, rise))
                 self._run(takeoff, self._arm(takeoff), "take-off", Stage.TAKE_OFF)
                 self._say("to the task")
