@@ -23,7 +23,6 @@ from multilift_marl.mdp.rewards import (
     body_rate,
     distance,
     failure,
-    is_at_rest,
     tolerance,
     update_peak_tension,
     velocity,
@@ -119,8 +118,13 @@ def advance_target(e, v):
 
 @inlined
 def has_arrived(e, v):
-    """Payload at rest at the goal, where the target has arrived."""
-    return norm(sub(row(v.goal.position, e), row(v.own.goal, e))) < 1e-6 and is_at_rest(e, v, v.settings.bounds)
+    """Payload at rest at the goal, wherever the target is."""
+    bounds, state = v.settings.bounds, v.state
+    if norm(sub(row(state.payload_position, e), row(v.own.goal, e))) > bounds.distance:
+        return False
+    moving = norm(row(state.payload_velocity, e)) > bounds.speed
+    turning = norm(row(state.payload_body_rates, e)) > bounds.body_rate
+    return v.errors.angle[e] <= bounds.angle and not (moving or turning)
 
 
 @inlined
