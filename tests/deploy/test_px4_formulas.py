@@ -166,6 +166,16 @@ def test_what_stands_for_an_autopilots_delay_and_integral_is_not_added_to_its_ow
     assert ours.randomization.action_delay == (1, 3) and ours.control.disturbance == "integral"
 
 
+def test_a_flights_own_take_off_and_landing_go_gently_through_a_margin_that_its_cables_have():
+    flight = Flight(ml.load_config("hover"), record(report=lambda state: None), 2000)
+    for task in ("takeoff", "land"):
+        options = flight._part(task, 30.0, {}).task_options
+        assert options["pace"] == 0.5 and options["margin"] == 0.05
+    assert "margin" not in flight._part("track", 1.0, {}).task_options
+    flight.config = record(system=record(cable_length=np.array([0.3, 0.2])))
+    assert flight.margin == pytest.approx(0.04)
+
+
 class Rehearsal(Flight):
     """A flight without autopilots: parts follow each other, and one of them may fail."""
 

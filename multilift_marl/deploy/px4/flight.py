@@ -77,7 +77,6 @@ class Flight:
         start: state in which the task began; empty for `takeoff`, which begins as ever.
         phases: of the flight so far.
         stage: in which it is.
-        margin: of its take-off and landing, see the tasks of these names [m].
 
     Raises:
         ConfigError: what autopilots cannot fly.
@@ -92,9 +91,7 @@ class Flight:
         self._flown = build_config(self.config.model_dump(), _BY_AUTOPILOTS)
         self._task = self._make(self._flown)
         self._task.reset(seed=seed)
-        self.margin = min(_MARGIN, MAX_MARGIN * float(self.config.system.cable_length.min()))
-        self._gently = {"pace": _PACE, "margin": self.margin}
-        self._landing = self._make(self._part("land", _LANDING, {"pad_xy": 0.0, "pad_yaw": 0.0, **self._gently}))
+        self._landing = self._make(self._part("land", _LANDING, {"pad_xy": 0.0, "pad_yaw": 0.0}))
         self._landing.reset(seed=seed)
         self.start: dict[str, np.ndarray] = {}
         self.phases: list[Phase] = []
@@ -105,6 +102,11 @@ class Flight:
     def vec(self) -> MultiliftVec:
         """The environment of the task."""
         return self._task
+
+    @property
+    def margin(self) -> float:
+        """Of its own take-off and landing, see the tasks of these names [m]."""
+        return min(_MARGIN, MAX_MARGIN * float(self.config.system.cable_length.min()))
 
     def fly(self, make_policy: Maker, on_step: OnStep | None = None) -> FlightResult:
         """Fly, and return the task as measured.
@@ -123,7 +125,7 @@ class Flight:
             if self.config.task == "takeoff":
                 observation = self._arm(self._task)
             else:
-                rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": begin.pose[2], **self._gently}
+                rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": begin.pose[2]}
                 takeoff = self._make(self._part("takeoff", _TAKEOFF, rise))
                 self._run(takeoff, self._arm(takeoff), "take-off", Stage.TAKE_OFF)
                 self._say("to the task")
@@ -229,7 +231,9 @@ class Flight:
         return _measure(vec, make_policy(vec), observation)
 
     def _part(self, task: str, seconds: float, options: dict[str, Any]) -> Config:
-        """Return the configuration of another task by the same rig."""
+        """Return the configuration of another task by the same rig; it leaves the ground and comes to it gently."""
+        if task in ("takeoff", "land"):
+            options = {**options, "pace": _PACE, "margin": self.margin}
         values = {key: value for key, value in self._flown.model_dump().items() if key not in _OWN}
         overrides = {f"task_options.{key}": value for key, value in options.items()}
         overrides |= {"task": task, "env.episode_seconds": seconds, "control.action": "reference"}
