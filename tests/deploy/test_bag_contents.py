@@ -21,6 +21,7 @@ from multilift_marl.deploy.ros.live import LiveFlight
 from multilift_marl.deploy.ros.markers import _HEAVY, CUBE, CYLINDER, SPHERE, TRIANGLES
 from multilift_marl.deploy.ros.messages import FlightMessages
 from multilift_marl.deploy.ros.types import EXACT
+from multilift_marl.sim.obstacle_distance import ray_distance
 from multilift_marl.sim.scene import build_model
 
 TWO = {"num_drones": 2, "payload.mass": 0.7}
@@ -308,3 +309,35 @@ def test_mcaps_own_reader_reads_the_bag_of_jazzy(tmp_path):
             other.header.frame_id,
         )
         np.testing.assert_array_equal(place(one.scale), place(other.scale))
+
+
+def test_markers_of_obstacles_are_where_rays_meet_them(tmp_path):
+    wedge = str(write_wedge(tmp_path / "wedge.obj"))
+    around = [
+        {"shape": "box", "size": [0.6, 0.4, 2.0], "position": [3, 0, 1], "rotation": [10, 20, 30]},
+        {"shape": "cylinder", "size": [0.6, 1.5], "position": [-3, 0, 1], "rotation": [40, 0, 0]},
+        {"shape": "sphere", "size": [0.5], "position": [0, 3, 1], "travel": [0.5, 0, 0], "period": 1.0},
+        {"shape": "mesh", "mesh": wedge, "position": [0, -3, 1], "rotation": [0, 70, 0]},
+    ]
+    vec = make("hover", **TWO, **{"scene.obstacles": around})
+    with BagWriter(tmp_path / "bag", vec) as writer:
+        for k in range(10):
+            vec.step(np.zeros((1, 2, 4)))
+            writer.write(0.02 * (k + 1))
+    heard = read(tmp_path / "bag")
+    static = [m for m in heard["/scene"][0][1].markers if m.ns == "scenery"]
+    moving = [m for m in heard["/markers"][-1][1].markers if m.ns == "scenery"]
+    assert len(static) == len(moving) == 4
+    obstacles, hulls, world = vec.world.obstacles, vec.task.view.hulls, {"world": (np.zeros(3), np.eye(3))}
+    assert place(static[2].pose.position)[0] == 0.0 and abs(place(moving[2].pose.position)[0]) > 0.3
+    rng, met = np.random.default_rng(0), 0
+    for k in range(120):
+        m = k % 4
+        way = rng.standard_normal(3)
+        way /= np.linalg.norm(way)
+        origin = obstacles.position[0, m] - 3.0 * way + 0.2 * rng.standard_normal(3)
+        expected = ray_distance(0, m, tuple(origin), tuple(way), obstacles, hulls)
+        found = hit(moving[m], world, origin, way)
+        met += np.isfinite(found)
+        assert found == pytest.approx(expected, abs=2e-5)
+    assert met > 40

@@ -217,3 +217,34 @@ def test_the_camera_above_a_track_sees_all_of_its_path():
     assert max(np.abs(up).max(), np.abs(right).max()) < 1.0
     assert max(np.abs(up).max(), np.abs(right).max()) > 0.6  # and not from afar
     assert depth.min() > 0
+
+
+def test_obstacles_are_drawn_as_they_are(tmp_path):
+    wedge = tmp_path / "wedge.obj"
+    wedge.write_text("v 0 0 0\nv 0.5 0.1 0\nv 0.1 0.4 0\nv 0.2 0.1 0.3\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    around = [
+        {"shape": "box", "size": [0.6, 0.4, 2.0], "position": [3, 0, 1]},
+        {"shape": "cylinder", "size": [0.6, 1.5], "position": [-3, 0, 1]},
+        {"shape": "sphere", "size": [0.5], "position": [0, 3, 1], "travel": [0.5, 0, 0], "period": 1.0},
+        {"shape": "mesh", "mesh": str(wedge), "position": [0, -3, 1], "rotation": [0, 70, 30]},
+    ]
+    vec = make("hover", num_envs=1, **{"scene.obstacles": around})
+    vec.reset(seed=0)
+    for _ in range(10):
+        vec.step(zeros(vec))
+    stage = shown(vec)
+    box, cylinder, sphere, mesh = extra(stage)[:4]
+    form = mujoco.mjtGeom
+    kinds = [form.mjGEOM_BOX, form.mjGEOM_CYLINDER, form.mjGEOM_SPHERE, form.mjGEOM_MESH]
+    assert [geom.type for geom in (box, cylinder, sphere, mesh)] == kinds
+    # The scene's sizes are half extents along all axes.
+    for geom, half in ((box, (0.3, 0.2, 1.0)), (cylinder, (0.3, 0.3, 0.75)), (sphere, (0.25, 0.25, 0.25))):
+        np.testing.assert_allclose(geom.size, half, atol=1e-6)
+    assert sphere.pos[0] == pytest.approx(0.5 * np.sin(2 * np.pi * 0.2), abs=1e-6)
+    # Corners of the mesh as drawn are those of the hull in its place.
+    vertices = stage.model.mesh_vert[: stage.model.mesh_vertnum[0]]
+    corners = vertices @ np.array(mesh.mat).reshape(3, 3).T + mesh.pos
+    hull, frame = vec.task.view.hulls[0], vec.world.obstacles.rotation[0, 3]
+    expected = hull @ frame.T + vec.world.obstacles.position[0, 3]
+    order = np.lexsort(np.round(corners, 4).T), np.lexsort(np.round(expected, 4).T)
+    np.testing.assert_allclose(corners[order[0]], expected[order[1]], atol=1e-5)
