@@ -248,9 +248,8 @@ class MultiliftVec:
         """
         check_saved(saved, self.state_dict(), "world.diverged", "world.system", "task_name")
         delays, most = self.config.randomization, 2**63 - 1
-        counts = dict.fromkeys(
-            ("steps", "seeds", *(f"sensing.{x}" for x in ("sent", "seen", "obstacle_steps"))), (0, most)
-        )
+        whole = "steps", "seeds", "sensing.sent", "sensing.seen", "sensing.obstacle_steps"
+        counts = dict.fromkeys(whole, (0, most))
         counts |= {"episodes": (-1, most), "task.time": (0, most), "task.cause": (0, len(self.failure_causes) - 1)}
         counts |= {f"task.own.{name}": limits for name, limits in self.task.count_limits().items()}
         counts |= {f"sensing.{name}": (0, getattr(delays, name)[1]) for name in ("action_delay", "observation_delay")}

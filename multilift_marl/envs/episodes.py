@@ -88,9 +88,10 @@ class Episodes:
         for _ in range(_MAX_REDRAWS):
             if self._task.draw_start(e, rng, self._draw.parameters):
                 return
+        cure = "move scene.obstacles, " if self._cause(e) == "obstacle" else ""
         raise ConfigError(
             f"no start of task {self._task.name} is free of failure ({self._cause(e)}) in {_MAX_REDRAWS} "
-            "draws; narrow the start ranges in task_options or change the rig"
+            f"draws; {cure}narrow the start ranges in task_options or change the rig"
         )
 
     def _give(self, e: int, given: Rows) -> None:

@@ -169,7 +169,7 @@ def time_path(
         speeds = share * settings.speed, share * settings.acceleration
         table = time_route(knots, points, *speeds, pace, departure, fade)
         length = float(np.linalg.norm(np.diff(values[:, :3], axis=0), axis=1).sum())
-        report = RouteReport(0, length, float(table[-1, 0]), 0.0, thread_time() - begun)
+        report = RouteReport(0, length, float(table[-1, 0]), float("nan"), thread_time() - begun)
         route = Route(table[:, 0], table, body.rest, modes, report)
         if move_team(route, system, body, _NO_SCENE, 0.0).feasible(tilt):
             break

@@ -16,17 +16,18 @@ from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, clear
 
 LEVELS = ("sparse", "dense", "narrow", "unknown")
 CAPACITY = 16  # rows that a map needs at most
-FALCONS = 1.48  # [m] width of the resting formation of four falcons
+FALCONS = 1.4637  # [m] width of the resting formation of four falcons
 LENGTH = 8.0  # from start to goal, like the next ones in units of length
 WIDTH = 3.0  # the payload may stray from the line between them
 FIELD = 2.6  # obstacles stand as far as this before and behind the middle, and ...
 SIDE = 2.8  # ... to its sides
-TALL = 3.0  # height of pillars and walls, more than a team under the ceiling reaches
 LEVEL = 1.4  # height of start and goal, at least
-CEILING = 1.7  # of the payload
+RISE = 0.2  # by which they may be higher
+CEILING = 0.3  # of the payload above that level, 0.1 m added
 PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # how many; least gaps between them
 RADIUS = 0.12, 0.32  # of pillars
 GAPS = 0.5, 0.8  # range of the widths of a narrow map's gaps over the resting formation's
+SPARE = 0.15  # that a gap is wider than the payload, at least
 WALLS = 3  # of a narrow map
 MAX_WALLS = CAPACITY // 2
 _DRAWS = 4000
@@ -72,15 +73,20 @@ def draw_map(level: str, seed: int, system: System, gaps: tuple[float, float] = 
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(LEVELS.index(level),)))
     unit = unit_length(system)
     height = max(LEVEL * unit, float(system.payload_size[2]) + 0.5)
-    start = np.array([-LENGTH / 2 * unit, rng.uniform(-0.8, 0.8) * unit, height])
-    goal = np.array([LENGTH / 2 * unit, rng.uniform(-0.8, 0.8) * unit, height])
-    low = np.array([-(LENGTH / 2 + 1.0) * unit, -WIDTH * unit, 0.6 * height])
-    high = np.array([(LENGTH / 2 + 1.0) * unit, WIDTH * unit, max(CEILING * unit, height + 0.3)])
-    placed = (
-        _walls(rng, unit, formation_width(system), gaps, walls)
-        if level == "narrow"
-        else _pillars(rng, unit, *PILLARS[level])
+    start, goal = (
+        np.array([side * LENGTH / 2 * unit, rng.uniform(-0.8, 0.8) * unit, height + rng.uniform(0, RISE) * unit])
+        for side in (-1, 1)
     )
+    low = np.array([-(LENGTH / 2 + 1.0) * unit, -WIDTH * unit, 0.6 * height])
+    high = np.array([(LENGTH / 2 + 1.0) * unit, WIDTH * unit, height + 0.1 + CEILING * unit])
+    # No team flies over what stands on the ground, its cables upright and the payload at the ceiling.
+    reach = float(system.cable_length.max() + np.linalg.norm(system.anchors, axis=1).max())
+    tall = high[2] + reach + 0.1
+    if level == "narrow":
+        least = float(system.payload_size[:2].min()) + SPARE * unit
+        placed = _walls(rng, unit, tall, (formation_width(system), least), gaps, walls)
+    else:
+        placed = _pillars(rng, unit, tall, (height - 0.2 * unit, height + reach), *PILLARS[level])
     return Map(start, goal, low, high, tuple(placed))
 
 
@@ -91,8 +97,10 @@ def place_map(env: int, drawn: Map, obstacles: Obstacles, first: int = 0) -> Non
         place_obstacle(env, row, obstacles, *each)
 
 
-def _pillars(rng: np.random.Generator, unit: float, count: int, apart: float) -> list[Obstacle]:
-    """Draw round and square pillars and, one in five, balls in mid-air, surfaces `apart` from each other."""
+def _pillars(
+    rng: np.random.Generator, unit: float, tall: float, balls: tuple[float, float], count: int, apart: float
+) -> list[Obstacle]:
+    """Draw pillars `tall` [m], round and square, and, one in five, balls between two heights, surfaces `apart`."""
     placed: list[Obstacle] = []
     discs = np.zeros((0, 3))
     for _ in range(_DRAWS):
@@ -104,27 +112,32 @@ def _pillars(rng: np.random.Generator, unit: float, count: int, apart: float) ->
         if (gaps < apart * unit).any():
             continue
         discs = np.vstack([discs, (x, y, radius)])
-        form, turned, height = rng.uniform(), rng.uniform(0.0, pi / 2), rng.uniform(1.2, 2.4) * unit
+        form, turned, height = rng.uniform(), rng.uniform(0.0, pi / 2), rng.uniform(*balls)
         if form < 0.2:
             placed.append(Obstacle(SPHERE, (radius, radius, radius), (x, y, height), 0.0))
         elif form < 0.6:
-            placed.append(Obstacle(CYLINDER, (radius, radius, TALL * unit / 2), (x, y, TALL * unit / 2), 0.0))
+            placed.append(Obstacle(CYLINDER, (radius, radius, tall / 2), (x, y, tall / 2), 0.0))
         else:
             half = radius / 2**0.5  # its corners on the circle
-            placed.append(Obstacle(BOX, (half, half, TALL * unit / 2), (x, y, TALL * unit / 2), turned))
+            placed.append(Obstacle(BOX, (half, half, tall / 2), (x, y, tall / 2), turned))
     return placed
 
 
 def _walls(
-    rng: np.random.Generator, unit: float, width: float, gaps: tuple[float, float], walls: int
+    rng: np.random.Generator,
+    unit: float,
+    tall: float,
+    widths: tuple[float, float],
+    gaps: tuple[float, float],
+    walls: int,
 ) -> list[Obstacle]:
-    """Draw walls across the way, each with a gap of a width between `gaps` over the formation's `width` [m]."""
+    """Draw walls `tall` [m] across the way with gaps: as `gaps` over the first of `widths`, at least the second [m]."""
     placed = []
-    thick, end, top = 0.1 * unit, (WIDTH + 1.5) * unit, TALL * unit / 2
+    thick, end, top = 0.1 * unit, (WIDTH + 1.5) * unit, tall / 2
     middle = rng.uniform(-0.3, 0.3) * unit
     for wall in range(walls):
         x = (wall - (walls - 1) / 2) * min(2.2, 2 * FIELD / max(walls, 1)) * unit + rng.uniform(-0.2, 0.2) * unit
-        half = 0.5 * rng.uniform(*gaps) * width
+        half = 0.5 * max(rng.uniform(*gaps) * widths[0], widths[1])
         middle = float(np.clip(middle + rng.uniform(-1.4, 1.4) * unit, -2.0 * unit, 2.0 * unit))
         lean = rng.uniform(-0.15, 0.15)  # of the wall from the perpendicular [rad]
         for side in (-1.0, 1.0):

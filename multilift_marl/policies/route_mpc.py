@@ -50,6 +50,8 @@ class RouteMpc(TeamMpc):
             raise ConfigError(
                 f"policy={self.NAME} needs the map of task navigate, not {vec.task.name}; take policy=mpc"
             )
+        if vec.config.planner.limits == "hard":
+            raise ConfigError(f"policy={self.NAME} keeps clear of obstacles by soft limits; set planner.limits=soft")
         super().__init__(vec, self._follow)
         e = vec.num_envs
         self._task = vec.task

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, radians, sin
+from math import cos, pi, radians, sin
 
 import mujoco
 import numpy as np
@@ -13,6 +13,7 @@ from multilift_marl.rig.mesh import read_mesh
 from multilift_marl.schema.scene import ObstacleConfig, SceneConfig
 
 NONE, BOX, CYLINDER, SPHERE, HULL = range(5)
+MAX_SPEED = 5.0  # [m/s]
 _SIZES = {"box": 3, "wall": 3, "cylinder": 2, "sphere": 1, "mesh": 3}
 
 
@@ -68,6 +69,12 @@ def resolve_scenery(config: SceneConfig) -> Scenery:
 def _resolve(given: ObstacleConfig, key: str) -> list[Obstacle]:
     """Return the bodies of one obstacle."""
     needed = _SIZES[given.shape]
+    speed = 2 * pi * float(np.linalg.norm(given.travel)) / given.period
+    if speed > MAX_SPEED:
+        raise ConfigError(
+            f"{key} moves at up to {speed:.3g} m/s, and may at {MAX_SPEED:g}: faster ones pass through bodies between "
+            "two steps; lengthen its period or shorten its travel"
+        )
     if given.size is None and given.shape != "mesh":
         raise ConfigError(f"{key} has no size; give {needed} of them [m] for a {given.shape}")
     if given.size is not None and len(given.size) != needed:

@@ -42,7 +42,7 @@ class ObstacleConfig(Section):
 
 
 class SceneConfig(Section):
-    """Obstacles; drones, cables and payload must not touch them (docs/obstacles.md)."""
+    """Obstacles; drones, cables and payload must not touch them (docs/navigate.md)."""
 
     obstacles: tuple[ObstacleConfig, ...] = Field((), description="the obstacles")
     reserved: Int = Field(0, ge=0, le=200, description="further obstacles that the task may place in each episode")

@@ -6,6 +6,7 @@ convex hull. Distances are in `obstacle_distance.py`, their bodies in MuJoCo's m
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import cos, pi, sin
 from typing import NamedTuple
 
@@ -112,6 +113,34 @@ def move_obstacles(e, obstacles):
         put(obstacles.position[e, m], add(vec(obstacles.center, e, m), scale(sin(angle), travel)))
         put(obstacles.velocity[e, m], scale(rate * cos(angle), travel))
     return moving
+
+
+def restart_obstacles(env: int, obstacles: Obstacles) -> None:
+    """Put the obstacles of one environment where they are when an episode starts."""
+    obstacles.clock[env] = 0.0
+    move_obstacles(env, obstacles)
+
+
+def check_obstacles(saved: Mapping[str, np.ndarray], obstacles: Obstacles, scenery: Scenery) -> None:
+    """Refuse a saved state, which fits otherwise, whose obstacles are others than configured or of no kind.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    if not scenery.count:
+        return
+    fixed = len(scenery.obstacles)
+    for name in ("kind", "size", "rotation", "hull", "center", "travel", "period", "phase"):
+        key = f"obstacles.{name}"
+        array, own = saved[key], getattr(obstacles, name)
+        other = (array[:, :fixed] != own[:, :fixed]).any()
+        if name in ("kind", "hull"):  # kernels index by these; hulls are of the configuration alone
+            other |= (array[:, fixed:] < 0).any() or (array[:, fixed:] > (SPHERE if name == "kind" else 0)).any()
+        if other:
+            raise ValueError(
+                f"the saved state does not fit these environments: '{key}' holds obstacles that are not theirs; give "
+                "what state_dict() returned"
+            )
 
 
 def clear_obstacles(env: int, obstacles: Obstacles, first: int = 0) -> None:

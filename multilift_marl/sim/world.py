@@ -24,7 +24,7 @@ from multilift_marl.sim.contact import NEAR, body_radii, find_close, search_cont
 from multilift_marl.sim.dynamics import apply_loads
 from multilift_marl.sim.gusts import start_turbulence
 from multilift_marl.sim.obstacle_bodies import ShardObstacles
-from multilift_marl.sim.obstacles import make_obstacles
+from multilift_marl.sim.obstacles import check_obstacles, make_obstacles
 from multilift_marl.sim.parameters import (
     Parameters,
     make_inertias,
@@ -329,6 +329,7 @@ class World:
             ValueError: it is of another system, or not what `state_dict` returned; nothing is changed then.
         """
         check_saved(saved, self.state_dict(), "diverged", "system")
+        check_obstacles(saved, self.obstacles, self.system.scenery)
         # By `set_parameters` first, which brings the models into line; the arrays alone would leave them as they are.
         parameters = {name: saved[f"parameters.{name}"] for name in Parameters._fields}
         self.set_parameters(np.ones(self.num_envs, bool), **parameters)

@@ -27,7 +27,7 @@ from multilift_marl.rig.constants import RigArrays
 from multilift_marl.schema.validate import check_magnitudes, validate
 from multilift_marl.schema.values import Section
 from multilift_marl.sensing.measurement import Sensing
-from multilift_marl.sim.obstacles import make_hulls
+from multilift_marl.sim.obstacles import make_hulls, restart_obstacles
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.saved import flatten
 from multilift_marl.sim.world import World
@@ -332,6 +332,7 @@ class Task:
         self.good_time[env], self.min_separation[env], self.terms[env], self.time[env] = 0.0, 1e9, 0.0, 0.0
         self.clearance[env] = self.min_clearance[env] = SIGHT
         self.cause[env] = 0
+        restart_obstacles(env, self.world.obstacles)
         self.stages["measure"](env, env + 1)
         self.numpy.find_failures(env, env + 1)
         return bool(self.cause[env] == 0)

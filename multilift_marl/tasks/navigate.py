@@ -39,7 +39,7 @@ class NavigateOptions(Section):
     """The map, the target's motion along the straight line, and what counts as success."""
 
     level: Literal["sparse", "dense", "narrow", "unknown"] = Field("sparse", description="of the maps")
-    gaps: Span = Field(
+    gaps: Annotated[Span, Between(0.1, 1.5)] = Field(
         GAPS, description="[-] widths of the gaps of level narrow over the resting formation's, or their range"
     )
     walls: Int = Field(WALLS, ge=1, le=MAX_WALLS, description="of level narrow")
@@ -131,7 +131,8 @@ def has_arrived(e, v):
 def measure_way(e, v):
     """Add to the length of the payload's way; count leaving the map as a failure."""
     here = row(v.state.payload_position, e)
-    v.own.travelled[e] += norm(sub(here, row(v.own.place, e)))
+    moved = norm(sub(here, row(v.own.place, e)))
+    v.own.travelled[e] = v.own.travelled[e] + moved if v.time[e] > 0.0 else 0.0
     put(v.own.place[e], here)
     for i in range(3):
         if v.cause[e] == 0 and not v.own.low[e, i] <= here[i] <= v.own.high[e, i]:
@@ -146,7 +147,7 @@ def clearance(e, v, margin):
 
 @inlined
 def to_goal(e, n, v):
-    """Goal minus where the payload is, as the drone knows it."""
+    """Goal minus where the target is."""
     return sub(row(v.own.goal, e), row(v.goal.position, e))
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import load, make_system, refuse_system
+from conftest import load, make, make_system, refuse_system, zeros
 from test_contact import FALL, without_drag
 
 from multilift_marl.rig.obstacles import BOX, CYLINDER, SPHERE, resolve_scenery
@@ -168,3 +168,33 @@ def test_gaps_leave_the_rest_of_a_wall():
 )
 def test_obstacles_that_cannot_be_are_refused(given, text):
     assert text in refuse_system(4, **{"scene.obstacles": [given]})
+
+
+@pytest.mark.parametrize(
+    ("key", "row", "value"), [("kind", 1, 4), ("kind", 1, -1), ("hull", 1, 10**9), ("size", 0, 2.0), ("kind", 0, 1)]
+)
+def test_saved_obstacles_that_are_not_theirs_are_refused(key, row, value):
+    ball = {"shape": "sphere", "size": [0.4], "position": [0, 0, 0.2]}
+    world = make_world(1, obstacles=[ball], reserved=1)
+    saved = world.state_dict()
+    saved[f"obstacles.{key}"][0, row] = value
+    with pytest.raises(ValueError, match=rf"'obstacles.{key}' holds obstacles that are not theirs"):
+        world.load_state_dict(saved)
+
+
+def test_obstacles_that_move_too_fast_are_refused():
+    fast = {"shape": "sphere", "size": [0.4], "travel": [1, 0, 0], "period": 1.0}
+    assert "moves at up to 6.28 m/s, and may at 5" in refuse_system(4, **{"scene.obstacles": [fast]})
+
+
+def test_moving_obstacles_start_anew_with_an_episode():
+    moving = {"shape": "sphere", "size": [1.0], "position": [0, 0, 1.5], "travel": [9, 0, 0], "period": 20.0}
+    vec = make("hover", num_envs=8, **{"scene.obstacles": [moving | {"phase": 0.25}]})
+    vec.reset(seed=3)
+    first = vec.world.state.payload_position.copy()
+    for _ in range(10):
+        vec.step(zeros(vec))
+    vec.world.obstacles.position[:, 0, 0] = 0.0  # as if it had come to where teams start
+    vec.reset(seed=3)
+    assert np.array_equal(vec.world.state.payload_position, first)
+    assert (vec.world.obstacles.position[:, 0, 0] == 9.0).all() and (vec.task.min_clearance > 0.5).all()

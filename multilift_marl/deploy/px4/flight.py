@@ -359,6 +359,11 @@ def check_config(config: Config) -> Config:
             f"drones under PX4 follow config=land too late at task_options.pace={pace:g}, and the "
             f"payload hits the ground; set task_options.pace={LANDING_PACE:g} and env.episode_seconds=24"
         )
+    if config.task == "navigate" or config.scene.obstacles:
+        raise ConfigError(
+            "PX4 flies where nothing is in the way: a flight's own ways to and from its task do not avoid obstacles; "
+            "take another task than navigate, and leave scene.obstacles out"
+        )
     if config.cable.model != "massless":
         raise ConfigError("flights by PX4 go on from state to state, which chains cannot; set cable.model=massless")
     return build_config(config.model_dump(), {"env.num_envs": 1, "env.num_threads": 1})
