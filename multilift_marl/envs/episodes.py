@@ -88,7 +88,7 @@ class Episodes:
         for _ in range(_MAX_REDRAWS):
             if self._task.draw_start(e, rng, self._draw.parameters):
                 return
-        cure = "move scene.obstacles, " if self._cause(e) == "obstacle" else ""
+        cure = "move scene.obstacles, " if self._cause(e) == "obstacle_collision" else ""
         raise ConfigError(
             f"no start of task {self._task.name} is free of failure ({self._cause(e)}) in {_MAX_REDRAWS} "
             f"draws; {cure}narrow the start ranges in task_options or change the rig"

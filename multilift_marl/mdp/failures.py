@@ -38,7 +38,7 @@ CAUSES = (
     "tilt",  # a drone tilted over 80°
     "cable_broken",  # its tension has exceeded cable.breaking_load
     "wall",  # anything touches a wall (task gate)
-    "obstacle",  # a drone, a cable or the payload touches one
+    "obstacle_collision",  # a drone, a cable or the payload touches an obstacle
     "out_of_range",  # payload over 3 m from its target, whatever the vehicle; of navigate: outside its map
     "diverged",  # the simulation has failed, not the team
 )

@@ -28,6 +28,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
     "track": {"task_options.path": "random"},
     "takeoff": {"control.max_offset": 0.01},
+    "navigate": {"env.obstacle_sensing": "none"},
     "land": {"control.max_offset": 0.01},
     "loss": {"task_options.loss_time": [0.2, 0.3], "task_options.broadcast": True},
 }
@@ -192,6 +193,14 @@ def loss(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
     }
 
 
+def navigate(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
+    """See docs/navigate.md: the target moves straight to the goal."""
+    return {
+        "to_goal": m.in_slot_frame(m.vec.task.own.goal - m.goal["position"]),
+        "target_velocity": m.in_slot_frame(m.goal["velocity"]),
+    }
+
+
 def pose(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
     """See docs/pose.md."""
     each = m.vec.task.options.target_seconds
@@ -234,7 +243,7 @@ def track(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
 
 
 OWN: dict[str, Callable[[Moment, list[Moment]], dict[str, np.ndarray]]] = {
-    "gate": gate, "hover": lambda m, later: {}, "land": land, "loss": loss, "pose": pose, "recover": recover,
+    "gate": gate, "hover": lambda m, later: {}, "land": land, "loss": loss, "navigate": navigate, "pose": pose, "recover": recover,
     "takeoff": takeoff, "track": track,
 }  # fmt: skip
 

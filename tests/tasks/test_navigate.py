@@ -101,7 +101,7 @@ def test_what_touches_fails_and_says_so():
         place_obstacle(e, 3, obstacles, CYLINDER, (0.02, 0.02, 0.02), tuple(place))
     _, _, terminated, _, info = vec.step(zeros(vec))
     assert terminated.all()
-    assert [vec.failure_causes[cause] for cause in info["failure_cause"]] == ["obstacle"] * 3
+    assert [vec.failure_causes[cause] for cause in info["failure_cause"]] == ["obstacle_collision"] * 3
     assert (vec.task.min_clearance == 0.0).all()
 
 
