@@ -243,8 +243,8 @@ def track(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
 
 
 OWN: dict[str, Callable[[Moment, list[Moment]], dict[str, np.ndarray]]] = {
-    "gate": gate, "hover": lambda m, later: {}, "land": land, "loss": loss, "navigate": navigate, "pose": pose, "recover": recover,
-    "takeoff": takeoff, "track": track,
+    "gate": gate, "hover": lambda m, later: {}, "land": land, "loss": loss, "navigate": navigate,
+    "pose": pose, "recover": recover, "takeoff": takeoff, "track": track,
 }  # fmt: skip
 
 
