@@ -381,7 +381,7 @@ class Task:
         failures = {number: has_failed for number, has_failed in own if not is_plain(has_failed)}
         check = compose_check(kernels.check, kernels.plan is None, failures, self.world.system.scenery.count > 0)
         stages = {
-            "measure": self._bind(check, v, 0.0),
+            "measure": self._bind(check, v._replace(nodes=None), 0.0),  # chains are placed later, by `World.load`
             "check": self._bind(check, v, self.dt),
             "reward": self._bind(
                 compose_reward(self.REWARD, kernels.is_good, kernels.update), v, self.weights, self.margins
