@@ -33,7 +33,7 @@ PARTS = (*MODULES, *(f"gains {name}" for name in TUNED), *(f"task {name}" for na
 def as_json(value: Any) -> Any:
     """Return numbers, texts, and tuples and dictionaries of them, as JSON holds them; None for all else."""
     if isinstance(value, bool | int | float | str):
-        return value
+        return value if value == value else None  # NaN
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
         parts = [as_json(each) for each in value]
         return None if None in parts else parts
