@@ -29,6 +29,7 @@ DRAWS = int(os.environ.get("FLIGHT_DRAWS", "100"))
 SECTIONS = ("env", "sim", "vehicle", "payload", "cable", "control", "randomization", "wind")
 SIZES = ("env.num_envs", "env.num_threads")  # cost memory and threads, and change nothing else
 FILES = ("payload.mesh",)
+NESTED = ("env.obstacles",)  # a section of its own: tests/sensing/test_obstacle_sensing.py
 CHAIN = {"cable.model": "chain", "cable.segments": 3, "cable.bending_stiffness": 1e-3}
 BASES = {
     "massless": ("hover", {}),
@@ -59,7 +60,7 @@ def leaves() -> dict[str, Any]:
         f"{section}.{key}": field
         for section in SECTIONS
         for key, field in typing.cast(type[Section], Config.model_fields[section].annotation).model_fields.items()
-        if f"{section}.{key}" not in (*SIZES, *FILES)
+        if f"{section}.{key}" not in (*SIZES, *FILES, *NESTED)
     }
 
 
