@@ -7,7 +7,7 @@ import pytest
 from conftest import bold_actions, make, mask, mixed_actions, same, zeros
 
 from multilift_marl.envs.step_kernels import ENDED, NOT_FINITE, TAKEN, Outcome, end_step, take_actions
-from multilift_marl.mdp.failures import DIVERGED
+from multilift_marl.mdp.failures import DIVERGED, FIRST_OWN
 from multilift_marl.sim.parameters import MASSES, make_inertias, nominal_parameters, update_inertias
 from multilift_marl.sim.state_io import find_warnings
 
@@ -40,7 +40,7 @@ def test_ends_by_failure_divergence_and_time():
     outcome = Outcome.of(np.zeros((4, 2, 1), np.float32), np.ones((4, 3)))
     diverged, cause, ended = mask(4, 2), np.array([0, 3, 0, 0]), np.ones(4, bool)
     steps = np.array([0, 9, 9, 9])
-    assert end_step(diverged, cause, 11, steps, 10, ended, outcome) == (1, -1)
+    assert end_step(diverged, cause, FIRST_OWN, steps, 10, ended, outcome) == (1, -1)
     assert steps.tolist() == [1, 10, 10, 10] and ended.tolist() == [False, True, True, True]
     terminated, truncated, success, failure, lost = outcome.flags.tolist()
     assert terminated == failure == [False, True, True, False]

@@ -24,6 +24,9 @@ class FilmTask(SimpleNamespace):
     def criteria(self):
         return ()
 
+    def metrics(self):
+        return {}
+
     def success_windows(self):
         return ()
 

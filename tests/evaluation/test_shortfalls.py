@@ -108,6 +108,7 @@ SOFT = {  # bounds that some teams keep to and others do not
     "hover": FAST,
     "land": {"task_options.success_seconds": 3.2, "task_options.clearance": 0.75},
     "loss": {"task_options.success_body_rate": 0.05, "task_options.success_tension": 2.0},
+    "navigate": {"task_options.success_tension": 1.01, "task_options.success_distance": 0.05},
     "pose": {"task_options.success_distance": 0.02, "task_options.success_angle": 2.0},
     "recover": {"task_options.success_distance": 0.0015},
     "takeoff": {"task_options.success_distance": 0.01, "task_options.success_tension": 1.3},
