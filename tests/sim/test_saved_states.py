@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import make, same, zeros
 
+from multilift_marl.mdp.failures import FIRST_OWN
 from multilift_marl.sim.saved import fingerprint
 from multilift_marl.sim.world import World
 
@@ -49,7 +50,7 @@ def test_arrays_that_are_none_of_theirs_are_refused(vec, key, spoil, complaint):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("steps", -1), ("seeds", -5), ("episodes", -2), ("task.cause", 99), ("task.cause", -1), ("task.cause", 11)],
+    [("steps", -1), ("seeds", -5), ("episodes", -2), ("task.cause", 99), ("task.cause", -1), ("task.cause", FIRST_OWN)],
 )
 def test_counts_that_there_cannot_be_are_refused(vec, key, value):
     before = vec.state_dict()
