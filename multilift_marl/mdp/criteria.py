@@ -6,12 +6,27 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from multilift_marl.mdp.env_data import Errors
 from multilift_marl.mdp.rewards import RestBounds
+from multilift_marl.schema.values import Float, Section
 from multilift_marl.sim.state import SystemState
 
 CONDITION = float("nan")  # bound of a criterion that is met or not: its excess is 1 or 0
+
+
+class ArrivalOptions(Section):
+    """What counts as success where a payload is carried to a goal."""
+
+    success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of the goal ...")
+    success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, heading included ...")
+    success_speed: Float = Field(0.1, gt=0, description="[m/s] ... no faster than this ...")
+    success_body_rate: Float = Field(0.2, gt=0, description="[rad/s] ... and turning no faster than this ...")
+    success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout the last seconds, and ...")
+    success_tension: Float = Field(
+        3.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
+    )
 
 
 class Criterion(NamedTuple):

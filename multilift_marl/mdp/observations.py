@@ -69,6 +69,12 @@ def slot_error(e, n, v):
 
 
 @inlined
+def target_velocity(e, n, v):
+    """Velocity of the target."""
+    return row(v.goal.velocity, e)
+
+
+@inlined
 def own_velocity(e, n, v):
     """Own velocity."""
     return vec(v.estimated.drone_velocity, e, n)

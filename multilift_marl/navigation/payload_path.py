@@ -22,12 +22,12 @@ from multilift_marl.navigation.team_clearance import (
     local_point,
     make_body,
     measure_clearance,
-    obstacle_distance,
     rotation_of,
 )
 from multilift_marl.navigation.timing import SAMPLES, sample_curve, time_route
 from multilift_marl.planning.route import NoRoute, Route, RouteReport
 from multilift_marl.rig.system import System
+from multilift_marl.sim.obstacle_distance import local_distance
 
 STEP = 0.15  # [m] of the grid
 SHARES = 1.0, 0.8, 0.6, 0.4  # of the radius by which obstacles are inflated, tried in turn
@@ -132,7 +132,7 @@ def descend(start, goal, space, scene, distance, gain, points):
             return k + 1
         force = scale(1.0 / max(far, NEAR), way)
         for m in range(scene.kind.shape[0]):
-            d, normal = obstacle_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))
+            d, normal = local_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))
             r = max(d, _TIGHT) / distance
             if r < 1.0:
                 force = add(force, scale(gain * (1.0 / r - 1.0) / r**2, mul(rotation_of(scene, m), normal)))

@@ -18,12 +18,12 @@ from multilift_marl.navigation.team_clearance import (
     Scene,
     TeamBody,
     local_point,
-    obstacle_distance,
     payload_clearance,
     team_clearance,
     team_reach,
     write_arms,
 )
+from multilift_marl.sim.obstacle_distance import local_distance
 
 YAWS = 16  # of the lattice
 GREED = 1.3  # [-] weight of the heuristic: the way found costs at most so many times the least
@@ -212,7 +212,7 @@ def measure_way(lattice, body, scene, work):
         place = place_of(cell, 0.0, lattice)
         here, far = (place[0], place[1], place[2]), wide
         for m in range(scene.kind.shape[0]):
-            far = min(far, obstacle_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0])
+            far = min(far, local_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0])
         if cell == goal or (far >= thinnest and _payload_fits(cell, far, lattice, body, scene)):
             work.price[cell] = 1.0 + CAUTION * (1.0 - max(far, 0.0) / wide) ** 2
 

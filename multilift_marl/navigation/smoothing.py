@@ -21,10 +21,10 @@ from multilift_marl.navigation.team_clearance import (
     TeamBody,
     cable_clearance,
     local_point,
-    obstacle_distance,
     payload_clearance,
     team_reach,
 )
+from multilift_marl.sim.obstacle_distance import local_distance
 
 SPACING = 0.12  # [m] of knots
 TENSION = 1.0  # [-] of the band: weight of squared first differences
@@ -248,7 +248,7 @@ def _keep_away(knot, first, safe, band, w):
     reach = team_reach(w.arms, body) + band.comfort
     cost = 0.0
     for m in range(scene.kind.shape[0]):
-        if obstacle_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0] > reach:
+        if local_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0] > reach:
             continue
         far, normal, spot = payload_clearance(scene, m, here, c, s, body, band.comfort)
         if far < band.comfort:

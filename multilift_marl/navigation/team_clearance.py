@@ -6,7 +6,7 @@ d(z) from below, in all of a box or a segment; where that bound meets the distan
 
 from __future__ import annotations
 
-from math import cos, hypot, sin, sqrt
+from math import cos, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,8 @@ import numpy as np
 from multilift_marl.kernels.jit import inlined, kernel
 from multilift_marl.math3d import add, dot, matmul, mul, norm, put, row, scale, sub, tmul, transpose, turn, unit
 from multilift_marl.rig.system import System
-from multilift_marl.sim.obstacles import CYLINDER, NONE, SPHERE, Obstacles
+from multilift_marl.sim.obstacle_distance import local_distance
+from multilift_marl.sim.obstacles import NONE, Obstacles
 
 TOLERANCE = 1e-3  # [m] of distances, which are too small rather than too large
 _ITERATIONS = 16
@@ -75,37 +76,6 @@ def make_scene(obstacles: Obstacles, env: int) -> Scene:
 
 
 @kernel
-def obstacle_distance(kind, size, p):
-    """Return the signed distance of a point from an obstacle and the outward normal there, in the obstacle's frame."""
-    if kind == SPHERE:
-        far = norm(p)
-        if far < 1e-12:
-            return -size[0], (1.0, 0.0, 0.0)
-        return far - size[0], scale(1.0 / far, p)
-    if kind == CYLINDER:
-        across = hypot(p[0], p[1])
-        out = (p[0] / across, p[1] / across, 0.0) if across > 1e-12 else (1.0, 0.0, 0.0)
-        side, above = across - size[0], abs(p[2]) - size[2]
-        up = (0.0, 0.0, 1.0 if p[2] >= 0.0 else -1.0)
-        if side > 0.0 and above > 0.0:
-            far = hypot(side, above)
-            return far, add(scale(side / far, out), scale(above / far, up))
-        return (side, out) if side > above else (above, up)
-    # box, and the box about a hull
-    x, y, z = abs(p[0]) - size[0], abs(p[1]) - size[1], abs(p[2]) - size[2]
-    sx, sy, sz = 1.0 if p[0] >= 0.0 else -1.0, 1.0 if p[1] >= 0.0 else -1.0, 1.0 if p[2] >= 0.0 else -1.0
-    if x > 0.0 or y > 0.0 or z > 0.0:
-        out = (max(x, 0.0), max(y, 0.0), max(z, 0.0))
-        far = norm(out)
-        return far, (sx * out[0] / far, sy * out[1] / far, sz * out[2] / far)
-    if x >= y and x >= z:
-        return x, (sx, 0.0, 0.0)
-    if y >= z:
-        return y, (0.0, sy, 0.0)
-    return z, (0.0, 0.0, sz)
-
-
-@kernel
 def segment_clearance(kind, size, a, b, enough):
     """Return distance, normal and share of the point of a segment that is nearest to an obstacle, in its frame.
 
@@ -118,11 +88,11 @@ def segment_clearance(kind, size, a, b, enough):
         enough: distance beyond which a bound of it will do [m].
     """
     along = sub(b, a)
-    left, here = obstacle_distance(kind, size, a)
+    left, here = local_distance(kind, size, a)
     down = dot(here, along)
     if down >= 0.0 or left + down >= enough:
         return (left, here, 0.0) if down >= 0.0 else (left + down, here, 0.0)
-    right, there = obstacle_distance(kind, size, b)
+    right, there = local_distance(kind, size, b)
     up = dot(there, along)
     if up <= 0.0:
         return right, there, 1.0
@@ -133,7 +103,7 @@ def segment_clearance(kind, size, a, b, enough):
         bound = left + down * (share - low)
         if bound >= enough or min(left, right) - bound < TOLERANCE:
             return (bound, here, low) if left < right else (bound, there, high)
-        value, normal = obstacle_distance(kind, size, add(a, scale(share, along)))
+        value, normal = local_distance(kind, size, add(a, scale(share, along)))
         slope = dot(normal, along)
         if slope < 0.0:
             left, down, low, here = value, slope, share, normal
@@ -158,7 +128,7 @@ def box_clearance(kind, size, middle, axes, half, enough):
     x, best = middle, -FAR
     normal, point = (0.0, 0.0, 1.0), middle
     for _ in range(_ITERATIONS):
-        far, n = obstacle_distance(kind, size, x)
+        far, n = local_distance(kind, size, x)
         local = tmul(axes, n)
         reach = abs(local[0]) * half[0] + abs(local[1]) * half[1] + abs(local[2]) * half[2]
         bound = far + dot(n, sub(middle, x)) - reach
@@ -256,7 +226,7 @@ def cable_clearance(scene, m, a, b, radius, enough):
     """
     start, end = local_point(scene, m, a), local_point(scene, m, b)
     kind, size, frame = scene.kind[m], scene.size[m], rotation_of(scene, m)
-    drone, outward = obstacle_distance(kind, size, end)
+    drone, outward = local_distance(kind, size, end)
     cable, normal, share = segment_clearance(kind, size, start, end, enough)
     return cable, mul(frame, normal), share, drone - radius, mul(frame, outward)
 
@@ -275,7 +245,7 @@ def team_clearance(place, arms, body, scene, reach, enough):
     here, c, s = (place[0], place[1], place[2]), cos(place[3]), sin(place[3])
     least = enough
     for m in range(scene.kind.shape[0]):
-        far = obstacle_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0]
+        far = local_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0]
         if far > reach + least:
             continue
         least = min(least, payload_clearance(scene, m, here, c, s, body, least)[0])

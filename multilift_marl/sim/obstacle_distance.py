@@ -6,12 +6,11 @@ middles of their boxes, in their own frames [m]. Rows of kind NONE are infinitel
 
 from __future__ import annotations
 
-from math import inf, sqrt
+from math import hypot, inf, sqrt
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import (
     add,
-    clip,
     column,
     dot,
     from_columns,
@@ -48,13 +47,8 @@ def point_distance(e, m, point, obstacles, hulls):
         offset = separation((BOX, point, nothing), (HULL, middle, attitude), hulls, obstacles.hull[e, m], inf)
         return norm(offset), sub(point, offset)
     local = tmul(attitude, sub(point, middle))
-    if kind == SPHERE:
-        distance, nearest = norm(local) - half[0], scale(half[0], unit(local))
-    elif kind == CYLINDER:
-        distance, nearest = _from_cylinder(local, half)
-    else:
-        distance, nearest = _from_box(local, half)
-    return distance, add(middle, mul(attitude, nearest))
+    distance, normal = local_distance(kind, half, local)
+    return distance, sub(point, mul(attitude, scale(distance, normal)))
 
 
 @kernel
@@ -69,37 +63,36 @@ def nearest_point(e, point, most, obstacles, hulls):
 
 
 @kernel
-def _from_box(local, half):
-    """Return the signed distance of a point from a box in its own frame, and the nearest point of its surface."""
-    x, y, z = clip(local[0], -half[0], half[0]), clip(local[1], -half[1], half[1]), clip(local[2], -half[2], half[2])
-    outside = norm(sub(local, (x, y, z)))
-    if outside > 0.0:
-        return outside, (x, y, z)
-    # Inside: out by the nearest face.
-    dx, dy, dz = half[0] - abs(x), half[1] - abs(y), half[2] - abs(z)
-    if dx <= dy and dx <= dz:
-        return -dx, (half[0] if x >= 0.0 else -half[0], y, z)
-    if dy <= dz:
-        return -dy, (x, half[1] if y >= 0.0 else -half[1], z)
-    return -dz, (x, y, half[2] if z >= 0.0 else -half[2])
+def local_distance(kind, size, p):
+    """Return the signed distance of a point from a solid [m] and the outward normal there, in the solid's frame.
 
-
-@kernel
-def _from_cylinder(local, half):
-    """Do as `_from_box` for an upright cylinder."""
-    x, y, z = local
-    radius, radial = half[0], sqrt(x * x + y * y)
-    # Outward along its radius: any direction of a point on the axis.
-    out_x, out_y = (x / radial, y / radial) if radial > 1e-12 else (1.0, 0.0)
-    if radial > radius or abs(z) > half[2]:
-        kept = min(radial, radius)
-        nearest = (kept * out_x, kept * out_y, clip(z, -half[2], half[2]))
-        return norm(sub(local, nearest)), nearest
-    # Inside: out by the wall or by the nearer cap.
-    wall, cap = radius - radial, half[2] - abs(z)
-    if wall <= cap:
-        return -wall, (radius * out_x, radius * out_y, z)
-    return -cap, (x, y, half[2] if z >= 0.0 else -half[2])
+    Args:
+        kind: BOX, CYLINDER or SPHERE; of a HULL that of the box about it.
+        size: half edges of the box about it (3,) [m].
+        p: the point (3,) [m].
+    """
+    if kind == SPHERE:
+        return norm(p) - size[0], unit(p)
+    if kind == CYLINDER:
+        across = hypot(p[0], p[1])
+        out = (p[0] / across, p[1] / across, 0.0) if across > 1e-12 else (1.0, 0.0, 0.0)
+        side, above = across - size[0], abs(p[2]) - size[2]
+        up = (0.0, 0.0, 1.0 if p[2] >= 0.0 else -1.0)
+        if side > 0.0 and above > 0.0:
+            far = hypot(side, above)
+            return far, add(scale(side / far, out), scale(above / far, up))
+        return (side, out) if side >= above else (above, up)
+    x, y, z = abs(p[0]) - size[0], abs(p[1]) - size[1], abs(p[2]) - size[2]
+    sx, sy, sz = 1.0 if p[0] >= 0.0 else -1.0, 1.0 if p[1] >= 0.0 else -1.0, 1.0 if p[2] >= 0.0 else -1.0
+    if x > 0.0 or y > 0.0 or z > 0.0:
+        out = (max(x, 0.0), max(y, 0.0), max(z, 0.0))
+        far = norm(out)
+        return far, (sx * out[0] / far, sy * out[1] / far, sz * out[2] / far)
+    if x >= y and x >= z:
+        return x, (sx, 0.0, 0.0)
+    if y >= z:
+        return y, (0.0, sy, 0.0)
+    return z, (0.0, 0.0, sz)
 
 
 @kernel

@@ -11,10 +11,10 @@ from pydantic import Field
 from multilift_marl.control.formation import place_formation
 from multilift_marl.kernels.jit import drawing, inlined, kernel
 from multilift_marl.math3d import add, ease, mat, matrow, mul, put, putmat, rot_z, row, sub, triple, vec
-from multilift_marl.mdp.criteria import Criterion, rest_criteria
+from multilift_marl.mdp.criteria import ArrivalOptions, Criterion, rest_criteria
 from multilift_marl.mdp.failures import WALL
 from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
-from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.observations import Component, target_velocity
 from multilift_marl.mdp.rewards import (
     RestBounds,
     Term,
@@ -39,7 +39,7 @@ SPARE = 0.05  # [m] of clearance that the reward asks for
 _WALL = (0.62, 0.52, 0.45, 1.0)  # colour
 
 
-class GateOptions(Section):
+class GateOptions(ArrivalOptions):
     """The gates, the way through them, and what counts as success."""
 
     gates: Int = Field(1, ge=1, le=5, description="walls with a gap, 1.5 m apart, their middle at x = 0")
@@ -50,14 +50,6 @@ class GateOptions(Section):
     start_radius: Float = Field(0.2, ge=0, description="[m] start within a ball of this radius of the target's")
     set_off: Float = Field(1.0, ge=0, description="[s] when the target sets off ...")
     arrival: Float = Field(11.0, gt=0, description="[s] ... and when it arrives at the goal")
-    success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of the goal ...")
-    success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, heading included ...")
-    success_speed: Float = Field(0.1, gt=0, description="[m/s] ... no faster than this ...")
-    success_body_rate: Float = Field(0.2, gt=0, description="[rad/s] ... and turning no faster than this ...")
-    success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout the last seconds, and ...")
-    success_tension: Float = Field(
-        3.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
-    )
 
 
 class GateArrays(NamedTuple):
@@ -252,12 +244,6 @@ def find_touch(e, v):
     """Count a touched wall as a failure."""
     if v.cause[e] == 0 and least_room(e, v) < 0.0:
         v.cause[e] = WALL
-
-
-@inlined
-def target_velocity(e, n, v):
-    """Velocity of the target."""
-    return row(v.goal.velocity, e)
 
 
 @inlined

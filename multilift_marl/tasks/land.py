@@ -30,7 +30,7 @@ from multilift_marl.mdp.ground import (
     set_resting_goal,
 )
 from multilift_marl.mdp.initial_states import set_equilibrium
-from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.observations import Component, target_velocity
 from multilift_marl.mdp.rewards import Term, action_rate, tolerance
 from multilift_marl.schema.values import Float, Section
 from multilift_marl.sim.contact import drone_half_size
@@ -211,12 +211,6 @@ def slackness(e, v, margin):
 def time_to_touch(e, n, v):
     """Time until the target is on the ground."""
     return v.settings.settle[0] + v.settings.settle[1] - v.time[e]
-
-
-@inlined
-def target_velocity(e, n, v):
-    """Velocity of the target."""
-    return row(v.goal.velocity, e)
 
 
 def _components(frame: str) -> tuple[Component, ...]:

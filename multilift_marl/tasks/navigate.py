@@ -11,10 +11,10 @@ from multilift_marl.control.formation import place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import drawing, inlined
 from multilift_marl.math3d import IDENTITY, add, ease, norm, put, putmat, row, scale, sub
-from multilift_marl.mdp.criteria import Criterion, rest_criteria
+from multilift_marl.mdp.criteria import ArrivalOptions, Criterion, rest_criteria
 from multilift_marl.mdp.failures import RANGE
 from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
-from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.observations import Component, target_velocity
 from multilift_marl.mdp.rewards import (
     RestBounds,
     Term,
@@ -35,7 +35,7 @@ SPARE = 0.10  # [m] of clearance that the reward asks for
 PEAK = 35.0 / 16.0  # of an eased motion's speed over its mean, see `math3d.ease`
 
 
-class NavigateOptions(Section):
+class NavigateOptions(ArrivalOptions):
     """The map, the target's motion along the straight line, and what counts as success."""
 
     level: Literal["sparse", "dense", "narrow", "unknown"] = Field("sparse", description="of the maps")
@@ -46,14 +46,6 @@ class NavigateOptions(Section):
     map: Int | None = Field(None, ge=0, lt=2**31, description="seed of the one map; None: drawn for each episode")
     speed: Annotated[Float, Between(0.01, 100, "m/s")] = Field(1.0, description="[m/s] peak speed of the target")
     start_radius: Float = Field(0.05, ge=0, description="[m] start within a ball of this radius about the map's")
-    success_distance: Float = Field(0.10, gt=0, description="[m] payload within this of the goal ...")
-    success_angle: Float = Field(10.0, gt=0, description="[deg] ... and of its attitude, heading included ...")
-    success_speed: Float = Field(0.1, gt=0, description="[m/s] ... no faster than this ...")
-    success_body_rate: Float = Field(0.2, gt=0, description="[rad/s] ... and turning no faster than this ...")
-    success_seconds: Float = Field(1.0, gt=0, description="[s] ... throughout the last seconds, and ...")
-    success_tension: Float = Field(
-        3.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
-    )
 
 
 class NavigateArrays(NamedTuple):
@@ -149,12 +141,6 @@ def clearance(e, v, margin):
 def to_goal(e, n, v):
     """Goal minus where the target is."""
     return sub(row(v.own.goal, e), row(v.goal.position, e))
-
-
-@inlined
-def target_velocity(e, n, v):
-    """Velocity of the target."""
-    return row(v.goal.velocity, e)
 
 
 @inlined

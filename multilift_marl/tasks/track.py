@@ -15,7 +15,7 @@ from multilift_marl.kernels.jit import drawing, inlined, kernel
 from multilift_marl.math3d import add, matrow, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.mdp.criteria import Criterion
 from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
-from multilift_marl.mdp.observations import Component
+from multilift_marl.mdp.observations import Component, target_velocity
 from multilift_marl.mdp.rewards import Term, action_rate, attitude, distance, failure, tolerance, velocity
 from multilift_marl.planning.path_file import load_path
 from multilift_marl.planning.paths import (
@@ -201,12 +201,6 @@ def never(e, v):
 def heading(e, v, margin):
     """Payload's heading close to its target's."""
     return tolerance(v.errors.rotation[e, 2], margin)
-
-
-@inlined
-def target_velocity(e, n, v):
-    """Velocity of the target."""
-    return row(v.goal.velocity, e)
 
 
 @inlined
