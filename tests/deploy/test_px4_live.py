@@ -18,8 +18,8 @@ pytest.importorskip("rosbags")  # of the ros extra
 pytest.importorskip("cyclonedds")
 if sys.platform == "win32":
     pytest.skip("PX4 flies on Linux and macOS alone", allow_module_level=True)
+from airfield import Airfield, config_of
 from ros_wire import Wire
-from test_px4 import Airfield, config_of
 
 from multilift_marl.deploy.px4.flight import Flight
 from multilift_marl.deploy.px4.forwarded import ForwardedSetpoints

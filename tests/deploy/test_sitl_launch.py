@@ -71,14 +71,14 @@ def test_the_processes_are_those_of_the_command(description, tmp_path):
     out = tmp_path / "out of it"
     arguments = {"flight.seed": 7, "nodes.control.output": "rates", "out": str(out)}
     context = {
-        "file": str(EXAMPLES / "sitl.yaml"), "px4": "/opt/PX4",
+        "file": str(EXAMPLES / "sitl.yaml"), "px4": "PX4-Autopilot",
         "arguments": f"flight.seed=7 nodes.control.output=rates out='{out}'",
     }  # fmt: skip
     processes = [each.named for each in start.named["function"](context)]
     expected = list_commands(read_options({"file": context["file"], **arguments}), out)
     assert {each["name"]: each["cmd"] for each in processes} == expected and len(expected) == 4
     assert [each["on_exit"] is not None for each in processes] == [True, False, False, False]
-    assert all(each["additional_env"]["PX4_DIR"] == "/opt/PX4" for each in processes)
+    assert all(each["additional_env"]["PX4_DIR"] == "PX4-Autopilot" for each in processes)
     assert out.is_dir()
 
 
