@@ -1,8 +1,8 @@
 """Success among obstacles: `python results/navigate.py [maps=1000] [rows=dense_4,...] [policies=mpc_route,mpc]`.
 
 Each row is a level and a number of drones, flown on held-out maps: evaluation episodes 0 to maps - 1 of seed 1000, the
-same for all policies. Finished episodes are kept in results/navigate and not flown again; the table of all of them is
-docs/data/navigate.csv, with maps=0 it alone is written.
+same for all policies. Finished episodes are kept in results/navigate and not flown again; of all of them a table is
+written to docs/data/navigate.csv, and successes of four drones to docs/navigate.md, with maps=0 these alone.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from multilift_marl.mdp.failures import CAUSES
 from multilift_marl.policies.baselines import make_scripted
 
 HERE = Path(__file__).parent / "navigate"
-TABLE = Path(__file__).parents[1] / "docs" / "data" / "navigate.csv"
+DOCS = Path(__file__).parents[1] / "docs"
+BEGIN, END = "<!-- table of navigate -->\n", "<!-- end of table -->"
 SEED, CHUNK = 1000, 50
 LEVELS = "sparse", "dense", "narrow", "unknown"
 ROWS: dict[str, dict[str, object]] = {
@@ -92,10 +93,27 @@ def write_table() -> None:
     order = [(row, path) for row in ROWS for path in sorted(HERE.glob(f"{row}_*.npz"))]
     lines = [summary(path) for _, path in order]
     columns = list(dict.fromkeys(name for line in lines for name in line))
-    with TABLE.open("w", newline="", encoding="utf-8") as file:
+    with (DOCS / "data" / "navigate.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines)
+
+
+def write_page() -> None:
+    """Write successes of four drones with their intervals into the page of the task."""
+    with (DOCS / "data" / "navigate.csv").open(encoding="utf-8") as file:
+        lines = [line for line in csv.DictReader(file) if line["drones"] == "4" and line["level"] in LEVELS]
+    policies = sorted({line["policy"] for line in lines}, key=lambda name: (name != "mpc_route", name))
+    rows = [f"|level, maps|{'|'.join(f'`{policy}`' for policy in policies)}|", f"|---|{'---|' * len(policies)}"]
+    for level in LEVELS:
+        cells = {line["policy"]: line for line in lines if line["level"] == level}
+        maps = ", ".join(sorted({line["maps"] for line in cells.values()}))
+        found = [cells.get(policy) for policy in policies]
+        shown = "|".join(f"{line['success_percent']} ({line['ci95']})" if line else "" for line in found)
+        rows.append(f"|{level}, {maps}|{shown}|")
+    page = DOCS / "navigate.md"
+    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
+    page.write_text(f"{before}{BEGIN}" + "\n".join(rows) + f"\n{END}{rest.split(END, 1)[1]}", encoding="utf-8")
 
 
 def main(arguments: list[str]) -> None:
@@ -106,6 +124,7 @@ def main(arguments: list[str]) -> None:
         for policy in values["policies"].split(","):
             fly(row, policy, int(values["maps"]))
     write_table()
+    write_page()
 
 
 if __name__ == "__main__":

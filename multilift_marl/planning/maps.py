@@ -1,7 +1,7 @@
 """Maps of the task `navigate`: obstacles between a start and a goal, drawn from a seed.
 
-Lengths are in units of the resting formation's width over that of four falcons (`unit_length`), so that a level is as
-hard for every team: a gap is narrow or wide for a formation. A map is a function of level, seed and team alone.
+Lengths are in units of the resting formation's width over that of four falcons (`unit_length`): a gap is narrow or wide
+for a formation. A map is a function of level, seed and team alone.
 """
 
 from __future__ import annotations

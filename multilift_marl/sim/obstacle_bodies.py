@@ -1,6 +1,6 @@
 """Obstacles in MuJoCo: geoms of the world that nothing moves, each environment with its own forms, sizes and places.
 
-Geoms of the world itself cost a third of a percent of a step each, bodies of their own five times that. What touches a
+They are geoms of the world itself, which cost less than bodies of their own (`bench/obstacles.py`). What touches a
 moving one meets its surface at rest, so that friction does not drag along.
 """
 
