@@ -18,6 +18,7 @@ from multilift_marl.rendering import Renderer
 WIDTH, HEIGHT, GAP = 480, 360, 6  # [pixels]
 TRAIL = 1.0  # [s]
 MIXED = {"vehicle.preset": ("falcon", "falcon", "hummingbird", "iris")}
+ROUTE = {"control.action": "acc_rates", "task_options.map": 3}
 STRIPS: dict[str, tuple[str, dict, str, int, tuple[float, ...]]] = {
     # name: configuration, overrides, script or shipped policy, seed, times [s]
     "hover": ("hover", {}, "hover", 3, (0.02, 0.6, 4.0)),
@@ -27,10 +28,12 @@ STRIPS: dict[str, tuple[str, dict, str, int, tuple[float, ...]]] = {
     "gate": ("gate", {}, "gate", 2, (3.0, 5.6, 6.4, 8.0)),
     "recover": ("recover", {}, "formation", 0, (0.02, 0.4, 1.0, 4.0)),
     "loss": ("loss", {}, "loss", 0, (1.5, 4.4, 11.0)),
+    "navigate": ("navigate_narrow", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
+    "navigate_dense": ("navigate_dense", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
     "mixed_team": ("hover", MIXED, "formation_integral", 0, (0.02, 6.0)),
 }
 
-CAMERAS = {"gate": "chase"}
+CAMERAS = dict.fromkeys(("gate", "navigate", "navigate_dense"), "chase")
 
 
 def draw(name: str) -> np.ndarray:
