@@ -36,7 +36,7 @@ def routes(level: str, seed: int, system: System) -> tuple[float, Route | None, 
     except NoRoute:
         return apart, None, None
     try:
-        middle = route.sample(np.array([0.5 * route.times[-1]]))[:3, 0]
+        middle = route.sample(np.array([0.5 * route.times[-1]]))[:, 0]
         return apart, route, find_route(system, obstacles, 0, goal, goal, settings, middle)
     except NoRoute:
         return apart, route, None

@@ -15,6 +15,7 @@ from multilift_marl.rig.system import System
 TICK = 0.02  # [s] between the times that are looked at
 MAX_THRUST = 0.9  # over the largest thrust of a drone
 MIN_TENSION = 0.2  # over the resting one
+APART = 1.05  # of drones that swing, over the distance that is a collision; shapes at rest keep more
 
 
 class RouteMotion(NamedTuple):
@@ -32,14 +33,17 @@ class RouteMotion(NamedTuple):
     """(M, N) over the largest one."""
     tilt: np.ndarray
     """(M, N) of the thrusts [rad]."""
+    separation: np.ndarray
+    """(M,) of the two drones that are closest, over the distance that counts as a collision."""
     clearance: np.ndarray
     """(M,) from obstacles, no more than what was asked for [m]."""
 
     def feasible(self, tilt: float, until: float = np.inf) -> bool:
-        """Return whether thrusts, tensions and tilts, at most `tilt` [rad], are within limits, up to a time [s]."""
+        """Return whether thrusts, tensions, distances and tilts, at most `tilt` [rad], are within limits to a time [s]."""
         part = self.times <= until
         within = self.thrust[part].max() <= MAX_THRUST and self.tilt[part].max() <= tilt
-        return bool(within and self.tension[part].min() >= MIN_TENSION)
+        apart = self.separation[part].min() >= APART
+        return bool(within and apart and self.tension[part].min() >= MIN_TENSION)
 
 
 def move_team(route: Route, system: System, body: TeamBody, scene: Scene, enough: float) -> RouteMotion:
@@ -72,4 +76,7 @@ def move_team(route: Route, system: System, body: TeamBody, scene: Scene, enough
     measure_clearance(places, np.ascontiguousarray(arms), body, scene, enough, clearance)
     tilt = np.arccos(np.clip(thrust[..., 2] / size, -1, 1))
     rest = np.linalg.norm(system.formation_force, axis=1)
-    return RouteMotion(times, places, arms, tension / rest, size / most, tilt, clearance)
+    offset = np.linalg.norm(place[:, :, None] - place[:, None], axis=-1)
+    separation = (offset + 1e9 * np.eye(len(rest))) / (system.min_separation + np.eye(len(rest)))
+    apart = separation.min(axis=(1, 2))
+    return RouteMotion(times, places, arms, tension / rest, size / most, tilt, apart, clearance)

@@ -72,7 +72,7 @@ def shortest_path(
         space: (2, 3) lowest and highest position [m].
         scene: the obstacles.
         radius: by which they are inflated [m]; less where start or goal is closer, or there is no way; see `SHARES`.
-        departure: (3, 4) pose at the start, its rates and second rates; None: at rest.
+        departure: (4, 4) pose at the start and three orders of rates; None: at rest.
 
     Raises:
         NoRoute: there is none.

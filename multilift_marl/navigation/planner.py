@@ -85,8 +85,8 @@ def find_route(
         obstacles, env: those of one environment, where they are now.
         start, goal: (4,) x, y, z [m] and yaw [rad] of the level payload.
         settings: what it is to keep.
-        departure: (3, 4 + J) pose and shape of the team at the start, their rates and second rates, such as
-            `route.sample(time)[:3, 0]` of another route; `start` is not used then. None: at rest in the resting
+        departure: (4, 4 + J) pose and shape of the team at the start and three orders of rates, such as
+            `route.sample(time)[:, 0]` of another route; `start` is not used then. None: at rest in the resting
             formation.
 
     Raises:

@@ -7,6 +7,8 @@ speeds. Their means over a short time make a curve of continuous derivatives in 
 
 from __future__ import annotations
 
+from math import comb, factorial
+
 import numpy as np
 
 from multilift_marl.planning.spline import fit_spline
@@ -16,6 +18,7 @@ KNOT = 0.1  # [s] between the knots in time
 BOXES = 4  # means that are taken in turn, each over ...
 BOX = 0.2  # [s]
 _TICK = 0.02  # [s] of the times at which means are taken
+_FIRST = 9  # ticks from which rates at a start are found
 
 
 def sample_curve(knots: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -104,7 +107,7 @@ def time_route(
         knots: (K, D) of the curve.
         points, speed, acceleration: see `fit_speeds`, at `SAMPLES` for each piece.
         pace: see `smooth_times`.
-        departure: (3, D) values, rates and second rates at the start; None: at rest. What the curve lacks of them is
+        departure: (4, D) values and three orders of rates at the start; None: at rest. What the curve lacks of them is
             added, and fades away.
         fade: time in which it does [s].
     """
@@ -119,16 +122,24 @@ def time_route(
     if departure is None:
         values[0] = knots[0]
         return fit_spline(np.column_stack([at, values]))
-    curve = sample_curve(knots, u[:3])  # at 0, 1 and 2 ticks
-    rates = (-1.5 * curve[0] + 2.0 * curve[1] - 0.5 * curve[2]) / _TICK
-    bends = (curve[0] - 2.0 * curve[1] + curve[2]) / _TICK**2
-    values += fade_out(departure - np.array([values[0], rates, bends]), at, min(fade, at[-1]))
+    # What the curve has at the start, from the polynomial through its first ticks.
+    along = _TICK * np.arange(_FIRST)
+    fitted = np.polynomial.polynomial.polyfit(along, sample_curve(knots, u[:_FIRST]), 5)
+    has = fitted[: len(departure)] * np.cumprod([1.0, *range(1, len(departure))])[:, None]
+    has[0] = values[0]
+    values += fade_out(departure - has, at, min(fade, at[-1]))
     return fit_spline(np.column_stack([at, values]), (departure[1], departure[2]))
 
 
 def fade_out(lack: np.ndarray, times: np.ndarray, fade: float) -> np.ndarray:
-    """Return a quintic (T, D) with value, rate and second rate `lack` (3, D) at 0, and zeros after `fade` [s]."""
+    """Return polynomials (T, D) whose value and rates at 0 are `lack` (K, D), and which end within `fade` [s].
+
+    They are (1 - u)^K times a polynomial of degree K - 1 of u, the share of the time that has passed.
+    """
+    order = len(lack)
     u = np.clip(times / fade, 0.0, 1.0)[:, None]
-    value, rate, bend = lack[0], lack[1] * fade, lack[2] * fade**2
-    # (1 - u)³ times a polynomial of second degree
-    return (1 - u) ** 3 * (value + u * (rate + 3 * value) + u**2 * (0.5 * bend + 3 * rate + 6 * value))
+    taylor = [each * fade**k / factorial(k) for k, each in enumerate(lack)]
+    # The Taylor series of (1 - u)^-K has the coefficients C(K - 1 + j, j).
+    left = sum(u**k * sum(taylor[k - j] * comb(order - 1 + j, j) for j in range(k + 1)) for k in range(order))
+    faded: np.ndarray = (1.0 - u) ** order * left
+    return faded

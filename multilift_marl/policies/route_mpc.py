@@ -24,6 +24,7 @@ from multilift_marl.tasks.navigate import Navigate
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
+HINGE = 0.06  # [m] of `planner.clearance` at most: more would push teams off routes that lead closer to obstacles
 INSIDE = 0.1  # [m] that routes keep from the bounds of the map, beyond which the payload is out of range
 AHEAD = 0.1  # [s] that a route which goes on begins later, as a search takes time
 RETRY = 0.2  # [s] after a search that found no way on
@@ -59,7 +60,9 @@ class RouteMpc(TeamMpc):
         self.begun, self.searches, self.search_time = np.zeros(e), np.zeros(e), np.zeros((e, 2))
         self._flown: list[list[tuple[float, Route]]] = [[] for _ in range(e)]
         self.known = Obstacles(*(array.copy() for array in vec.world.obstacles))
-        self.planner.around = self.planner.around._replace(obstacles=self.known)
+        around = self.planner.around
+        points = around.points._replace(clearance=min(around.points.clearance, HINGE))
+        self.planner.around = around._replace(obstacles=self.known, points=points)
         self._seen = np.zeros(self.known.kind.shape, bool)
         self._due = np.zeros(e)
         self._new = np.ones(e, bool)
@@ -117,7 +120,7 @@ class RouteMpc(TeamMpc):
             self._due[e] = np.inf
             route = self.routes[e]
             begin = time if route is None else time + AHEAD
-            departure = None if route is None else route.sample(np.array([begin - self.begun[e]]))[:3, 0]
+            departure = None if route is None else route.sample(np.array([begin - self.begun[e]]))[:, 0]
             self._search(e, departure, begin)
 
     def _in_sight(self, e: int) -> np.ndarray:
