@@ -39,7 +39,7 @@ class RouteMotion(NamedTuple):
     """(M,) from obstacles, no more than what was asked for [m]."""
 
     def feasible(self, tilt: float, until: float = np.inf) -> bool:
-        """Return whether thrusts, tensions, distances and tilts, at most `tilt` [rad], are within limits to a time [s]."""
+        """Return whether thrusts, tensions, distances and tilts, at most `tilt` [rad], keep limits until a time [s]."""
         part = self.times <= until
         within = self.thrust[part].max() <= MAX_THRUST and self.tilt[part].max() <= tilt
         apart = self.separation[part].min() >= APART
