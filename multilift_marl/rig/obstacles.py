@@ -42,7 +42,7 @@ class Obstacle:
     vertices: np.ndarray | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Scenery:
     """The obstacles of a system.
 

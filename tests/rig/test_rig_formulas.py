@@ -16,6 +16,7 @@ from multilift_marl.sim import World, pushes
 from multilift_marl.sim.cables import catenary, massless
 from multilift_marl.sim.cables.chain_arrays import UNITS, largest_substep
 from multilift_marl.sim.contact import APART, FAST, NEAR, body_radii, find_close
+from multilift_marl.sim.obstacles import BOX, Obstacles
 from multilift_marl.sim.parameters import MASSES, make_inertias, nominal_parameters, update_inertias
 from multilift_marl.sim.randomization import Draw
 from multilift_marl.sim.state import SystemState
@@ -178,15 +179,16 @@ def test_bodies_are_near_where_their_spheres_meet_and_fast_where_they_would_pass
     np.testing.assert_allclose(radii[1:], arm * np.sqrt(0.7**2 + 0.7**2 + 0.3**2))
     assert radii[0] == pytest.approx(np.linalg.norm(system.payload_size) / 2 + np.linalg.norm(system.payload_center))
     state, seen, search = SystemState.zeros(1, 2), np.full(1, 9, np.int8), plain(find_close)
+    obstacles = Obstacles.zeros(1, 1)
 
     def find(payload, first, second, speed=0.0):
         state.payload_position[0], state.drone_position[0] = payload, [first, second]
         state.drone_velocity[0, 1] = [-speed, 0.0, 0.0]
-        search(0, state, seen, radii, step)
+        search(0, state, seen, radii, step, obstacles)
         return seen[0]
 
     far = [[0, 0, 5.0], [0, 3.0, 5.0], [3.0, 3.0, 5.0]]
-    assert find(*far) == APART and not search(0, state, seen, radii, step)
+    assert find(*far) == APART and not search(0, state, seen, radii, step, obstacles)
     for gap, expected in ((1.001, APART), (0.999, NEAR)):
         assert find([0, 0, gap * radii[0]], [0, 3, 5], [3, 3, 5]) == expected
         assert find([0, 0, 5], [0, 3, gap * radii[1]], [3, 3, 5]) == expected
@@ -200,6 +202,19 @@ def test_bodies_are_near_where_their_spheres_meet_and_fast_where_they_would_pass
     close = radii[1] + radii[2]
     for speed, expected in ((1.99, NEAR), (2.01, FAST)):
         assert find([0, 0, 5], [0, 3, 5], [0.9 * close, 3, 5], speed) == expected
+
+    obstacles.kind[0, 0], obstacles.size[0, 0], obstacles.position[0, 0] = BOX, [0.5, 0.5, 0.5], [8.0, 3.0, 5.0]
+    near = 7.5 - radii[2]  # of the second drone's middle to touch the box
+    for place, speed, expected in (
+        (near - 0.001, 0.0, APART),
+        (near + 0.001, 0.0, NEAR),
+        (near - 2 * step * 10 - 0.001, 10.0, APART),
+        (near - 2 * step * 10 + 0.001, 10.0, FAST),
+    ):
+        assert find([0, 0, 5], [0, 3, 5], [place, 3, 5], speed) == expected
+    obstacles.velocity[0, 0] = [-10.0, 0.0, 0.0]  # as the drone: neither comes nearer
+    assert find([0, 0, 5], [0, 3, 5], [near - 0.05, 3, 5], 10.0) == APART
+    assert find([near + 0.6, 3, 5], [0, 9, 5], [near + 0.6, 9, 5]) == FAST  # it comes upon the payload
 
 
 # What is drawn
