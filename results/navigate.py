@@ -24,13 +24,19 @@ DOCS = Path(__file__).parents[1] / "docs"
 BEGIN, END = "<!-- table of navigate -->\n", "<!-- end of table -->"
 SEED, CHUNK = 1000, 50
 LEVELS = "sparse", "dense", "narrow", "unknown"
+PUBLIC = "window", "forest", "wall"  # of coltrans-planning, in configs/maps; episodes differ by their starts
 ROWS: dict[str, dict[str, object]] = {
     **{f"{level}_{n}": {"env.num_drones": n} for n in (4, 2, 3, 6, 8) for level in LEVELS},
     **{f"half_{n}": {"env.num_drones": n, "task_options.gaps": 0.5} for n in (3, 4, 6, 8)},
     "two_4": {"env.num_drones": 4, "task_options.walls": 2},
     "three_4": {"env.num_drones": 4, "task_options.walls": 3},
+    **{
+        f"{level}_{n}": {"env.num_drones": n, "payload.mass": 0.0054 if n < 5 else 0.01}
+        for level in PUBLIC
+        for n in (2, 3, 4, 5, 6)
+    },
 }
-"""Level and drones: half: gaps of half the formation's width; two, three: so many walls."""
+"""Level and drones: half: gaps of half the formation's width; two, three: so many walls; or a public map."""
 KEPT = (
     "success_rate", "failure_cause", "arrival_time_s", "path_length_ratio", "min_clearance_m", "min_separation_m",
     "cable_tension_max_n", "searches", "search_s", "longest_later_search_s",
@@ -40,6 +46,8 @@ KEPT = (
 def configuration(row: str) -> str:
     """Return the configuration of a row."""
     level = row.rsplit("_", 1)[0]
+    if level in PUBLIC:
+        return f"maps/coltrans_{'window3' if row == 'window_3' else level}"
     return {"sparse": "navigate", "unknown": "navigate_unknown", "dense": "navigate_dense"}.get(
         level, "navigate_narrow"
     )

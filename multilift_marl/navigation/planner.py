@@ -26,7 +26,8 @@ from multilift_marl.planning.route import NoRoute, Route, RouteReport
 from multilift_marl.rig.system import System
 from multilift_marl.sim.obstacles import Obstacles
 
-FINENESS = 1.0, 0.6  # of the lattice, tried in turn
+FINENESS = 1.0, 0.6, 0.45  # of the lattice, tried in turn, and ...
+MOVING = 2  # ... of a moving team, which cannot wait, as many and a tenth of the states
 STEP = 0.5  # [-] of the lattice, over the narrowest half width of payload and drone
 TALL = 1.5  # [-] steps of height, over those
 REPAIRS = 9  # of the curve, and as many of its speeds
@@ -54,7 +55,7 @@ class RouteSettings:
         low, high: space of the payload's position (3,) [m]; None: `room` around start, goal and obstacles.
         room: [m].
         ground: height of the payload's lowest point, at least [m].
-        most: states to expand.
+        most: states to expand on each lattice.
     """
 
     clearance: float = 0.08
@@ -66,7 +67,7 @@ class RouteSettings:
     high: tuple[float, float, float] | None = None
     room: float = 2.0
     ground: float = 0.3
-    most: int = 100_000
+    most: int = 1_000_000
 
 
 def find_route(
@@ -107,11 +108,12 @@ def find_route(
     nearest = int(np.abs(shapes.choices - shape).sum(axis=1).argmin())
 
     expanded = 0
-    for fineness in FINENESS:
+    most = settings.most if departure is None else settings.most // 10
+    for fineness in FINENESS[: None if departure is None else MOVING]:
         step = fineness * STEP * (system.payload_size[:2].min() / 2 + body.radius.max()) * np.array([1.0, 1.0, TALL])
         clearance = settings.least_clearance * fineness**2, settings.comfort
         lattice = make_lattice(start, goal, space, step, body, shapes, clearance)
-        way, count = search_route(lattice, start, nearest, body, scene, settings.most)
+        way, count = search_route(lattice, start, nearest, body, scene, most)
         expanded += count
         if not len(way):
             continue

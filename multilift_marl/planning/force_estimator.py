@@ -58,7 +58,8 @@ class Priors(NamedTuple):
 def make_priors(model: TeamModel, noise: float) -> Priors:
     """Return the priors of a team; `noise` is that of measured accelerations, over gravity."""
     n = len(model.anchors)
-    mass, arm = model.payload_mass, float(np.linalg.norm(model.anchors, axis=1).mean())
+    # A point has no arms; what is thought of moments on it has no effect.
+    mass, arm = model.payload_mass, float(np.linalg.norm(model.anchors, axis=1).mean() or model.length.mean())
     weight = mass * GRAVITY
     own = (model.drone_mass + mass / n) * GRAVITY
     parts = [(weight, 3, FORCE), (weight * arm, 3, MOMENT), (mass, 1, MASS), *((each, 3, DRONE) for each in own)]

@@ -47,9 +47,13 @@ def make_model(system: System) -> TeamModel:
     """Return the nominal model of a team."""
     # The model's cables do not stretch: they are as long as real ones under the resting load.
     stretched = system.cable_length + np.linalg.norm(system.formation_force, axis=1) / system.cable_stiffness
+    mass = float(system.payload_mass + 0.5 * system.cable_mass.sum())
+    inertia = np.reshape(system.inertia_matrix, (3, 3)).copy()
+    if not system.anchors.any():  # nothing turns a point; any moments of inertia do
+        inertia = mass * float(stretched.mean()) ** 2 * np.eye(3)
     return TeamModel(
-        payload_mass=float(system.payload_mass + 0.5 * system.cable_mass.sum()),
-        inertia=np.reshape(system.inertia_matrix, (3, 3)).copy(),
+        payload_mass=mass,
+        inertia=inertia,
         anchors=np.ascontiguousarray(system.anchors, float),
         drone_mass=system.drone_mass + 0.5 * system.cable_mass,
         length=stretched,

@@ -15,7 +15,7 @@ import numpy as np
 from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.approach import Approach, begin_approaches, write_approaches
-from multilift_marl.planning.flatness import SAMPLES, SHAPES
+from multilift_marl.planning.flatness import SAMPLES, SHAPES, STEP
 from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.hard_planner import HardPlanner
 from multilift_marl.planning.team_observer import TeamObserver
@@ -60,8 +60,8 @@ class TeamMpc:
             (E, M, N, 3) [N], see `flatness.set_flat_state`, or None for that at rest. None: `Task.preview_targets`.
 
     Raises:
-        ConfigError: a task that it cannot fly, see `Task.CAN_PLAN`; a payload on one point
-            or one cable, which has no attitude to plan; drones that reject the forces that it estimates.
+        ConfigError: a task that it cannot fly, see `Task.CAN_PLAN`; a box on one cable, whose attitude it cannot plan;
+            drones that reject the forces that it estimates.
     """
 
     INTERFACE: ClassVar[str] = "acc_rates"
@@ -74,8 +74,12 @@ class TeamMpc:
                 f"policy=mpc cannot fly task {config.task}: it plans for taut cables, all drones and free air; take "
                 "another policy"
             )
-        if vec.task.rig.is_point or n < 2:
-            raise ConfigError("policy=mpc plans for payloads on two cables or more; take another policy for this rig")
+        self._is_point = vec.task.rig.is_point
+        if n < 2 and not self._is_point:
+            raise ConfigError(
+                "policy=mpc plans for payloads on two cables or more, or for a point; set payload.shape=point, or take "
+                "another policy for this rig"
+            )
         rejection = config.control.disturbance
         if config.planner.estimate and rejection != "none":
             raise ConfigError(
@@ -253,6 +257,8 @@ class TeamMpc:
         own, load, model = view.estimated, view.payload_estimate, self.planner.model
         position, velocity = load.position.mean(axis=1), load.velocity.mean(axis=1)
         rotation, rates = load.rotation[:, 0], load.body_rates.mean(axis=1)
+        if self._is_point:  # nothing turns it: as its target, which the formation's heading follows
+            rotation, rates = self._target_attitude()
         arm = np.einsum("eij,nj->eni", rotation, model.anchors)
         turning = np.einsum("eij,ej->ei", rotation, rates)
         hook = own.drone_position + np.einsum("enij,nj->eni", own.drone_rotation, self._vec.world.system.hooks)
@@ -277,6 +283,12 @@ class TeamMpc:
         level, turned = direction[..., :2].reshape(count, -1), swing[..., :2].reshape(count, -1)
         parts = [position, euler, level, velocity, rates, turned, thrust.reshape(count, 3 * n)]
         return np.concatenate(parts, axis=1), np.ascontiguousarray(rotation), drag
+
+    def _target_attitude(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the attitude (E, 3, 3) of the payload's target now, and its body rates (E, 3) [rad/s]."""
+        turned = self._look_ahead(self._vec.task.time[:, None] + STEP * np.arange(-1, 2))[1]
+        change = np.swapaxes(turned[:, 1], 1, 2) @ (turned[:, 2] - turned[:, 0]) / (2 * STEP)
+        return turned[:, 1], np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0]], axis=1)
 
     def _command(self, thrust: np.ndarray, rate: np.ndarray, drag: np.ndarray) -> np.ndarray:
         """Return the actions that ask for thrust vectors (E, N, 3) [N] which change at a rate [N/s]."""

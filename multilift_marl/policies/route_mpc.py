@@ -138,8 +138,11 @@ class RouteMpc(TeamMpc):
     def _search(self, e: int, departure: np.ndarray | None, begin: float) -> None:
         """Replace the route of an environment from a time on [s]; the one that it has stays where none is found."""
         own, state = self._task.own, self._vec.world.state
-        settings = RouteSettings(low=tuple(own.low[e] + INSIDE), high=tuple(own.high[e] - INSIDE))
         start = np.append(state.payload_position[e], heading(tuple(state.payload_rotation[e].ravel())))
+        ends = np.array([start[:3], own.goal[e]])  # those of a given map may be closer to its bounds
+        low = np.minimum(own.low[e] + INSIDE, ends.min(axis=0))
+        high = np.maximum(own.high[e] - INSIDE, ends.max(axis=0))
+        settings = RouteSettings(low=tuple(low), high=tuple(high))
         self.searches[e] += 1
         try:
             route = self.make_route(e, start, settings, departure)

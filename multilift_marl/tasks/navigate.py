@@ -27,18 +27,28 @@ from multilift_marl.mdp.rewards import (
     update_peak_tension,
     velocity,
 )
-from multilift_marl.planning.maps import CAPACITY, GAPS, MAX_WALLS, WALLS, draw_map, place_map
-from multilift_marl.schema.values import Between, Float, Int, Section, Span
+from multilift_marl.planning.maps import CAPACITY, GAPS, MAX_WALLS, WALLS, Map, draw_map, place_map
+from multilift_marl.rig.obstacles import NONE
+from multilift_marl.schema.values import Between, Float, Int, Section, Span, Vector
+from multilift_marl.sim.obstacles import Obstacles
 from multilift_marl.tasks.base import Kernels, Task
 
+Place = Annotated[Vector, Between(-1e3, 1e3, "m")]
 SPARE = 0.10  # [m] of clearance that the reward asks for
+ROOM = 2.0  # [m] of the payload's space about a given map
 PEAK = 35.0 / 16.0  # of an eased motion's speed over its mean, see `math3d.ease`
 
 
 class NavigateOptions(ArrivalOptions):
     """The map, the target's motion along the straight line, and what counts as success."""
 
-    level: Literal["sparse", "dense", "narrow", "unknown"] = Field("sparse", description="of the maps")
+    level: Literal["sparse", "dense", "narrow", "unknown", "given"] = Field(
+        "sparse", description="of the maps; given: scene.obstacles, start and goal"
+    )
+    start: Place | None = Field(None, description="[m] of the payload, level given")
+    goal: Place | None = Field(None, description="[m] of the payload, level given")
+    low: Place | None = Field(None, description="[m] lowest corner of the payload's space, level given; None: 2 m away")
+    high: Place | None = Field(None, description="[m] highest corner")
     gaps: Annotated[Span, Between(0.1, 1.5)] = Field(
         GAPS, description="[-] widths of the gaps of level narrow over the resting formation's, or their range"
     )
@@ -149,6 +159,29 @@ def least_clearance(e, n, v):
     return v.clearance[e]
 
 
+def given_map(option: NavigateOptions, obstacles: Obstacles) -> Map:
+    """Return the map of level `given`: obstacles are the scene's.
+
+    Raises:
+        ConfigError: no start or goal, or one outside the payload's space.
+    """
+    if option.start is None or option.goal is None:
+        raise ConfigError("task_options.level=given needs task_options.start and task_options.goal, x, y, z [m] each")
+    start, goal = np.array(option.start), np.array(option.goal)
+    used = obstacles.kind[0] != NONE
+    far = np.linalg.norm(obstacles.size[0, used], axis=1, keepdims=True)
+    points = np.vstack([start, goal, obstacles.center[0, used] - far, obstacles.center[0, used] + far])
+    low = points.min(axis=0) - ROOM if option.low is None else np.array(option.low)
+    high = points.max(axis=0) + ROOM if option.high is None else np.array(option.high)
+    for name, place in (("start", start), ("goal", goal)):
+        if (place < low).any() or (place > high).any():
+            raise ConfigError(
+                f"task_options.{name}={place.tolist()} is outside the payload's space from {low.tolist()} to "
+                f"{high.tolist()} m; move it, or widen task_options.low and task_options.high"
+            )
+    return Map(start, goal, low, high, ())
+
+
 class Navigate(Task):
     """Carry the payload to the goal among obstacles; see docs/navigate.md."""
 
@@ -181,7 +214,9 @@ class Navigate(Task):
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, e, scenery = self.options, self.world.num_envs, self.world.system.scenery
-        if scenery.reserved < CAPACITY:
+        if option.level == "given":
+            self._given = given_map(option, self.world.obstacles)
+        elif scenery.reserved < CAPACITY:
             raise ConfigError(f"task navigate places up to {CAPACITY} obstacles; set scene.reserved={CAPACITY} or more")
         self._first = len(scenery.obstacles)
         start, goal, low, high, place = (np.zeros((e, 3)) for _ in range(5))
@@ -193,7 +228,10 @@ class Navigate(Task):
         """Draw the map, and where the team starts; see `Task.start`."""
         option, own = self.options, self.own
         seed = int(rng.integers(2**31)) if option.map is None else option.map
-        drawn = draw_map(option.level, seed, self.world.system, option.gaps, option.walls)
+        if option.level == "given":
+            drawn = self._given
+        else:
+            drawn = draw_map(option.level, seed, self.world.system, option.gaps, option.walls)
         place_map(env, drawn, self.world.obstacles, self._first)
         own.map[env], own.start[env], own.goal[env] = seed, drawn.start, drawn.goal
         own.low[env], own.high[env], own.peak_tension[env] = drawn.low, drawn.high, 0.0
