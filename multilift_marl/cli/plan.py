@@ -17,6 +17,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.planning.feasibility import Feasibility, assess_path
 from multilift_marl.planning.path_file import load_path
 from multilift_marl.planning.path_table import COLUMNS
+from multilift_marl.planning.team_model import has_model
 from multilift_marl.planning.waypoints import describe_violation, plan_waypoints, sample_rows
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Between, Float, Places
@@ -65,8 +66,11 @@ def _plan(values: dict[str, Any]) -> int:
     if config.task != "track":
         raise ConfigError(f"config={options.config} is of task {config.task}; give one of task track")
     system, ranges = config.system, config.randomization
-    if system.num_drones < 2 or not system.anchors.any():
-        raise ConfigError("plans are assessed for payloads on two cables or more; take another rig")
+    if not has_model(system):
+        raise ConfigError(
+            "plans are assessed for bodies with two anchors or more, apart, and for points; set payload.shape=point, "
+            "or take another rig"
+        )
     option = validate(TrackOptions, config.task_options, "task_options")
     refusal = ""
     if option.waypoints is None:

@@ -75,6 +75,20 @@ def make_scene(obstacles: Obstacles, env: int) -> Scene:
     return Scene(*(np.ascontiguousarray(part[env][used]) for part in parts))
 
 
+def rest_clearance(system: System, obstacles: Obstacles, env: int, place: tuple[float, float, float, float]) -> float:
+    """Return how far the resting formation is from obstacles [m], `FAR` at most.
+
+    Args:
+        system: the team.
+        obstacles, env: those of one environment.
+        place: x, y, z [m] and yaw [rad] of the level payload.
+    """
+    rest = system.formation_force
+    body, arms = make_body(system, rest, np.zeros((0, *rest.shape))), np.zeros_like(rest)
+    write_arms(np.zeros(0), body, arms)
+    return float(team_clearance(place, arms, body, make_scene(obstacles, env), team_reach(arms, body), FAR))
+
+
 @kernel
 def segment_clearance(kind, size, a, b, enough):
     """Return distance, normal and share of the point of a segment that is nearest to an obstacle, in its frame.

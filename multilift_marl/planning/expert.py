@@ -36,7 +36,7 @@ from multilift_marl.planning.hard_planner import (
     make_limits,
     solve_teams,
 )
-from multilift_marl.planning.team_model import make_model, state_size
+from multilift_marl.planning.team_model import has_model, make_model, state_size
 from multilift_marl.planning.team_planner import Plans, make_objective, make_surroundings
 
 COSTS = "position", "attitude", "cable", "velocity", "body_rates", "cable_rates", "thrust", "thrust_rate"
@@ -94,14 +94,16 @@ class TeamExpert:
         limit_names: of each step.
 
     Raises:
-        ConfigError: a payload on one point or one cable, which has no attitude to plan.
+        ConfigError: a body that hangs on one point, see `team_model.has_model`.
     """
 
     def __init__(self, config: Config, tolerance: float = TOLERANCE):
         system, settings = config.system, config.planner
         n, steps = system.num_drones, settings.steps
-        if n < 2 or np.ptp(system.anchors, axis=0).max() < 1e-9:
-            raise ConfigError("the expert plans for payloads on two cables or more, apart; give another rig")
+        if not has_model(system):
+            raise ConfigError(
+                "the expert plans for bodies with two anchors or more, apart, and for points; give another rig"
+            )
         self.times = settings.step * np.arange(steps + 1)[:, None] + STEP * (np.arange(SAMPLES) - SAMPLES // 2)
         self.model = make_model(system)
         self.objective = make_objective(settings, system, self.model)

@@ -23,7 +23,7 @@ from multilift_marl.planning.flatness import (
     steady_shape,
 )  # fmt: skip
 from multilift_marl.planning.spline import sample_spline
-from multilift_marl.planning.team_model import make_model, state_size
+from multilift_marl.planning.team_model import has_model, make_model, state_size
 from multilift_marl.rig.system import System
 from multilift_marl.schema.sections import RandomizationConfig
 
@@ -90,9 +90,9 @@ class Feasibility(NamedTuple):
 def find_violation(table: np.ndarray, system: System, ranges: RandomizationConfig) -> Margin | None:
     """Return the first limit that the path of a level payload exceeds, None if none; see `assess_path`.
 
-    A payload on one point or one cable, which has no attitude to plan, is not assessed.
+    A body that hangs on one point, whose attitude is not planned, is not assessed.
     """
-    if system.num_drones < 2 or not system.anchors.any():
+    if not has_model(system):
         return None
     return assess_path(table, system, ranges).violation
 
@@ -117,7 +117,7 @@ def assess_path(table: np.ndarray, system: System, ranges: RandomizationConfig) 
 def assess_motion(
     times: np.ndarray, positions: np.ndarray, rotations: np.ndarray, system: System, ranges: RandomizationConfig
 ) -> Feasibility:
-    """Return what a motion of the payload asks of a team of two or more drones, beside its limits.
+    """Return what a motion of the payload asks of a team, beside its limits.
 
     Payload and drones are the heaviest, and rotors the weakest, that `ranges` draw.
 
@@ -229,14 +229,16 @@ def _measure_places(
 
     limits = make_limits(system)
     gaps = np.linalg.norm(motion.place[:, :, None] - motion.place[:, None], axis=-1)
-    nearest = (gaps - limits.separation + np.where(np.eye(n), np.inf, 0.0)).argmin(axis=-1)
+    gaps[:, np.arange(n), np.arange(n)] = np.inf
+    nearest = (gaps - limits.separation).argmin(axis=-1)
     distance = np.take_along_axis(gaps, nearest[..., None], axis=-1)[..., 0]
     apart = Quantity("distance", "m", distance, limits.separation[np.arange(n), nearest])
 
     place, attitude = payload
     down = attitude[:, 2] @ np.array(limits.payload_center) - np.abs(attitude[:, 2]) @ limits.payload_half  # of a box
     height = np.column_stack([place[:, 2] + down, motion.place[..., 2] - limits.drone_half[:, 2]])
-    return lift, apart, Quantity("height", "m", height, np.full((count, 1 + n), TOUCH))
+    low = Quantity("height", "m", height, np.full((count, 1 + n), TOUCH))
+    return (lift, low) if n == 1 else (lift, apart, low)
 
 
 def _margin(quantity: Quantity, times: np.ndarray, spare: np.ndarray, i: int, k: int) -> Margin:

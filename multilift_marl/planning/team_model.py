@@ -43,6 +43,11 @@ class TeamModel(NamedTuple):
     """Of the payload, ½ ρ C_d A [kg/m]."""
 
 
+def has_model(system: System) -> bool:
+    """Return whether there is a model of a team: its payload is a point, or has anchors apart from each other."""
+    return not system.anchors.any() or bool(np.ptp(system.anchors, axis=0).max() > 1e-9)
+
+
 def make_model(system: System) -> TeamModel:
     """Return the nominal model of a team."""
     # The model's cables do not stretch: they are as long as real ones under the resting load.

@@ -18,6 +18,7 @@ from multilift_marl.planning.approach import Approach, begin_approaches, write_a
 from multilift_marl.planning.flatness import SAMPLES, SHAPES, STEP
 from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.hard_planner import HardPlanner
+from multilift_marl.planning.team_model import has_model
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.policies.full_state_command import FullStateCommand, rotations
@@ -60,8 +61,8 @@ class TeamMpc:
             (E, M, N, 3) [N], see `flatness.set_flat_state`, or None for that at rest. None: `Task.preview_targets`.
 
     Raises:
-        ConfigError: a task that it cannot fly, see `Task.CAN_PLAN`; a box on one cable, whose attitude it cannot plan;
-            drones that reject the forces that it estimates.
+        ConfigError: a task that it cannot fly, see `Task.CAN_PLAN`; a body that hangs on one point (see
+            `team_model.has_model`); drones that reject the forces that it estimates.
     """
 
     INTERFACE: ClassVar[str] = "acc_rates"
@@ -75,10 +76,10 @@ class TeamMpc:
                 "another policy"
             )
         self._is_point = vec.task.rig.is_point
-        if n < 2 and not self._is_point:
+        if not has_model(system):
             raise ConfigError(
-                "policy=mpc plans for payloads on two cables or more, or for a point; set payload.shape=point, or take "
-                "another policy for this rig"
+                "policy=mpc plans for bodies with two anchors or more, apart, and for points; set payload.shape=point, "
+                "or take another policy for this rig"
             )
         rejection = config.control.disturbance
         if config.planner.estimate and rejection != "none":

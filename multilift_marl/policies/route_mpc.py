@@ -24,7 +24,6 @@ from multilift_marl.tasks.navigate import Navigate
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
-HINGE = 0.06  # [m] of `planner.clearance` at most: more would push teams off routes that lead closer to obstacles
 INSIDE = 0.1  # [m] that routes keep from the bounds of the map, beyond which the payload is out of range
 AHEAD = 0.1  # [s] that a route which goes on begins later, as a search takes time
 RETRY = 0.2  # [s] after a search that found no way on
@@ -35,6 +34,7 @@ class RouteMpc(TeamMpc):
 
     Class attributes:
         NAME: of the policy.
+        HINGE: of `planner.clearance` at most [m]: more would push teams off routes that lead closer to obstacles.
 
     Attributes:
         routes: of each environment (E,), None where none was found: there the team stays where it began.
@@ -45,6 +45,7 @@ class RouteMpc(TeamMpc):
     """
 
     NAME: ClassVar[str] = "mpc_route"
+    HINGE: ClassVar[float] = 0.06
 
     def __init__(self, vec: MultiliftVec):
         if not isinstance(vec.task, Navigate):
@@ -61,7 +62,7 @@ class RouteMpc(TeamMpc):
         self._flown: list[list[tuple[float, Route]]] = [[] for _ in range(e)]
         self.known = Obstacles(*(array.copy() for array in vec.world.obstacles))
         around = self.planner.around
-        points = around.points._replace(clearance=min(around.points.clearance, HINGE))
+        points = around.points._replace(clearance=min(around.points.clearance, self.HINGE))
         self.planner.around = around._replace(obstacles=self.known, points=points)
         self._seen = np.zeros(self.known.kind.shape, bool)
         self._due = np.zeros(e)

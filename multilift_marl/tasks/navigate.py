@@ -27,8 +27,10 @@ from multilift_marl.mdp.rewards import (
     update_peak_tension,
     velocity,
 )
+from multilift_marl.navigation.team_clearance import rest_clearance
 from multilift_marl.planning.maps import CAPACITY, GAPS, MAX_WALLS, WALLS, Map, draw_map, place_map
 from multilift_marl.rig.obstacles import NONE
+from multilift_marl.rig.system import System
 from multilift_marl.schema.values import Between, Float, Int, Section, Span, Vector
 from multilift_marl.sim.obstacles import Obstacles
 from multilift_marl.tasks.base import Kernels, Task
@@ -47,7 +49,9 @@ class NavigateOptions(ArrivalOptions):
     )
     start: Place | None = Field(None, description="[m] of the payload, level given")
     goal: Place | None = Field(None, description="[m] of the payload, level given")
-    low: Place | None = Field(None, description="[m] lowest corner of the payload's space, level given; None: 2 m away")
+    low: Place | None = Field(
+        None, description="[m] lowest corner of the payload's space, level given; None: 2 m beyond all"
+    )
     high: Place | None = Field(None, description="[m] highest corner")
     gaps: Annotated[Span, Between(0.1, 1.5)] = Field(
         GAPS, description="[-] widths of the gaps of level narrow over the resting formation's, or their range"
@@ -159,11 +163,11 @@ def least_clearance(e, n, v):
     return v.clearance[e]
 
 
-def given_map(option: NavigateOptions, obstacles: Obstacles) -> Map:
+def given_map(option: NavigateOptions, system: System, obstacles: Obstacles) -> Map:
     """Return the map of level `given`: obstacles are the scene's.
 
     Raises:
-        ConfigError: no start or goal, or one outside the payload's space.
+        ConfigError: no start or goal, or one outside the payload's space, or where the team is in an obstacle.
     """
     if option.start is None or option.goal is None:
         raise ConfigError("task_options.level=given needs task_options.start and task_options.goal, x, y, z [m] each")
@@ -179,6 +183,8 @@ def given_map(option: NavigateOptions, obstacles: Obstacles) -> Map:
                 f"task_options.{name}={place.tolist()} is outside the payload's space from {low.tolist()} to "
                 f"{high.tolist()} m; move it, or widen task_options.low and task_options.high"
             )
+        if rest_clearance(system, obstacles, 0, (*place.tolist(), 0.0)) <= 0:
+            raise ConfigError(f"at task_options.{name}={place.tolist()} the team is in an obstacle; move one of them")
     return Map(start, goal, low, high, ())
 
 
@@ -214,8 +220,13 @@ class Navigate(Task):
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, e, scenery = self.options, self.world.num_envs, self.world.system.scenery
+        own = [name for name in ("start", "goal", "low", "high") if getattr(option, name) is not None]
+        if own and option.level != "given":
+            raise ConfigError(
+                f"task_options.{own[0]} means nothing at level {option.level}; set task_options.level=given"
+            )
         if option.level == "given":
-            self._given = given_map(option, self.world.obstacles)
+            self._given = given_map(option, self.world.system, self.world.obstacles)
         elif scenery.reserved < CAPACITY:
             raise ConfigError(f"task navigate places up to {CAPACITY} obstacles; set scene.reserved={CAPACITY} or more")
         self._first = len(scenery.obstacles)

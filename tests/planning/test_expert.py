@@ -132,6 +132,17 @@ def test_what_cannot_be_is_refused_in_a_sentence(expert, wrong, words):
         wrong(expert)
 
 
-def test_payloads_without_an_attitude_are_refused():
-    with pytest.raises(ConfigError, match="two cables or more"):
+def test_bodies_on_one_cable_are_refused():
+    with pytest.raises(ConfigError, match="two anchors or more, apart, and for points"):
         TeamExpert(ml.load_config("hover", {"env.num_drones": 1}))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_point_is_planned_from_a_swing_to_rest(count):
+    expert = TeamExpert(ml.load_config("hover", {"env.num_drones": count, "payload.shape": "point"}))
+    states = expert.rest_states(HOME)
+    states[:, 0] += 0.3
+    plans = expert.solve(states, pose_goal(expert.times, HOME))
+    assert plans.converged.all()
+    assert np.linalg.norm(plans.states[0, -1, :3] - HOME) < 0.1
+    assert (plans.states[0, :, 3:6] == 0).all()  # nothing turns a point

@@ -101,10 +101,13 @@ def test_the_first_limit_that_is_exceeded_is_named(rows, quantity, drone):
     assert isinstance(least[quantity], Margin) and least[quantity].spare <= first.spare
 
 
-def test_payloads_without_an_attitude_are_not_assessed():
+def test_bodies_on_one_cable_are_not_assessed_and_points_are():
     fast = table_of([[0, 0, 0, 2, 0], [1, 3, 0, 2, 0]])
     assert find_violation(fast, make_system(1), NOTHING) is None
-    assert find_violation(fast, make_system(3, **{"payload.shape": "point"}), NOTHING) is None
+    for count in (1, 3):
+        point = make_system(count, **{"payload.shape": "point"})
+        assert find_violation(fast, point, NOTHING) is not None
+        assert ("distance" in {each.quantity for each in assess_path(fast, point, NOTHING).margins}) == (count > 1)
 
 
 @pytest.mark.slow

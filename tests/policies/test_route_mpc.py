@@ -34,6 +34,15 @@ def test_maps_are_passed(name, drones):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("name", "drones"), [("window", 2), ("window3", 3), ("forest", 4), ("wall", 6)])
+def test_public_maps_are_passed_by_points_on_cables(name, drones):
+    vec = make(f"maps/coltrans_{name}", num_envs=3, num_drones=drones, **FLOWN)
+    info, terminated, _ = fly(vec, make_scripted("mpc_route", vec))
+    assert not terminated.any() and info["success"].all()
+    assert (vec.task.min_clearance > 0.05).all()
+
+
+@pytest.mark.slow
 def test_a_team_goes_around_what_comes_into_sight():
     vec = make("navigate_unknown", num_envs=2, **FLOWN)
     policy = make_scripted("mpc_route", vec)

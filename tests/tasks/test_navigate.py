@@ -136,6 +136,39 @@ def test_configured_obstacles_stay_beside_those_of_maps():
         assert (vec.world.obstacles.kind[:, 1:6] != NONE).all()
 
 
+PILLAR = {"shape": "cylinder", "size": [0.4, 4.0], "position": [0.0, 0.0, 2.0]}
+GIVEN = {"task_options.level": "given", "task_options.start": [-3, 0, 1.5], "task_options.goal": [3, 1, 1.6]}
+GIVEN |= {"scene.obstacles": [PILLAR], "scene.reserved": 0}
+
+
+def test_a_given_map_is_the_scene_with_its_start_and_goal():
+    vec = make("navigate", num_envs=2, **GIVEN)
+    vec.reset(seed=0)
+    own = vec.task.own
+    assert (own.start == [-3, 0, 1.5]).all() and (own.goal == [3, 1, 1.6]).all()
+    assert (vec.world.obstacles.kind == [[CYLINDER]]).all()
+    far = np.linalg.norm([0.2, 0.2, 2.0])
+    np.testing.assert_allclose(own.low[0], [-5, -far - 2, 2 - far - 2])
+    np.testing.assert_allclose(own.high[0], [5, far + 2, 2 + far + 2])
+    vec = make("navigate", num_envs=1, **GIVEN, **{"task_options.low": [-4, -1, 1], "task_options.high": [4, 2, 2]})
+    vec.reset(seed=0)
+    assert vec.task.own.low[0].tolist() == [-4, -1, 1] and vec.task.own.high[0].tolist() == [4, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"task_options.goal": None}, "needs task_options.start and task_options.goal"),
+        ({"task_options.level": "dense", "scene.reserved": 16}, "task_options.start means nothing at level dense"),
+        ({"task_options.high": [2, 2, 2]}, r"goal=[3.0, 1.0, 1.6] is outside the payload's space"),
+        ({"task_options.goal": [0.3, 0, 1.5]}, "at task_options.goal=[0.3, 0.0, 1.5] the team is in an obstacle"),
+        ({"task_options.start": [1, 2]}, "task_options.start"),
+    ],
+)
+def test_given_maps_that_cannot_be_are_refused(change, said):
+    assert said in refusal(make, "navigate", **(GIVEN | change))
+
+
 def test_a_straight_flight_without_obstacles_succeeds():
     vec = reset(2)
     clear_all(vec)
