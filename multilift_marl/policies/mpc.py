@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
     Preview = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
 
-SHARE = 0.6  # of what filters of sensors say beside the prediction, by which states are corrected
-UNFILTERED = 0.35  # of what `randomization.observation_noise` leaves, which no filter has smoothed
+# By which share of what sensors say beside the prediction states are corrected: of cameras, after their filters, of what
+# `randomization.observation_noise` leaves, which no filter has smoothed, and of drones' own cables.
+SHARE, UNFILTERED, ONBOARD = 0.6, 0.35, 0.1
 ENOUGH = {  # full scales of actions that limit no usual flight, and those to set
     "acc_rates": {"max_acceleration": (10.0, 25.0), "max_tilt_rate": (8.0, 15.0)},
     "full_state": {
@@ -92,12 +93,13 @@ class TeamMpc:
         self.planner = HardPlanner(*team) if settings.limits == "hard" else TeamPlanner(*team, vec.world.obstacles)
         self._dt = vec.task.dt
         exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
-        noise = settings.estimate_noise or (0.5 if exact else 1.0)
+        cameras, onboard = config.env.sensing in CAMERAS, config.env.sensing in ("onboard", "blind")
+        noise = settings.estimate_noise or (0.5 if exact else 2.0 if onboard else 1.0)
         self._estimator = ForceEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None
         self._observer = None
         if not exact:
-            late = CAMERA_DELAY if config.env.sensing in CAMERAS else 0.0
-            share = UNFILTERED if config.env.sensing == "ideal" else SHARE
+            late = CAMERA_DELAY if cameras else 0.0
+            share = SHARE if cameras else ONBOARD if onboard else UNFILTERED
             self._observer = TeamObserver(self.planner.model, vec.num_envs, share, late)
         lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)
         self._full_state, self._feedback = None, settings.feedback

@@ -54,6 +54,12 @@ class RouteMpc(TeamMpc):
             )
         if vec.config.planner.limits == "hard":
             raise ConfigError(f"policy={self.NAME} keeps clear of obstacles by soft limits; set planner.limits=soft")
+        env = vec.config.env
+        if env.sensing in ("onboard", "blind") and env.communication == "none":
+            raise ConfigError(
+                f"policy={self.NAME} turns the payload, whose attitude drones do not know with env.sensing="
+                f"{env.sensing}; set env.sensing=onboard env.communication=all"
+            )
         super().__init__(vec, self._follow)
         e = vec.num_envs
         self._task = vec.task
@@ -67,7 +73,6 @@ class RouteMpc(TeamMpc):
         self._seen = np.zeros(self.known.kind.shape, bool)
         self._due = np.zeros(e)
         self._new = np.ones(e, bool)
-        env = vec.config.env
         self._range = env.obstacles.range if env.obstacle_sensing in ("local", "ranges") else np.inf
 
     def reset(self, mask: np.ndarray | None = None) -> None:
@@ -138,8 +143,9 @@ class RouteMpc(TeamMpc):
 
     def _search(self, e: int, departure: np.ndarray | None, begin: float) -> None:
         """Replace the route of an environment from a time on [s]; the one that it has stays where none is found."""
-        own, state = self._task.own, self._vec.world.state
-        start = np.append(state.payload_position[e], heading(tuple(state.payload_rotation[e].ravel())))
+        own, load = self._task.own, self._task.view.payload_estimate
+        yaw = 0.0 if self._is_point else heading(tuple(load.rotation[e, 0].ravel()))
+        start = np.append(load.position[e].mean(axis=0), yaw)
         ends = np.array([start[:3], own.goal[e]])  # those of a given map may be closer to its bounds
         low = np.minimum(own.low[e] + INSIDE, ends.min(axis=0))
         high = np.maximum(own.high[e] - INSIDE, ends.max(axis=0))

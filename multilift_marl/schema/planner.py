@@ -64,7 +64,7 @@ class PlannerConfig(Section):
     estimate_noise: Annotated[Float | None, Between(1e-3, 1000)] = Field(
         None,
         description="[-] of accelerations as measured for that, over gravity; larger: slower; None: 0.5 with "
-        "env.sensing=ideal and no observation_noise, else 1",
+        "env.sensing=ideal and no observation_noise, 2 with onboard and blind, else 1",
     )
     feedback: Annotated[Float, Between(0, 1)] = Field(
         1.0,

@@ -60,6 +60,13 @@ def test_late_cameras_cost_a_centimetre():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("sensing", "most"), [("onboard", 0.03), ("blind", 0.15)])
+def test_sensors_on_board_cost_centimetres(sensing, most):
+    result = fly("track", FAST | {"env.sensing": sensing}, episodes=6)
+    assert not result["failure_cause"].any() and (result["payload_rmse_m"] < most).all()
+
+
+@pytest.mark.slow
 def test_it_flies_tilted_poses():
     result = fly("pose", {}, episodes=2, seconds=8.0)
     assert result["success_rate"].all() and (result["payload_position_error_m"] < 0.01).all()

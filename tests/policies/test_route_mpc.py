@@ -43,6 +43,16 @@ def test_public_maps_are_passed_by_points_on_cables(name, drones):
 
 
 @pytest.mark.slow
+def test_a_forest_is_passed_by_sensors_on_board():
+    onboard = {"env.sensing": "onboard"}
+    said = refusal(make_scripted, "mpc_route", make("navigate_dense", **FLOWN, **onboard))
+    assert "set env.sensing=onboard env.communication=all" in said
+    vec = make("navigate_dense", num_envs=4, **FLOWN, **onboard, **{"env.communication": "all"})
+    info, terminated, _ = fly(vec, make_scripted("mpc_route", vec))
+    assert not terminated.any() and info["success"].mean() >= 0.75
+
+
+@pytest.mark.slow
 def test_a_team_goes_around_what_comes_into_sight():
     vec = make("navigate_unknown", num_envs=2, **FLOWN)
     policy = make_scripted("mpc_route", vec)
