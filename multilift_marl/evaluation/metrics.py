@@ -167,7 +167,10 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
 
 
 def format_table(report: dict[str, Any], name: str = "policy") -> str:
-    """Return the report as a Markdown table: mean and 95 % interval of each metric, a column for each policy."""
+    """Return the report as a Markdown table: mean and 95 % interval of each metric, a column for each policy.
+
+    What no policy has, such as a distance from obstacles where there are none, is left out.
+    """
     columns = {name: report["policy"], **report["baselines"]}
     causes = {
         key for summary in columns.values() for key in summary if key.startswith("failure_") and summary[key]["mean"]
@@ -175,7 +178,9 @@ def format_table(report: dict[str, Any], name: str = "policy") -> str:
     rows = [*_ROWS, *((key, f"{key[8:-5].replace('_', ' ')} [%]", 100, 1) for key in sorted(causes))]
     cells = [["", *columns]]
     for key, heading, factor, digits in rows:
-        cells.append([heading, *(_cell(summary.get(key), factor, digits) for summary in columns.values())])
+        found = [_cell(summary.get(key), factor, digits) for summary in columns.values()]
+        if any(cell != "-" for cell in found):
+            cells.append([heading, *found])
     return _align(cells)
 
 
