@@ -18,7 +18,8 @@ from multilift_marl.rendering import Renderer
 WIDTH, HEIGHT, GAP = 480, 360, 6  # [pixels]
 TRAIL = 1.0  # [s]
 MIXED = {"vehicle.preset": ("falcon", "falcon", "hummingbird", "iris")}
-ROUTE = {"control.action": "acc_rates", "task_options.map": 3}
+ACC_RATES = {"control.action": "acc_rates"}
+ROUTE = {**ACC_RATES, "task_options.map": 3}
 STRIPS: dict[str, tuple[str, dict, str, int, tuple[float, ...]]] = {
     # name: configuration, overrides, script or shipped policy, seed, times [s]
     "hover": ("hover", {}, "hover", 3, (0.02, 0.6, 4.0)),
@@ -30,10 +31,13 @@ STRIPS: dict[str, tuple[str, dict, str, int, tuple[float, ...]]] = {
     "loss": ("loss", {}, "loss", 0, (1.5, 4.4, 11.0)),
     "navigate": ("navigate_narrow", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
     "navigate_dense": ("navigate_dense", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
+    "navigate_sparse": ("navigate", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
+    "navigate_unknown": ("navigate_unknown", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
+    "coltrans": ("maps/coltrans_forest", {**ACC_RATES, "env.num_drones": 6}, "mpc_route", 0, (1.0, 2.3, 3.4)),
     "mixed_team": ("hover", MIXED, "formation_integral", 0, (0.02, 6.0)),
 }
 
-CAMERAS = dict.fromkeys(("gate", "navigate", "navigate_dense"), "chase")
+CAMERAS = {name: "chase" for name, strip in STRIPS.items() if strip[2] == "mpc_route"} | {"gate": "chase"}
 
 
 def draw(name: str) -> np.ndarray:

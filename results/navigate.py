@@ -96,10 +96,21 @@ def summary(path: Path) -> dict[str, str]:
     return line
 
 
+def flown_by_any(paths: list[Path]) -> int:
+    """Return on how many maps of a row any policy succeeded: they can be flown."""
+    flights = [np.load(path)["success_rate"].astype(bool) for path in paths]
+    flown = np.zeros(max(len(each) for each in flights), bool)
+    for each in flights:
+        flown[: len(each)] |= each
+    return int(flown.sum())
+
+
 def write_table() -> None:
     """Write the table of all that has been flown."""
-    order = [(row, path) for row in ROWS for path in sorted(HERE.glob(f"{row}_*.npz"))]
-    lines = [summary(path) for _, path in order]
+    lines = []
+    for row in ROWS:
+        paths = sorted(HERE.glob(f"{row}_*.npz"))
+        lines += [summary(path) | {"maps_flown_by_any": str(flown_by_any(paths))} for path in paths]
     columns = list(dict.fromkeys(name for line in lines for name in line))
     with (DOCS / "data" / "navigate.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
