@@ -27,6 +27,7 @@ LEVELS = "sparse", "dense", "narrow", "unknown"
 PUBLIC = "window", "forest", "wall"  # of coltrans-planning, in configs/maps; episodes differ by their starts
 ROWS: dict[str, dict[str, object]] = {
     **{f"{level}_{n}": {"env.num_drones": n} for n in (4, 2, 3, 6, 8) for level in LEVELS},
+    **{f"{level}_1": {"env.num_drones": 1, "payload.shape": "point"} for level in LEVELS},
     **{f"half_{n}": {"env.num_drones": n, "task_options.gaps": 0.5} for n in (3, 4, 6, 8)},
     "two_4": {"env.num_drones": 4, "task_options.walls": 2},
     "three_4": {"env.num_drones": 4, "task_options.walls": 3},

@@ -27,6 +27,7 @@ CEILING = 0.3  # of the payload above that level, 0.1 m added
 PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # how many; least gaps between them
 RADIUS = 0.12, 0.32  # of pillars
 GAPS = 0.5, 0.8  # range of the widths of a narrow map's gaps over the resting formation's
+ALONE = 4.0
 SPARE = 0.15  # that a gap is wider than the payload, at least
 WALLS = 3  # of a narrow map
 MAX_WALLS = CAPACITY // 2
@@ -56,11 +57,14 @@ class Map(NamedTuple):
 
 
 def formation_width(system: System) -> float:
-    """Return the greatest horizontal extent of the resting formation along x or y, drones included [m]."""
+    """Return the greatest horizontal extent of the resting formation along x or y, drones included [m].
+
+    Of a single drone, which cannot draw in, that counts `ALONE` times: gaps are narrower than formations.
+    """
     half = np.array([vehicle.half_size for vehicle in system.vehicles])[:, :2]
     payload = system.payload_size[:2] / 2
     ends = np.vstack([system.slots[:, :2] + half, system.slots[:, :2] - half, payload, -payload])
-    return float((ends.max(axis=0) - ends.min(axis=0)).max())
+    return float((ends.max(axis=0) - ends.min(axis=0)).max()) * (ALONE if system.num_drones == 1 else 1.0)
 
 
 def unit_length(system: System) -> float:

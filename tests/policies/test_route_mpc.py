@@ -43,6 +43,14 @@ def test_public_maps_are_passed_by_points_on_cables(name, drones):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["navigate_dense", "navigate_narrow"])
+def test_one_drone_passes_with_a_point(name):
+    vec = make(name, num_envs=3, num_drones=1, **FLOWN, **{"payload.shape": "point"})
+    info, terminated, _ = fly(vec, make_scripted("mpc_route", vec))
+    assert not terminated.any() and info["success"].all()
+
+
+@pytest.mark.slow
 def test_a_forest_is_passed_by_sensors_on_board():
     onboard = {"env.sensing": "onboard"}
     said = refusal(make_scripted, "mpc_route", make("navigate_dense", **FLOWN, **onboard))
