@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     Preview = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
 
-# By which share of what sensors say beside the prediction states are corrected: of cameras, after their filters, of what
-# `randomization.observation_noise` leaves, which no filter has smoothed, and of drones' own cables.
+# By which share of what sensors say beside the prediction states are corrected: of cameras, after their filters; of
+# `randomization.observation_noise`, which no filter has smoothed; and of drones' own cables.
 SHARE, UNFILTERED, ONBOARD = 0.6, 0.35, 0.1
 ENOUGH = {  # full scales of actions that limit no usual flight, and those to set
     "acc_rates": {"max_acceleration": (10.0, 25.0), "max_tilt_rate": (8.0, 15.0)},
