@@ -124,13 +124,12 @@ def write_page() -> None:
     with (DOCS / "data" / "navigate.csv").open(encoding="utf-8") as file:
         lines = [line for line in csv.DictReader(file) if line["drones"] == "4" and line["level"] in LEVELS]
     policies = sorted({line["policy"] for line in lines}, key=lambda name: (name != "mpc_route", name))
-    rows = [f"|level, maps|{'|'.join(f'`{policy}`' for policy in policies)}|", f"|---|{'---|' * len(policies)}"]
+    rows = [f"|level|{'|'.join(f'`{policy}`' for policy in policies)}|", f"|---|{'---|' * len(policies)}"]
     for level in LEVELS:
         cells = {line["policy"]: line for line in lines if line["level"] == level}
-        maps = ", ".join(sorted({line["maps"] for line in cells.values()}))
         found = [cells.get(policy) for policy in policies]
-        shown = "|".join(f"{line['success_percent']} ({line['ci95']})" if line else "" for line in found)
-        rows.append(f"|{level}, {maps}|{shown}|")
+        text = "{success_percent} of {maps} ({ci95})"
+        rows.append(f"|{level}|{'|'.join(text.format(**line) if line else '-' for line in found)}|")
     page = DOCS / "navigate.md"
     before, rest = page.read_text(encoding="utf-8").split(BEGIN)
     page.write_text(f"{before}{BEGIN}" + "\n".join(rows) + f"\n{END}{rest.split(END, 1)[1]}", encoding="utf-8")
