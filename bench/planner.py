@@ -3,11 +3,12 @@
     python bench/planner.py [repeats=200] [drones=3,4,6,8] [starts=100] [any configuration key]
 
 First, a team is 0.1 m from its target at rest. Stated are medians, and the least and the largest time [ms], of a
-Gauss-Newton iteration: the trajectory linearised, the Riccati recursion, and its step; and of a whole plan with its
-flat states. Then plans within hard limits, from the random states of `TeamExpert.random_states`: how many converge
-within 40 iterations; iterations and times, median and ninth decile; the same a policy step later, from states that are
-disturbed by 5 mm, 2 cm/s, 0.01 and 0.05 1/s at most; and times of a quadratic program of the same size by PIQP, if it
-is installed (`pip install piqp`).
+Gauss-Newton iteration: the trajectory linearised, the Riccati recursion, and its step; of a whole plan with its flat
+states; and of one drone's share in plans of drones that plan for themselves, with `planner.sweeps`. Then plans within
+hard limits, from the random states of `TeamExpert.random_states`: how many converge within 40 iterations; iterations
+and times, median and ninth decile; the same a policy step later, from states that are disturbed by 5 mm, 2 cm/s, 0.01
+and 0.05 1/s at most; and times of a quadratic program of the same size by PIQP, if it is installed
+(`pip install piqp`).
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ from planner_qp import time_piqp
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config, parse_overrides
+from multilift_marl.planning.distributed_planner import DistributedPlanner
 from multilift_marl.planning.expert import TeamExpert
 from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.goals import pose_goal
 from multilift_marl.planning.riccati import IterationWork, Problem, find_gains, take_step
 from multilift_marl.planning.team_model import ModelWork, state_size, step_state
 from multilift_marl.planning.team_planner import TeamPlanner
+from multilift_marl.sensing.communication import Links
 
 DEFAULTS = {"repeats": 200, "drones": "3,4,6,8", "starts": 100}
 LATER = 0.02  # [s], a policy step
@@ -44,8 +47,8 @@ def timed(call: Callable[[], object], repeats: int) -> np.ndarray:
     return np.array(times)
 
 
-def measure(config: Config, repeats: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times of iterations and of plans [ms]."""
+def measure(config: Config, repeats: int) -> tuple[np.ndarray, ...]:
+    """Return the times of iterations, of plans, and of one drone's share in distributed ones [ms]."""
     system, settings = config.system, config.planner
     n, steps = system.num_drones, settings.steps
     planner = TeamPlanner(system, settings, 1)
@@ -57,7 +60,7 @@ def measure(config: Config, repeats: int) -> tuple[np.ndarray, np.ndarray]:
     start[0] += 0.1
     states, inputs = np.tile(rest, (steps + 1, 1)), np.zeros((steps, 3 * n))
     targets = states.copy(), inputs.copy()
-    problem = Problem(*targets, settings.step, planner.model, still, planner.objective, planner.around)
+    problem = Problem(*targets, settings.step, planner.model, still[None], planner.objective, planner.around)
     work = IterationWork.of(steps, n)
 
     def iterate() -> None:
@@ -67,7 +70,15 @@ def measure(config: Config, repeats: int) -> tuple[np.ndarray, np.ndarray]:
     shape = (1, *planner.times.shape)
     motion = np.tile([0.0, 0.0, 1.0], (*shape, 1)), np.tile(np.eye(3), (*shape, 1, 1))
     offsets = np.zeros((*shape[:2], 12))
-    return timed(iterate, repeats), timed(lambda: planner.plan(start[None], *motion, 0.02, offsets), repeats)
+    links = Links(~np.eye(n, dtype=bool), 0, 0.0, np.inf)
+    apart = DistributedPlanner(system, settings, 1, None, links)
+    known = start[None], *motion, LATER, offsets
+    knows = *(np.repeat(each, n, axis=0) for each in known[:3]), LATER, np.repeat(offsets, n, axis=0)
+    return (
+        timed(iterate, repeats),
+        timed(lambda: planner.plan(*known), repeats),
+        timed(lambda: apart.plan(*knows), repeats) / n,
+    )
 
 
 def converge(config: Config, count: int) -> list[str]:
@@ -112,7 +123,7 @@ def main(arguments: list[str]) -> None:
     values = parse_overrides(arguments, ["drones"])
     repeats, drones, starts = (values.pop(key, default) for key, default in DEFAULTS.items())
     configs = {n: load_config("hover", values | {"env.num_drones": int(n)}) for n in str(drones).split(",")}
-    print("| drones | iteration [ms] | plan [ms] |\n|---|---|---|")
+    print("| drones | iteration [ms] | plan [ms] | share of one drone [ms] |\n|---|---|---|---|")
     for n, config in configs.items():
         cells = (
             f"{np.median(times):.2f} ({times.min():.2f} - {times.max():.2f})" for times in measure(config, int(repeats))

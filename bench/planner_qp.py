@@ -16,7 +16,7 @@ def dynamics(expert: TeamExpert, rest: np.ndarray, h: float) -> tuple[np.ndarray
     """Return A and B of a step at rest, and the derivatives (N, 12 + 7 N) of the tensions."""
     n, size = len(expert.model.anchors), len(rest)
     w, inputs, states = IterationWork.of(1, n), np.zeros((1, 3 * n)), np.tile(rest, (2, 1))
-    problem = Problem(states, inputs, h, expert.model, np.zeros(7), expert.objective, expert.around)
+    problem = Problem(states, inputs, h, expert.model, np.zeros((1, 7)), expert.objective, expert.around)
     linearise(0, states, inputs, problem, w)
     a = np.zeros((size, size))
     for i in range(size):

@@ -24,6 +24,7 @@ MOMENT = 0.02, 0.35  # of its weight times the mean distance of its anchors
 DRONE = 0.1, 0.5  # of a drone's weight and share of the load; with twice the drift late sensors make it swing
 LARGEST = 0.6  # of these, that estimates are at most
 PAYLOAD = 7  # unknowns of the payload, see `team_model.accelerations`
+UNSEEN = 1e12  # [m²/s⁴] variance of accelerations that nobody measures
 _STEP = 1e-3  # of differences, over the unknown's scale
 
 
@@ -43,7 +44,7 @@ class ForceEstimate(NamedTuple):
 
 
 class Priors(NamedTuple):
-    """What is thought of unknowns beforehand, (7 + 3 N,) each, and of what is measured."""
+    """What is thought of unknowns beforehand, (P, 7 + 3 N) each, and of what is measured; team e by row e modulo P."""
 
     scale: np.ndarray
     """Of each unknown, which bounds it and sets the steps of differences."""
@@ -52,11 +53,17 @@ class Priors(NamedTuple):
     drift: np.ndarray
     """Variance that a second adds."""
     noise: np.ndarray
-    """(6 + 2 N,) variance of measured accelerations."""
+    """(P, 6 + 2 N) variance of measured accelerations."""
 
 
-def make_priors(model: TeamModel, noise: float) -> Priors:
-    """Return the priors of a team; `noise` is that of measured accelerations, over gravity."""
+def make_priors(model: TeamModel, noise: float, apart: bool = False) -> Priors:
+    """Return the priors of a team.
+
+    Args:
+        model: nominal.
+        noise: of measured accelerations, over gravity.
+        apart: as each drone has them, which measures but the payload and itself (P = N); else one of all (P = 1).
+    """
     n = len(model.anchors)
     # A point has no arms; what is thought of moments on it has no effect.
     mass, arm = model.payload_mass, float(np.linalg.norm(model.anchors, axis=1).mean() or model.length.mean())
@@ -72,7 +79,13 @@ def make_priors(model: TeamModel, noise: float) -> Priors:
         )
     )
     shaken = noise * GRAVITY / np.concatenate([np.ones(3), np.full(3, arm), np.repeat(model.length, 2)])
-    return Priors(scale, first**2, drift**2, shaken**2)
+    priors = Priors(*(np.tile(each, (n if apart else 1, 1)) for each in (scale, first**2, drift**2, shaken**2)))
+    if apart:
+        others = ~np.eye(n, dtype=bool)
+        priors.first[:, PAYLOAD:][np.repeat(others, 3, axis=1)] = 0.0
+        priors.drift[:, PAYLOAD:][np.repeat(others, 3, axis=1)] = 0.0
+        priors.noise[:, 6:][np.repeat(others, 2, axis=1)] = UNSEEN
+    return priors
 
 
 class ForceEstimator:
@@ -82,16 +95,17 @@ class ForceEstimator:
         model: nominal.
         num_envs: E.
         noise: of measured accelerations, over gravity [-].
+        apart: see `make_priors`.
 
     Attributes:
         estimate: ForceEstimate, live.
         priors: Priors.
     """
 
-    def __init__(self, model: TeamModel, num_envs: int, noise: float):
+    def __init__(self, model: TeamModel, num_envs: int, noise: float, apart: bool = False):
         n = len(model.anchors)
         size, count, e = 12 + 7 * n, PAYLOAD + 3 * n, num_envs
-        self._model, self.priors = model, make_priors(model, noise)
+        self._model, self.priors = model, make_priors(model, noise, apart)
         self._work = EstimatorWork(
             ModelWork.of(n), np.zeros(size), np.zeros(PAYLOAD), np.zeros(6 + 2 * n), np.zeros((6 + 2 * n, count)),
             np.zeros(count),
@@ -135,17 +149,19 @@ def update_forces(states, dt, known, model, priors, estimate, work):
     """See `ForceEstimator.update`."""
     for e in range(states.shape[0]):
         x, before, p = states[e], estimate.before[e], estimate.covariance[e]
+        row = e % priors.scale.shape[0]
+        own = Priors(priors.scale[row], priors.first[row], priors.drift[row], priors.noise[row])
         if estimate.fresh[e]:
             estimate.fresh[e], estimate.stale[e] = False, True
             estimate.unknowns[e] = 0.0
             p[:] = 0.0
             for i in range(p.shape[0]):
-                p[i, i] = priors.first[i]
+                p[i, i] = own.first[i]
         if not estimate.stale[e] and known[e]:
-            _find_effects(x, before, dt, estimate.unknowns[e], model, priors, work)
+            _find_effects(x, before, dt, estimate.unknowns[e], model, own, work)
             for i in range(p.shape[0]):
-                p[i, i] += dt * priors.drift[i]
-            _correct(estimate.unknowns[e], p, priors, work)
+                p[i, i] += dt * own.drift[i]
+            _correct(estimate.unknowns[e], p, own, work)
         estimate.stale[e] = not known[e]
         for i in range(x.shape[0]):
             before[i] = x[i]

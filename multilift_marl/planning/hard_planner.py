@@ -123,7 +123,7 @@ def solve_teams(bounds, given, settings, team, plans, hard, w):
             all_multipliers.values[e], all_multipliers.dual[e], all_multipliers.push[e], all_multipliers.stiffness[e]
         )
         _move_on(m.push, 0.0 if plans.fresh[e] else 1.0, elapsed / h, m.dual)
-        task = LimitedProblem(Problem(targets, asked, h, flat.model, loads[e], objective, around), limits)
+        task = LimitedProblem(Problem(targets, asked, h, flat.model, loads[e : e + 1], objective, around), limits)
         path, wanted = Trajectory(states, inputs), (tolerance, iterations)
         status, count = solve_team(starts[e], path, task, m, wanted, w.newton, report.residual[e])
         report.status[e], report.iterations[e] = status, count

@@ -245,7 +245,7 @@ def follow(start, path, length, task, w):
                 change += gain[i, j] * it.force[j]
             u[i] = inputs[k, i] + change
             cost += 0.5 * h * objective.rate[i] * (u[i] - problem.asked[k, i]) ** 2
-        step_state(x, u, h, problem.model, problem.load, it.model, w.states[k + 1])
+        step_state(x, u, h, problem.model, problem.loads[min(k, problem.loads.shape[0] - 1)], it.model, w.states[k + 1])
         for n in range(count):
             w.values[k, n] = (it.model.tension[n] - limits.tension[n]) / limits.tolerance[0]
         evaluate_limits(w.states[k + 1], task, it, w.values[k])

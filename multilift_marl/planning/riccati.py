@@ -21,6 +21,7 @@ from multilift_marl.planning.model_slopes import slopes
 from multilift_marl.planning.soft_limits import (
     Surroundings,
     add_clearances,
+    add_neighbours,
     add_separations,
     add_tensions,
     add_thrusts,
@@ -65,8 +66,8 @@ class Problem(NamedTuple):
     step: float
     """[s]."""
     model: TeamModel
-    load: np.ndarray
-    """(7,) see `team_model.accelerations`."""
+    loads: np.ndarray
+    """(1 or K, 7 or 49) of each step, or of all alike, see `team_model.accelerations`."""
     objective: Objective
     around: Surroundings
 
@@ -135,7 +136,7 @@ def linearise(k, states, inputs, problem, w):
     q = 6 + 2 * count
     size = 2 * q + 3 * count
     after = w.gap[k]
-    step_state(x, inputs[k], h, model, problem.load, m, after)
+    step_state(x, inputs[k], h, model, problem.loads[min(k, problem.loads.shape[0] - 1)], m, after)
     for i in range(size):
         after[i] -= states[k + 1, i]
     slopes(m.middle, model, m)
@@ -210,6 +211,7 @@ def recur(k, states, inputs, problem, damping, w):
     add_tensions(k, q, size, h, objective, w)
     add_thrusts(states[k], q, h, objective, quadratic, linear)
     add_separations(states[k], q, problem, w)
+    add_neighbours(k, q, problem, w)
     add_clearances(k, states[k], q, problem, w)
 
     factorise(curvature, nu)

@@ -38,7 +38,7 @@ class TeamPoints(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """The obstacles of one team, which go on as they move."""
+    """What one team is to stay clear of: obstacles, which go on as they move, and drones that are not its own."""
 
     env: int
     obstacles: Obstacles
@@ -47,6 +47,8 @@ class Surroundings(NamedTuple):
     ahead: float
     """[s] of the plan's start, from the time at which they are so."""
     points: TeamPoints
+    others: np.ndarray
+    """(K + 1, M, 4) where such drones are beside the payload at each step, world frame, and least distances [m]."""
 
 
 def make_points(settings: PlannerConfig, system: System, model: TeamModel) -> TeamPoints:
@@ -145,6 +147,32 @@ def add_separations(x, q, problem, w):
                     lever[6 + 2 * o + k] -= d * w.place_slope[o, i, 3 + k]
             for i in range(3, q):
                 part = h * objective.weights[2] * lever[i]
+                w.linear[i] -= short * part
+                for j in range(i + 1):
+                    w.quadratic[i, j] += part * lever[j]
+
+
+@kernel
+def add_neighbours(k, q, problem, w):
+    """Add the cost of drones that come too close to drones that are not of the team, after `add_separations`."""
+    others, lever = problem.around.others, w.lever
+    for n in range(problem.model.anchors.shape[0]):
+        for m in range(others.shape[1]):
+            d0, d1, d2 = sub(row(w.place, n), (others[k, m, 0], others[k, m, 1], others[k, m, 2]))
+            distance = sqrt(d0 * d0 + d1 * d1 + d2 * d2) + 1e-12
+            short = others[k, m, 3] - distance
+            if short <= 0.0:
+                continue
+            # These drones do as they said, whatever the payload does: by the own arm (3) and the own cable (2) alone.
+            lever[:] = 0.0
+            for i in range(3):
+                d = (w.place[n, i] - others[k, m, i]) / distance
+                for j in range(3):
+                    lever[3 + j] += d * w.place_slope[n, i, j]
+                for j in range(2):
+                    lever[6 + 2 * n + j] += d * w.place_slope[n, i, 3 + j]
+            for i in range(3, q):
+                part = problem.step * problem.objective.weights[2] * lever[i]
                 w.linear[i] -= short * part
                 for j in range(i + 1):
                     w.quadratic[i, j] += part * lever[j]

@@ -172,7 +172,7 @@ def accelerations(x, model, load, w):
         x: (12 + 7 N,) state.
         model: TeamModel.
         load: (7,) other force on the payload, world frame [N], moment on it, its frame [N m], and mass beside the
-            nominal one [kg].
+            nominal one [kg]; or (49,), then what drones exert that the model is without: Σ S g (6,) and Σ m g gᵀ (36,).
         w: ModelWork, written.
     """
     count = model.anchors.shape[0]
@@ -200,16 +200,15 @@ def accelerations(x, model, load, w):
     right[4, 0] = load[4] - (w2 * l0 - w0 * l2)
     right[5, 0] = load[5] - (w0 * l1 - w1 * l0)
 
-    # each drone adds its mass along its cable, and S = d·(F − m κ) − m g d_z + m L |ḋ|²
+    if load.shape[0] > 7:
+        for i in range(6):
+            right[i, 0] += load[7 + i]
+            for k in range(6):
+                mass[i, k] += load[13 + 6 * i + k]
+    # each drone adds its mass along its cable, and S
     for n in range(count):
-        _place_cable(x, n, q, model, w)
-        m = model.drone_mass[n]
-        pull, fast = -m * GRAVITY * w.direction[n, 2], 0.0
-        for i in range(3):
-            pull += w.direction[n, i] * (x[2 * q + 3 * n + i] - m * w.spin_world[n, i])
-            fast += w.swing[n, i] ** 2
-        pull += m * model.length[n] * fast
-        w.pull[n] = pull
+        pull_payload(x, n, q, model, w)
+        m, pull = model.drone_mass[n], w.pull[n]
         for i in range(6):
             right[i, 0] += w.arm[n, i] * pull
             for k in range(6):
@@ -220,6 +219,18 @@ def accelerations(x, model, load, w):
         w.acceleration[i] = right[i, 0]
     for n in range(count):
         _swing_cable(x, n, q, model, w)
+
+
+@kernel
+def pull_payload(x, n, q, model, w):
+    """Write g and S = d·(F − m κ) − m g d_z + m L |ḋ|² of drone n, after `set_rotation`."""
+    _place_cable(x, n, q, model, w)
+    m = model.drone_mass[n]
+    pull, fast = -m * GRAVITY * w.direction[n, 2], 0.0
+    for i in range(3):
+        pull += w.direction[n, i] * (x[2 * q + 3 * n + i] - m * w.spin_world[n, i])
+        fast += w.swing[n, i] ** 2
+    w.pull[n] = pull + m * model.length[n] * fast
 
 
 @kernel

@@ -72,7 +72,7 @@ def make_surroundings(
     if obstacles is None:
         obstacles = Obstacles.zeros(1, 0)
     hulls, points = make_hulls(system.scenery), make_points(settings, system, model)
-    return Surroundings(0, obstacles, hulls, settings.delay, points)
+    return Surroundings(0, obstacles, hulls, settings.delay, points, np.zeros((settings.steps + 1, 0, 4)))
 
 
 class TeamPlanner:
@@ -169,8 +169,8 @@ def plan_teams(given, settings, team, plans, work):
     for e in range(starts.shape[0]):
         states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
         prepare_team(e, given, (elapsed, h), flat, plans, work)
-        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points)
-        problem = Problem(targets, asked, h, flat.model, loads[e], objective, here)
+        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, around.others)
+        problem = Problem(targets, asked, h, flat.model, loads[e : e + 1], objective, here)
         _iterate(starts[e], states, inputs, problem, iterations, work)
         plans.failed[e] = not _is_finite(states, inputs)
         if plans.failed[e]:  # again from the flat states; at last these themselves

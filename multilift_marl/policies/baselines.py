@@ -26,6 +26,7 @@ from multilift_marl.policies.hold import (
     HoldVelocity,
 )
 from multilift_marl.policies.mpc import TeamMpc
+from multilift_marl.policies.mpc_distributed import DistributedMpc, DistributedRouteMpc
 from multilift_marl.policies.payload_geometric import PayloadGeometric
 from multilift_marl.policies.policy import OwnPolicy, Policy
 from multilift_marl.policies.route_baselines import NarrowRouteMpc, PayloadRouteMpc, PotentialRouteMpc
@@ -56,7 +57,9 @@ LINEAR: dict[str, type[Formation]] = {
 SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric] | type[TeamMpc]] = {
     **LINEAR,
     "mpc": TeamMpc,
+    "mpc_distributed": DistributedMpc,
     "mpc_route": RouteMpc,
+    "mpc_route_distributed": DistributedRouteMpc,
     "mpc_payload": PayloadRouteMpc,
     "mpc_narrow": NarrowRouteMpc,
     "mpc_potential": PotentialRouteMpc,

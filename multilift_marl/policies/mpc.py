@@ -89,18 +89,20 @@ class TeamMpc:
                 "time; set control.disturbance=none, or planner.estimate=false"
             )
         self._vec, settings, self.preview = vec, config.planner, preview
-        team = system, settings, vec.num_envs
-        self.planner = HardPlanner(*team) if settings.limits == "hard" else TeamPlanner(*team, vec.world.obstacles)
+        self.planner = self._make_planner()
+        teams = len(self.planner.plans.states)
         self._dt = vec.task.dt
         exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
         cameras, onboard = config.env.sensing in CAMERAS, config.env.sensing in ("onboard", "blind")
         noise = settings.estimate_noise or (0.5 if exact else 2.0 if onboard else 1.0)
-        self._estimator = ForceEstimator(self.planner.model, vec.num_envs, noise) if settings.estimate else None
+        self._estimator = None
+        if settings.estimate:
+            self._estimator = ForceEstimator(self.planner.model, teams, noise, apart=teams > vec.num_envs)
         self._observer = None
         if not exact:
             late = CAMERA_DELAY if cameras else 0.0
             share = SHARE if cameras else ONBOARD if onboard else UNFILTERED
-            self._observer = TeamObserver(self.planner.model, vec.num_envs, share, late)
+            self._observer = TeamObserver(self.planner.model, teams, share, late)
         lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)
         self._full_state, self._feedback = None, settings.feedback
         if self._feedback < 1.0 and config.control.action != "full_state":
@@ -114,15 +116,13 @@ class TeamMpc:
         self._drag = np.array([vehicle.drag for vehicle in system.vehicles], float)
         self._lift = np.array([vehicle.thrust_coefficient for vehicle in system.vehicles], float)
         under_way = round(settings.delay / self._dt)
-        self._sent = np.zeros((under_way + 1, vec.num_envs, 3 * n))
-        self._starts = [
-            np.zeros((vec.num_envs, 12 + 7 * n)) for _ in range(under_way + 1)
-        ]  # of the plans for now and later
-        self._fresh, self._acted = np.ones(vec.num_envs, bool), np.zeros(vec.num_envs)
+        self._sent = np.zeros((under_way + 1, teams, 3 * n))
+        self._starts = [np.zeros((teams, 12 + 7 * n)) for _ in range(under_way + 1)]  # of the plans for now and later
+        self._fresh, self._acted = np.ones(teams, bool), np.zeros(teams)
         self._last = LastPlan(self.planner.plans, settings.step, self._dt)
         self._without_plan = HoldAccRates(vec) if self._full_state is None else HoldFullState(vec)
-        self._approach = Approach.zeros(vec.num_envs)
-        self._offsets = np.zeros((vec.num_envs, settings.steps + 1, 12))
+        self._approach = Approach.zeros(teams)
+        self._offsets = np.zeros((teams, settings.steps + 1, 12))
         enough = ENOUGH[config.control.action]
         if any(getattr(config.acting, key) < least for key, (least, _) in enough.items()):
             cure = " ".join(f"control.{key}={wide:g}" for key, (_, wide) in enough.items())
@@ -131,9 +131,18 @@ class TeamMpc:
         self._patience = settings.patience
         self._limits = config.acting.max_acceleration, config.acting.max_tilt_rate
 
+    def _make_planner(self) -> TeamPlanner | HardPlanner:
+        vec, settings = self._vec, self._vec.config.planner
+        team = vec.world.system, settings, vec.num_envs
+        return HardPlanner(*team) if settings.limits == "hard" else TeamPlanner(*team, vec.world.obstacles)
+
+    def _time(self) -> np.ndarray:
+        """Return the time of each plan (E,) [s]."""
+        return self._vec.task.time
+
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget the plans of the environments in the mask (E,) (None: all)."""
-        chosen = np.ones(self._vec.num_envs, bool) if mask is None else mask
+        chosen = np.ones(len(self._fresh), bool) if mask is None else mask
         self._fresh[chosen] = True
         self._last.reset(chosen)
 
@@ -147,7 +156,7 @@ class TeamMpc:
         Raises:
             ValueError: observations of another number of environments.
         """
-        vec, planner, shape = self._vec, self.planner, (self._vec.num_envs, self._vec.num_drones)
+        planner, shape = self.planner, (self._vec.num_envs, self._vec.num_drones)
         if np.shape(observation)[:2] != shape:
             raise ValueError(
                 f"mpc reads the state of its {shape[0]} environments of {shape[1]} drones, but the observation has "
@@ -158,7 +167,8 @@ class TeamMpc:
         unknown = ~np.isfinite(states).all(axis=1)
         if unknown.any():
             states[unknown] = self._last.states(self._dt)[unknown]
-            payload_rotation[unknown], drag[unknown] = np.eye(3), 0.0
+            payload_rotation[unknown] = np.eye(3)
+            drag[~np.isfinite(drag).all(axis=(1, 2))] = 0.0
         loads, forces = self._unknown(self._fresh)
         states[:, -3 * shape[1] :] += np.where(unknown[:, None], 0.0, forces)  # planned ones hold them
         if self._observer is not None:
@@ -167,13 +177,13 @@ class TeamMpc:
         if self._estimator is not None:
             self._estimator.update(states, self._dt, ~unknown)
         unknown |= self._forget_unsound(states, loads, forces)
-        following = ~(self._fresh | unknown) if self._feedback < 1.0 else np.zeros(vec.num_envs, bool)
+        following = ~(self._fresh | unknown) if self._feedback < 1.0 else np.zeros(len(states), bool)
         if following.any():
             planned = self._correct_plans(states, payload_rotation, following)
-        now = vec.task.time[:, None]
+        now = self._time()[:, None]
         last = np.maximum(now - self._dt, 0.0)
         targets = self._look_ahead(now + [0.0, self._dt])[:2], self._look_ahead(last)[:2]
-        begin_approaches(vec.task.time, self._dt, states, payload_rotation, targets, self._fresh, self._approach)
+        begin_approaches(self._time(), self._dt, states, payload_rotation, targets, self._fresh, self._approach)
         times = now + ahead + planner.times.ravel()
         positions, rotations, shapes = self._look_ahead(times)
         poses = (len(times), *planner.times.shape)
@@ -191,26 +201,32 @@ class TeamMpc:
         for start in self._starts:
             start[~following] = states[~following]  # they begin
         self._starts = [*self._starts[1:], states.copy()]
-        self._acted = vec.task.time.copy()
+        self._acted = self._time().copy()
         if shapes is not None:
             shapes = np.ascontiguousarray(shapes.reshape(*poses, -1, 3)[:, :, SHAPES])
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads, shapes)
-        late = (perf_counter() - begin) / shape[0] > self._deadline
+        late = (perf_counter() - begin) / len(states) > self._deadline
         self._last.keep(plans, late, plans.failed | unknown)
-        rate = self._last.inputs().reshape(*shape, 3)
-        thrust = self._last.states()[:, -3 * shape[1] :].reshape(*shape, 3) + self._lead * rate
+        rate = self._last.inputs()
+        thrust = self._last.states()[:, -3 * shape[1] :] + self._lead * rate
         self._sent[:-1] = self._sent[1:]
-        self._sent[-1] = thrust.reshape(shape[0], -1)
-        own = thrust - forces.reshape(thrust.shape)  # of the rotors: what else acts is part of the planned ones
+        self._sent[-1] = thrust
+        # of the rotors: what else acts is part of the planned ones
+        own, rate = self._of_drones(thrust - forces), self._of_drones(rate)
         if self._full_state is not None:
             action = self._full_state.act(present, states, loads, own, rate, drag)
         else:
             action = self._command(own, rate, drag)
         lost = self._last.without > self._patience
         if lost.any():
-            action[lost] = self._without_plan.act(observation)[lost]
+            without = lost.reshape(shape[0], -1)
+            action = np.where(without[..., None], self._without_plan.act(observation), action)
             self._fresh |= lost  # its next plan begins where the team is then
         return action
+
+    def _of_drones(self, vectors: np.ndarray) -> np.ndarray:
+        """Return what plans (E, 3 N) have for each drone (E, N, 3)."""
+        return vectors.reshape(self._vec.num_envs, self._vec.num_drones, 3)
 
     def _look_ahead(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Return places, attitudes and shapes at times (E, M), see `preview`, as arrays that can be written."""
@@ -233,7 +249,7 @@ class TeamMpc:
         Return where the next plans begin, `planner.delay` later, corrected alike.
         """
         # Where the last plans are by now, also where steps were missed.
-        later = self._last.states(np.maximum(self._vec.task.time - self._acted, self._dt))
+        later = self._last.states(np.maximum(self._time() - self._acted, self._dt))
         # Of the plan that began with the present, if plans are ahead of it.
         planned = (self._starts[1] if len(self._starts) > 1 else later).copy()
         off = states - planned
@@ -256,10 +272,18 @@ class TeamMpc:
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the states (E, 12 + 7 N) of the reduced model, the payload's attitudes, and drag (E, N, 3) [N]."""
+        return self._measure_by(None)
+
+    def _measure_by(self, drone: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `_measure`: the payload as a drone knows it; None: the mean of what all know."""
         view, n = self._vec.task.view, self._vec.num_drones
         own, load, model = view.estimated, view.payload_estimate, self.planner.model
-        position, velocity = load.position.mean(axis=1), load.velocity.mean(axis=1)
-        rotation, rates = load.rotation[:, 0], load.body_rates.mean(axis=1)
+        one = 0 if drone is None else min(drone, load.position.shape[1] - 1)  # where all know the same there is one
+        chosen = slice(None) if drone is None else slice(one, one + 1)
+        position, velocity, rates = (
+            each[:, chosen].mean(axis=1) for each in (load.position, load.velocity, load.body_rates)
+        )
+        rotation = load.rotation[:, one]
         if self._is_point:  # nothing turns it: as its target, which the formation's heading follows
             rotation, rates = self._target_attitude()
         arm = np.einsum("eij,nj->eni", rotation, model.anchors)
@@ -289,7 +313,7 @@ class TeamMpc:
 
     def _target_attitude(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the attitude (E, 3, 3) of the payload's target now, and its body rates (E, 3) [rad/s]."""
-        turned = self._look_ahead(self._vec.task.time[:, None] + STEP * np.arange(-1, 2))[1]
+        turned = TeamMpc._look_ahead(self, self._vec.task.time[:, None] + STEP * np.arange(-1, 2))[1]
         change = np.swapaxes(turned[:, 1], 1, 2) @ (turned[:, 2] - turned[:, 0]) / (2 * STEP)
         return turned[:, 1], np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0]], axis=1)
 

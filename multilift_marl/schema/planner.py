@@ -20,6 +20,9 @@ class PlannerConfig(Section):
     iterations: Int | None = Field(
         None, ge=1, le=1000, description="in each policy step, with hard limits at most; None: 1, with hard limits 40"
     )
+    sweeps: Int = Field(
+        3, ge=1, le=100, description="in each policy step in which the drones of mpc_distributed improve their plans"
+    )
     position: Annotated[Float, Between(1e-4, 100, "m")] = Field(0.02, description="[m] tolerance of the payload")
     attitude: Annotated[Float, Between(0.01, 1000, "deg")] = Field(5.0, description="[deg] of the payload")
     cable: Annotated[Float, Between(0.01, 1000, "deg")] = Field(8.6, description="[deg] of each cable's direction")

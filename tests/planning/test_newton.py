@@ -29,7 +29,7 @@ def test_second_derivatives_of_a_step_are_differences_of_first_ones(expert):
     model = expert.model._replace(drag=0.3)
     x = expert.rest_states(np.array([0.0, 0.0, 1.0]))[0] + 0.2 * rng.normal(size=SIZE)
     inputs, costate, pull = rng.normal(size=(1, NU)), rng.normal(size=SIZE), rng.normal(size=N)
-    problem = Problem(np.tile(x, (2, 1)), inputs, STEP, model, LOAD, expert.objective, expert.around)
+    problem = Problem(np.tile(x, (2, 1)), inputs, STEP, model, LOAD[None], expert.objective, expert.around)
     w, c = IterationWork.of(1, N), CurvatureWork.of(N)
 
     def slope(x):
@@ -61,7 +61,7 @@ def test_a_step_is_newtons_on_the_cost_with_limits_of_every_kind(expert, exact):
     start[2 * Q :] = rest[2 * Q :] + 0.5 * rng.normal(size=NU)
     targets, inputs = np.tile(rest, (STEPS + 1, 1)), 2.0 * rng.normal(size=(STEPS, NU))
     objective = expert.objective._replace(rate=1000.0 * expert.objective.rate)  # convex all the same
-    problem = Problem(targets, np.zeros_like(inputs), STEP, expert.model, LOAD, objective, expert.around)
+    problem = Problem(targets, np.zeros_like(inputs), STEP, expert.model, LOAD[None], objective, expert.around)
     tension = np.linalg.norm(rest[2 * Q : 2 * Q + 3])
     limits = Limits(
         np.full(N, tension),

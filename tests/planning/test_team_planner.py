@@ -102,7 +102,7 @@ def test_a_step_solves_the_linearised_problem_with_active_limits_of_every_kind(s
     load = np.array([0.1, 0.2, -0.3, 0.01, 0.0, -0.01, 0.1])
     settings = PlannerConfig(clearance=0.3, clearance_tolerance=0.2, delay=0.1)
     around = make_surroundings(settings, system, model, obstacles_about())._replace(env=1)
-    problem, w = Problem(targets, asked, STEP, model, load, objective, around), IterationWork.of(STEPS, N)
+    problem, w = Problem(targets, asked, STEP, model, load[None], objective, around), IterationWork.of(STEPS, N)
     scratch = ModelWork.of(N)
 
     def after(both):
@@ -191,7 +191,7 @@ def test_iterations_end_at_a_trajectory_of_the_model_that_no_change_improves(sys
     objective = make_objective(PlannerConfig(), system, model)
     around = make_surroundings(PlannerConfig(), system, model)
     states, inputs = np.tile(rest, (STEPS + 1, 1)), np.zeros((STEPS, NU))
-    problem = Problem(states.copy(), inputs.copy(), STEP, model, np.zeros(7), objective, around)
+    problem = Problem(states.copy(), inputs.copy(), STEP, model, np.zeros((1, 7)), objective, around)
     start, w = rest.copy(), IterationWork.of(STEPS, N)
     start[:3] += [0.05, -0.03, 0.02]
     for _ in range(30):

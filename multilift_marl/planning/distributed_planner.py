@@ -1,0 +1,406 @@
+"""Plans of E teams whose drones plan for themselves, and tell each other what they will do.
+
+Drone n's problem holds the payload and its own cable and thrust; those of the others are as they said last. It is that
+of `riccati.py` for a team of one, whose payload feels the others' pulls, and their inertia along their cables. In a
+sweep each drone moves by 1/N to its own optimum (damped Jacobi iteration: a mean of N plans), says so, and then rolls
+the payload alone under what it knows of all.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from multilift_marl.kernels.jit import kernel
+from multilift_marl.planning.riccati import IterationWork, Objective, Problem, find_gains, take_step
+from multilift_marl.planning.soft_limits import Surroundings
+from multilift_marl.planning.team_model import (
+    ModelWork,
+    TeamModel,
+    move_to_middle,
+    pull_payload,
+    set_rotation,
+    state_size,
+    step_state,
+)
+from multilift_marl.planning.team_planner import Plans, TeamPlanner, keep_targets, prepare_team
+from multilift_marl.rig.system import System
+from multilift_marl.rng import uniform
+from multilift_marl.schema.planner import PlannerConfig
+from multilift_marl.sensing.communication import Links
+from multilift_marl.sim.obstacles import Obstacles
+
+OWN = 19  # numbers of a drone's problem: payload 12, its cable 4, its thrust vector 3
+SAID = 7  # numbers that a drone says of each step: its cable 4, its thrust vector 3
+BYTES = 4  # of each
+MOMENTUM = 0.4  # of a sweep's change, that the next one adds
+
+
+class Post(NamedTuple):
+    """What drones have said in the last policy steps."""
+
+    generator: np.ndarray
+    """(E,) uint64, state of the random numbers that decide which messages are lost."""
+    steps: np.ndarray
+    """(E,) policy steps of the episode."""
+    sent: np.ndarray
+    """(E, D + 1, N, K + 1, 7) of the last steps, at their number modulo D + 1."""
+    sent_loads: np.ndarray
+    """(E, D + 1, N, 7) what each estimated of the load then."""
+    loads: np.ndarray
+    """(E, N, N, 7) what the first last heard of the second's estimate."""
+    has_loads: np.ndarray
+    """(E, N, N) bool, whether it has."""
+
+
+class ApartWork(NamedTuple):
+    """Arrays that plans are made in."""
+
+    iteration: IterationWork
+    team: ModelWork
+    states: np.ndarray
+    """(K + 1, 19) of a drone's problem; targets, inputs and those asked for likewise."""
+    inputs: np.ndarray
+    targets: np.ndarray
+    asked: np.ndarray
+    loads: np.ndarray
+    """(K, 49) see `team_model.accelerations`."""
+    others: np.ndarray
+    """(K + 1, N - 1, 4) see `Surroundings`."""
+    all_targets: np.ndarray
+    """(N, K + 1, 12 + 7 N) of each drone's plan of the team."""
+    all_asked: np.ndarray
+    """(N, K, 3 N)."""
+    change: np.ndarray
+    """(N, K + 1, 7) of each drone's own plan in a sweep."""
+    input_change: np.ndarray
+    """(N, K, 3)."""
+    middle: np.ndarray
+    weights: np.ndarray
+    end: np.ndarray
+    rate: np.ndarray
+    start: np.ndarray
+
+    @classmethod
+    def of(cls, steps: int, n: int) -> ApartWork:
+        """Return arrays for K steps of N drones."""
+        size = state_size(n)
+        shapes = (
+            (steps + 1, OWN), (steps, 3), (steps + 1, OWN), (steps, 3), (steps, 49), (steps + 1, n - 1, 4),
+            (n, steps + 1, size),
+            (n, steps, 3 * n), (n, steps + 1, SAID), (n, steps, 3), (size,), (OWN,), (OWN,), (3,), (OWN,),
+        )  # fmt: skip
+        return cls(IterationWork.of(steps, 1), ModelWork.of(n), *(np.zeros(shape) for shape in shapes))
+
+
+class DistributedPlanner(TeamPlanner):
+    """Plans of E teams by their drones: plan e N + n is that of team e which drone n has, with its own part of it.
+
+    Args:
+        system, settings, num_envs, obstacles: see `TeamPlanner`.
+        links: who hears whom; without delay after each sweep, else once in a policy step.
+    """
+
+    def __init__(
+        self, system: System, settings: PlannerConfig, num_envs: int, obstacles: Obstacles | None, links: Links
+    ):
+        n, steps = system.num_drones, settings.steps
+        super().__init__(system, settings, n * num_envs, obstacles)
+        self.links, self.sweeps = links, settings.sweeps if links.delay == 0 else 1
+        shape = num_envs, links.delay + 1, n, steps + 1, SAID
+        self.post = Post(
+            np.zeros(num_envs, np.uint64), np.zeros(num_envs, np.int64), np.zeros(shape), np.zeros((*shape[:3], 7)),
+            np.zeros((num_envs, n, n, 7)), np.zeros((num_envs, n, n), bool),
+        )  # fmt: skip
+        self._apart = ApartWork.of(steps, n)
+
+    @property
+    def message_bytes(self) -> int:
+        """Of what a drone says at once, as single-precision numbers."""
+        return BYTES * (SAID * (self.settings.steps + 1) + 7)
+
+    def plan(
+        self, states: np.ndarray, positions: np.ndarray, rotations: np.ndarray, elapsed: float,
+        offsets: np.ndarray,
+        loads: np.ndarray | None = None, shapes: np.ndarray | None = None,
+    ) -> Plans:  # fmt: skip
+        """See `TeamPlanner.plan`, with E N plans."""
+        loads = self._agree(self._unloaded if loads is None else loads)
+        given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
+        settings = elapsed, self.settings.step, self.sweeps
+        team = self._flat, self.objective, self.around
+        plan_apart(given, settings, team, (self.links, self.post), self.plans, self._work, self._apart)
+        return self.plans
+
+    def _agree(self, loads: np.ndarray) -> np.ndarray:
+        """Say loads (E N, 7) as each drone estimates them, and return the means of its own and those it has heard."""
+        post, n = self.post, self.post.loads.shape[1]
+        own = loads.reshape(-1, n, 7)
+        begins = self.plans.fresh[::n]
+        post.has_loads[begins] = False
+        now = np.where(begins, 0, post.steps) % post.sent.shape[1]
+        post.sent_loads[np.arange(len(now)), now] = own
+        total = own + (post.loads * post.has_loads[..., None]).sum(axis=2)
+        return np.ascontiguousarray((total / (1 + post.has_loads.sum(axis=2))[..., None]).reshape(-1, 7))
+
+
+@kernel
+def take_own(n, team, own):
+    """Write the payload's and drone n's numbers (19,) of a team's vector (12 + 7 N,)."""
+    q = 6 + 2 * ((team.shape[0] - 12) // 7)
+    for i in range(6):
+        own[i], own[8 + i] = team[i], team[q + i]
+    for i in range(2):
+        own[6 + i], own[14 + i] = team[6 + 2 * n + i], team[q + 6 + 2 * n + i]
+    for i in range(3):
+        own[16 + i] = team[2 * q + 3 * n + i]
+
+
+@kernel
+def said_at(i, n, q):
+    """Return where the i-th of the numbers that drone n says is in a team's vector."""
+    if i < 2:
+        return 6 + 2 * n + i
+    if i < 4:
+        return q + 6 + 2 * n + i - 2
+    return 2 * q + 3 * n + i - 4
+
+
+@kernel
+def set_others(n, states, inputs, h, model, load, work):
+    """Write what the payload feels in each step beside drone n: the load (7,), and the others in its middle."""
+    count = model.anchors.shape[0]
+    for k in range(inputs.shape[0]):
+        into = work.loads[k]
+        into[:] = 0.0
+        for i in range(7):
+            into[i] = load[i]
+        move_to_middle(states[k], inputs[k], h, model, work.middle)
+        set_rotation(work.middle, work.team.rotation, work.team.turning)
+        for m in range(count):
+            if m == n:
+                continue
+            pull_payload(work.middle, m, 6 + 2 * count, model, work.team)
+            arm = work.team.arm[m]
+            for i in range(6):
+                into[7 + i] += arm[i] * work.team.pull[m]
+                for j in range(6):
+                    into[13 + 6 * i + j] += model.drone_mass[m] * arm[i] * arm[j]
+
+
+@kernel
+def place_others(n, states, model, separation, work):
+    """Write where the other drones are beside the payload, and how far drone n is to stay from them (N, N) [m]."""
+    count = model.anchors.shape[0]
+    for k in range(states.shape[0]):
+        set_rotation(states[k], work.team.rotation, work.team.turning)
+        for m in range(count):
+            if m == n:
+                continue
+            pull_payload(states[k], m, 6 + 2 * count, model, work.team)
+            at, rotation = work.others[k, m - (m > n)], work.team.rotation
+            for i in range(3):
+                arm = 0.0
+                for j in range(3):
+                    arm += rotation[i, j] * model.anchors[m, j]
+                at[i] = arm + model.length[m] * work.team.direction[m, i]
+            at[3] = separation[n, m]
+
+
+@kernel
+def improve_own(n, start, states, inputs, problem, work):
+    """Write to `work.states` and `work.inputs` the optimum of drone n, where the others do as in a team's plan.
+
+    Args:
+        n: the drone.
+        start: (12 + 7 N,) of the team, as it knows it.
+        states, inputs: of the team's plan.
+        problem: Problem of the team, with one load.
+        work: ApartWork.
+    """
+    model, objective, h = problem.model, problem.objective, problem.step
+    set_others(n, states, inputs, h, model, problem.loads[0], work)
+    place_others(n, states, model, objective.separation, work)
+    for k in range(states.shape[0]):
+        take_own(n, states[k], work.states[k])
+        take_own(n, problem.targets[k], work.targets[k])
+    for k in range(inputs.shape[0]):
+        for i in range(3):
+            work.inputs[k, i], work.asked[k, i] = inputs[k, 3 * n + i], problem.asked[k, 3 * n + i]
+    take_own(n, objective.state, work.weights)
+    take_own(n, objective.end, work.end)
+    take_own(n, start, work.start)
+    for i in range(3):
+        work.rate[i] = objective.rate[3 * n + i]
+    one = TeamModel(
+        model.payload_mass, model.inertia, model.anchors[n : n + 1], model.drone_mass[n : n + 1],
+        model.length[n : n + 1], model.drag,
+    )  # fmt: skip
+    own = Objective(
+        work.weights, work.end, work.rate, objective.tension[n : n + 1], objective.thrust[n : n + 1],
+        objective.separation[n : n + 1, n : n + 1], objective.weights,
+    )  # fmt: skip
+    alone = Problem(work.targets, work.asked, h, one, work.loads, own, problem.around)
+    find_gains(work.states, work.inputs, alone, 0.0, work.iteration)
+    take_step(work.start, work.states, work.inputs, alone, work.iteration)
+
+
+@kernel
+def follow_load(states, inputs, h, model, load, w, after):
+    """Write how the payload moves from the first state on, where cables and thrusts are as planned."""
+    q = 6 + 2 * model.anchors.shape[0]
+    for k in range(inputs.shape[0]):
+        step_state(states[k], inputs[k], h, model, load, w, after)
+        for i in range(6):
+            states[k + 1, i], states[k + 1, q + i] = after[i], after[q + i]
+
+
+@kernel
+def believe(m, said, later, states, inputs, h):
+    """Write what drone m said into a plan of the team, `later` [steps] after it did; its last step stays."""
+    steps = inputs.shape[0]
+    q = 6 + 2 * (inputs.shape[1] // 3)
+    for k in range(steps + 1):
+        at = min(k + later, 1.0 * steps)
+        j = min(int(at), steps - 1)
+        s = at - j
+        for i in range(SAID):
+            states[k, said_at(i, m, q)] = (1.0 - s) * said[j, i] + s * said[j + 1, i]
+    for k in range(steps):
+        for i in range(3):
+            at = 2 * q + 3 * m + i
+            inputs[k, 3 * m + i] = (states[k + 1, at] - states[k, at]) / h
+
+
+@kernel
+def plan_apart(given, settings, team, radio, plans, work, apart):
+    """See `DistributedPlanner.plan`.
+
+    Args:
+        given, settings, team: see `plan_teams`, with the number of sweeps in place of iterations.
+        radio: Links, Post.
+        plans: Plans, overwritten.
+        work: PlannerWork.
+        apart: ApartWork.
+    """
+    elapsed, h, sweeps = settings
+    flat, objective, around = team
+    links, post = radio
+    count = flat.model.anchors.shape[0]
+    q, later = 6 + 2 * count, links.delay * elapsed / h
+    for e in range(post.steps.shape[0]):
+        first, kept = e * count, post.sent.shape[1]
+        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, apart.others)
+        begins = plans.fresh[first]
+        if begins:
+            post.steps[e] = 0
+            post.generator[e] = seed_of(given[0][first])
+        for n in range(count):
+            prepare_team(first + n, given, (elapsed, h), flat, plans, work)
+            keep_rows(work.targets, apart.all_targets[n])
+            keep_rows(work.asked, apart.all_asked[n])
+        now = post.steps[e]
+        if links.delay > 0 and now >= links.delay:
+            hear(e, (now - links.delay) % kept, later, links, post, plans, h)
+        apart.change[:] = 0.0
+        apart.input_change[:] = 0.0
+        for sweep in range(sweeps):
+            for n in range(count):
+                t = first + n
+                states, inputs = plans.states[t], plans.inputs[t]
+                set_start(n, given[0][t], states, inputs, h, begins)
+                follow_load(states, inputs, h, flat.model, given[1][t], apart.team, work.before[0])
+                loads = given[1][t : t + 1]
+                problem = Problem(apart.all_targets[n], apart.all_asked[n], h, flat.model, loads, objective, here)
+                improve_own(n, states[0], states, inputs, problem, apart)
+                move_own(n, states, inputs, 1.0 / count, MOMENTUM * (sweep > 0), apart)
+                for k in range(states.shape[0]):
+                    for i in range(SAID):
+                        post.sent[e, now % kept, n, k, i] = states[k, said_at(i, n, q)]
+            if links.delay == 0:
+                hear(e, now % kept, 0.0, links, post, plans, h)
+        for n in range(count):
+            t = first + n
+            states, inputs = plans.states[t], plans.inputs[t]
+            follow_load(states, inputs, h, flat.model, given[1][t], apart.team, work.before[0])
+            plans.failed[t] = not is_sound(states, inputs)
+            if plans.failed[t]:
+                keep_rows(apart.all_targets[n], states)
+                keep_rows(apart.all_asked[n], inputs)
+            keep_targets(t, apart.all_targets[n], plans)
+        post.steps[e] = now + 1
+
+
+@kernel
+def hear(e, slot, later, links, post, plans, h):
+    """Let the drones of team e believe what those have said whom they hear, `later` [steps] ago."""
+    said = post.sent[e, slot]
+    count = said.shape[0]
+    for n in range(count):
+        for m in range(count):
+            if links.partners[n, m] and uniform(e, post) > links.loss:
+                t = e * count + n
+                believe(m, said[m], later, plans.states[t], plans.inputs[t], h)
+                post.has_loads[e, n, m] = True
+                for i in range(7):
+                    post.loads[e, n, m, i] = post.sent_loads[e, slot, m, i]
+
+
+@kernel
+def set_start(n, start, states, inputs, h, whole):
+    """Let a plan begin at the payload and drone n as they are, or, if `whole`, at the whole team."""
+    count = inputs.shape[1] // 3
+    q = 6 + 2 * count
+    for i in range(6):
+        states[0, i], states[0, q + i] = start[i], start[q + i]
+    for m in range(count):
+        if m == n or whole:
+            for i in range(SAID):
+                states[0, said_at(i, m, q)] = start[said_at(i, m, q)]
+
+
+@kernel
+def move_own(n, states, inputs, share, momentum, work):
+    """Move drone n's part of a plan by a share of the way to its optimum, and on as before by `momentum`."""
+    q = 6 + 2 * (inputs.shape[1] // 3)
+    change, input_change = work.change[n], work.input_change[n]
+    for k in range(states.shape[0]):
+        for i in range(SAID):
+            at, own = said_at(i, n, q), i + 6 if i < 2 else i + 12
+            change[k, i] = momentum * change[k, i] + share * (work.states[k, own] - states[k, at])
+            states[k, at] += change[k, i]
+    for k in range(inputs.shape[0]):
+        for i in range(3):
+            before = inputs[k, 3 * n + i]
+            input_change[k, i] = momentum * input_change[k, i] + share * (work.inputs[k, i] - before)
+            inputs[k, 3 * n + i] += input_change[k, i]
+
+
+@kernel
+def keep_rows(rows, into):
+    """Copy rows."""
+    for k in range(rows.shape[0]):
+        for i in range(rows.shape[1]):
+            into[k, i] = rows[k, i]
+
+
+@kernel
+def is_sound(states, inputs):
+    """Return whether a plan is finite."""
+    total = 0.0
+    for k in range(states.shape[0]):
+        for i in range(states.shape[1]):
+            total += states[k, i]
+    for i in range(inputs.shape[1]):
+        total += inputs[0, i]
+    return np.isfinite(total)
+
+
+@kernel
+def seed_of(start):
+    """Return a seed that belongs to a team's first state, whatever environments it is planned with."""
+    total = np.uint64(0)
+    for i in range(start.shape[0]):
+        total = total * np.uint64(6364136223846793005) + np.uint64(int(abs(start[i]) * 1e9))
+    return total

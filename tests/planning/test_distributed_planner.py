@@ -1,0 +1,204 @@
+"""Drones that plan for themselves: their model, the mean of their plans, what they say and hear."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import make_system
+
+from multilift_marl.planning.distributed_planner import (
+    DistributedPlanner,
+    believe,
+    hear,
+    said_at,
+    set_others,
+    take_own,
+)
+from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
+from multilift_marl.planning.force_estimator import PAYLOAD, make_priors
+from multilift_marl.planning.team_model import ModelWork, accelerations, make_model, move_to_middle, state_size
+from multilift_marl.planning.team_planner import TeamPlanner
+from multilift_marl.schema.planner import PlannerConfig
+from multilift_marl.sensing.communication import Links
+
+N, STEP = 3, 0.05
+Q = 6 + 2 * N
+LOAD = np.array([0.5, -0.3, 0.2, 0.02, -0.01, 0.03, 0.2])
+
+
+def links(delay=0, loss=0.0, partners=None):
+    return Links(~np.eye(N, dtype=bool) if partners is None else partners, delay, loss, np.inf)
+
+
+def planner(settings=None, num_envs=1, **kinds):
+    return DistributedPlanner(make_system(N), settings or PlannerConfig(), num_envs, None, links(**kinds))
+
+
+def at_rest(system):
+    model = make_model(system)
+    x, team = np.zeros(state_size(N)), make_flat_team(model, system)
+    pose = np.tile([0.0, 0.0, 2.0], (5, 1)), np.tile(np.eye(3), (5, 1, 1))
+    set_flat_state(*pose, steady_shape(team), 0.0, np.zeros(7), team, FlatWork.of(N), x)
+    return model, x
+
+
+def held(plans, size):
+    """Return poses to hold, and offsets of none, of so many plans."""
+    shape = size, *plans.times.shape
+    positions = np.tile([0.0, 0.0, 2.0], (*shape, 1))
+    return positions, np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape[:2], 12))
+
+
+def cost(plans, states, inputs):
+    """Return what the central planner minimises, without limits, of a plan that holds a pose."""
+    o, off = plans.objective, states - plans.plans.targets[0]
+    running = STEP * ((o.state * off[:-1] ** 2).sum() + (o.rate * inputs**2).sum())
+    return 0.5 * (running + (o.end * off[-1] ** 2).sum())
+
+
+@pytest.mark.parametrize("n", range(N))
+def test_a_drone_alone_with_the_others_pulls_moves_as_in_the_team(n):
+    system, rng = make_system(N), np.random.default_rng(n)
+    model, rest = at_rest(system)
+    apart = planner()._apart
+    steps = len(apart.inputs)
+    states = rest + 0.05 * rng.normal(size=(steps + 1, len(rest)))
+    inputs = rng.normal(size=(steps, 3 * N))
+    set_others(n, states, inputs, STEP, model, LOAD, apart)
+    for k in (0, 7):
+        middle, own, whole, alone = np.zeros(len(rest)), np.zeros(19), ModelWork.of(N), ModelWork.of(1)
+        move_to_middle(states[k], inputs[k], STEP, model, middle)
+        accelerations(middle, model, LOAD, whole)
+        one = model._replace(
+            anchors=model.anchors[n : n + 1], drone_mass=model.drone_mass[n : n + 1], length=model.length[n : n + 1]
+        )
+        take_own(n, middle, own)
+        accelerations(own, one, apart.loads[k], alone)
+        np.testing.assert_allclose(alone.acceleration[:6], whole.acceleration[:6], rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(alone.acceleration[6:8], whole.acceleration[6 + 2 * n : 8 + 2 * n], rtol=1e-10)
+        assert alone.tension[0] == pytest.approx(whole.tension[n], rel=1e-10)
+
+
+def test_plans_come_near_the_central_one_and_agree():
+    """From a displaced and moving payload: the cost of each drone's plan, after 40 sweeps, and all of the payload."""
+    system, settings = make_system(N), PlannerConfig(sweeps=40)
+    central, apart = TeamPlanner(system, settings, 1), planner(settings)
+    _, start = at_rest(system)
+    start[[0, 1, Q]] += 0.08, -0.05, 0.1
+    for _ in range(30):
+        best = central.plan(start[None].copy(), *held(central, 1)[:2], 0.0, held(central, 1)[2])
+    positions, rotations, offsets = held(apart, N)
+    found = apart.plan(np.tile(start, (N, 1)), positions, rotations, 0.0, offsets)
+    least = cost(central, best.states[0], best.inputs[0])
+    nothing = cost(central, np.tile(start, (settings.steps + 1, 1)), np.zeros_like(best.inputs[0]))
+    for n in range(N):
+        assert least * 0.999 < cost(central, found.states[n], found.inputs[n]) < least + 0.05 * (nothing - least)
+    np.testing.assert_allclose(found.states[1:], found.states[:1].repeat(N - 1, axis=0), atol=1e-6)
+
+
+def test_sweeps_improve_plans():
+    costs = []
+    for sweeps in (1, 3, 10):
+        settings = PlannerConfig(sweeps=sweeps)
+        apart = planner(settings)
+        _, start = at_rest(make_system(N))
+        start[0] += 0.1
+        positions, rotations, offsets = held(apart, N)
+        found = apart.plan(np.tile(start, (N, 1)), positions, rotations, 0.0, offsets)
+        costs.append(cost(apart, found.states[0], found.inputs[0]))
+    assert costs[0] > costs[1] > costs[2]
+
+
+def test_what_is_heard_late_is_moved_on():
+    steps = 10
+    times = STEP * np.arange(steps + 1)
+    said = np.stack([np.full(steps + 1, 0.1 * i) + times for i in range(7)], axis=1)
+    states, inputs = np.zeros((steps + 1, state_size(N))), np.zeros((steps, 3 * N))
+    believe(1, said, 0.4, states, inputs, STEP)
+    columns = [said_at(i, 1, Q) for i in range(7)]
+    late = np.minimum(times + 0.4 * STEP, times[-1])
+    np.testing.assert_allclose(states[:, columns], 0.1 * np.arange(7) + late[:, None], atol=1e-12)
+    np.testing.assert_allclose(inputs[:-1, 3:6], 1.0)
+    others = np.delete(np.arange(states.shape[1]), columns)
+    assert (states[:, others] == 0).all() and (inputs[:, [0, 1, 2, 6, 7, 8]] == 0).all()
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3, 1.0])
+def test_so_many_messages_are_lost(loss):
+    apart = planner(loss=loss)
+    post, plans = apart.post, apart.plans
+    heard = np.zeros((N, N))
+    for _ in range(400):
+        plans.states[:], post.sent[:] = 0.0, 1.0
+        hear(0, 0, 0.0, apart.links, post, plans, STEP)
+        heard += [[plans.states[n, 0, said_at(0, m, Q)] for m in range(N)] for n in range(N)]
+    expected = 400 * (1 - loss) * ~np.eye(N, dtype=bool)
+    assert (abs(heard - expected) <= 4 * np.sqrt(400 * loss * (1 - loss))).all()
+
+
+def test_those_out_of_reach_are_not_heard():
+    partners = np.zeros((N, N), bool)
+    partners[0, 1] = True
+    apart = planner(partners=partners)
+    apart.post.sent[:] = 1.0
+    hear(0, 0, 0.0, apart.links, apart.post, apart.plans, STEP)
+    heard = [[apart.plans.states[n, 0, said_at(0, m, Q)] for m in range(N)] for n in range(N)]
+    assert (np.array(heard) == partners).all()
+
+
+def test_a_team_plans_the_same_in_any_batch():
+    _, rest = at_rest(make_system(N))
+    found = []
+    for envs in (1, 3):
+        apart = planner(num_envs=envs, delay=1, loss=0.4)
+        starts = np.tile(rest, (envs * N, 1))
+        starts[-N:, 0] += 0.1
+        starts[: -N or None, 1] -= 0.2
+        starts[-N:, 1] = 0.0
+        for _ in range(4):
+            positions, rotations, offsets = held(apart, envs * N)
+            plans = apart.plan(starts.copy(), positions, rotations, 0.02, offsets)
+        found.append(plans.states[-N:].copy())
+    np.testing.assert_array_equal(*found)
+
+
+def test_drones_take_the_mean_of_the_loads_that_they_know_of():
+    partners = np.array([[0, 1, 1], [1, 0, 0], [0, 0, 0]], bool)
+    apart = planner(partners=partners)
+    _, rest = at_rest(make_system(N))
+    loads = np.arange(N)[:, None] * np.full(7, 0.1)
+    positions, rotations, offsets = held(apart, N)
+    for _ in range(2):  # what was heard in a step counts in the next one
+        apart.plan(np.tile(rest, (N, 1)), positions, rotations, 0.02, offsets, loads)
+    np.testing.assert_allclose(apart._agree(loads)[:, 0], [0.1, 0.05, 0.2])
+    apart.plans.fresh[:] = True
+    np.testing.assert_allclose(apart._agree(loads)[:, 0], [0.0, 0.1, 0.2])
+
+
+def test_drones_keep_away_from_where_others_say_they_are():
+    """With a large least distance, drones at rest plan to be farther apart."""
+    gaps = []
+    for factor in (0.5, 4.0):
+        settings = PlannerConfig(separation=factor, sweeps=10)
+        apart = planner(settings)
+        _, rest = at_rest(make_system(N))
+        positions, rotations, offsets = held(apart, N)
+        found = apart.plan(np.tile(rest, (N, 1)), positions, rotations, 0.0, offsets).states[0, -1]
+        c = found[6 : 6 + 2 * N].reshape(N, 2)
+        gaps.append(np.linalg.norm(c - c.mean(axis=0), axis=1).mean())
+    assert gaps[1] > gaps[0] + 0.01
+
+
+def test_a_message_holds_seven_numbers_of_each_step_and_seven_of_the_load():
+    assert planner().message_bytes == 4 * (7 * 21 + 7) == 616
+
+
+def test_each_drone_estimates_but_the_payload_and_itself():
+    model, _ = at_rest(make_system(N))
+    one, each = make_priors(model, 1.0), make_priors(model, 1.0, apart=True)
+    assert len(one.first) == 1 and len(each.first) == N
+    for n in range(N):
+        own = [*range(PAYLOAD), *range(PAYLOAD + 3 * n, PAYLOAD + 3 * n + 3)]
+        np.testing.assert_array_equal(each.first[n, own], one.first[0, own])
+        assert not np.delete(each.first[n], own).any() and not np.delete(each.drift[n], own).any()
+        assert (each.noise[n, :6] == one.noise[0, :6]).all() and each.noise[n, 6 + 2 * n] == one.noise[0, 6 + 2 * n]

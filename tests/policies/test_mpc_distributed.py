@@ -1,0 +1,84 @@
+"""The policy mpc_distributed: flights beside the central one's, late and lossy messages, own sensing, refusals."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import make, refusal
+
+from multilift_marl.config.load import load_config
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.mpc_distributed import others_of
+
+BY_RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
+LOSSY = {"env.sensing": "onboard", "env.communication": "all", "env.communication_loss": 0.1}
+
+
+def fly(policy, config, overrides, episodes=3, seconds=6.0):
+    loaded = load_config(config, BY_RATES | overrides | {"env.episode_seconds": seconds, "env.num_threads": 1})
+    return run_episodes(loaded, lambda vec: make_scripted(policy, vec), episodes, 77)
+
+
+@pytest.mark.parametrize("drones", [2, 4, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 6, 8))])
+def test_paths_are_kept_to_within_half_a_millimetre(drones):
+    """Of two drones 2 mm: they do not hold the payload's angle about the line between them."""
+    result = fly("mpc_distributed", "track", {"env.num_drones": drones})
+    most = 2e-3 if drones == 2 else 5e-4
+    assert not result["failure_cause"].any() and (result["payload_rmse_m"] < most).all()
+    assert not result["planner_failed"].any()
+
+
+def test_unknown_masses_and_forces_are_held():
+    result = fly("mpc_distributed", "hover", {}, seconds=8.0)
+    assert result["success_rate"].all() and (result["payload_position_error_m"] < 0.003).all()
+
+
+@pytest.mark.slow
+def test_sensors_on_board_and_lossy_late_messages_cost_little():
+    apart, central = (fly(policy, "track", LOSSY, 8, 8.0) for policy in ("mpc_distributed", "mpc"))
+    assert not apart["failure_cause"].any()
+    assert apart["payload_rmse_m"].mean() < 1.3 * central["payload_rmse_m"].mean()
+
+
+@pytest.mark.slow
+def test_without_any_message_it_is_worse():
+    """The messages matter: lost altogether, drones take the others to fly as at first, and the payload is far off."""
+    heard, lost = (
+        fly("mpc_distributed", "track", LOSSY | {"env.communication_loss": loss}, 6, 8.0) for loss in (0.1, 1.0)
+    )
+    assert lost["payload_rmse_m"].mean() > 1.2 * heard["payload_rmse_m"].mean()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("overrides", [{}, LOSSY])
+def test_forests_are_passed(overrides):
+    result = fly("mpc_route_distributed", "navigate_dense", overrides, episodes=4, seconds=24.0)
+    assert result["success_rate"].all()
+
+
+def test_points_are_carried():
+    result = fly("mpc_distributed", "hover", {"payload.shape": "point", "env.num_drones": 3}, seconds=8.0)
+    assert result["success_rate"].all()
+
+
+def test_an_episode_is_the_same_in_any_batch():
+    one, three = (fly("mpc_distributed", "hover", LOSSY, count, 1.0) for count in (1, 3))
+    assert one["payload_rmse_m"][0] == three["payload_rmse_m"][0]
+
+
+def test_what_others_say_is_all_but_the_payload_and_oneself():
+    found = others_of(3)
+    assert found.shape == (3, 14)
+    assert sorted(found[1]) == [6, 7, 10, 11, 18, 19, 22, 23, 24, 25, 26, 30, 31, 32]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ({"planner.limits": "hard"}, "set planner.limits=soft"),
+        ({"num_drones": 1, "payload.shape": "point"}, "two drones or more"),
+        ({"control.action": "full_state"}, "acts by control.action=acc_rates"),
+    ],
+)
+def test_what_it_cannot_do_is_refused(overrides, said):
+    assert said in refusal(make_scripted, "mpc_distributed", make("hover", **(BY_RATES | overrides)))
