@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.kernels.jit import kernel
+from multilift_marl.planning.plan_messages import BYTES, SAID, Post, hear, said_at, seed_of
 from multilift_marl.planning.riccati import IterationWork, Objective, Problem, find_gains, take_step
 from multilift_marl.planning.soft_limits import Surroundings
 from multilift_marl.planning.team_model import (
@@ -24,34 +25,21 @@ from multilift_marl.planning.team_model import (
     state_size,
     step_state,
 )
-from multilift_marl.planning.team_planner import Plans, TeamPlanner, keep_targets, prepare_team
+from multilift_marl.planning.team_planner import (
+    Plans,
+    TeamPlanner,
+    is_finite,
+    keep_targets,
+    prepare_team,
+    take_targets,
+)
 from multilift_marl.rig.system import System
-from multilift_marl.rng import uniform
 from multilift_marl.schema.planner import PlannerConfig
 from multilift_marl.sensing.communication import Links
 from multilift_marl.sim.obstacles import Obstacles
 
 OWN = 19  # numbers of a drone's problem: payload 12, its cable 4, its thrust vector 3
-SAID = 7  # numbers that a drone says of each step: its cable 4, its thrust vector 3
-BYTES = 4  # of each
 MOMENTUM = 0.4  # of a sweep's change, that the next one adds
-
-
-class Post(NamedTuple):
-    """What drones have said in the last policy steps."""
-
-    generator: np.ndarray
-    """(E,) uint64, state of the random numbers that decide which messages are lost."""
-    steps: np.ndarray
-    """(E,) policy steps of the episode."""
-    sent: np.ndarray
-    """(E, D + 1, N, K + 1, 7) of the last steps, at their number modulo D + 1."""
-    sent_loads: np.ndarray
-    """(E, D + 1, N, 7) what each estimated of the load then."""
-    loads: np.ndarray
-    """(E, N, N, 7) what the first last heard of the second's estimate."""
-    has_loads: np.ndarray
-    """(E, N, N) bool, whether it has."""
 
 
 class ApartWork(NamedTuple):
@@ -158,16 +146,6 @@ def take_own(n, team, own):
 
 
 @kernel
-def said_at(i, n, q):
-    """Return where the i-th of the numbers that drone n says is in a team's vector."""
-    if i < 2:
-        return 6 + 2 * n + i
-    if i < 4:
-        return q + 6 + 2 * n + i - 2
-    return 2 * q + 3 * n + i - 4
-
-
-@kernel
 def set_others(n, states, inputs, h, model, load, work):
     """Write what the payload feels in each step beside drone n: the load (7,), and the others in its middle."""
     count = model.anchors.shape[0]
@@ -257,23 +235,6 @@ def follow_load(states, inputs, h, model, load, w, after):
 
 
 @kernel
-def believe(m, said, later, states, inputs, h):
-    """Write what drone m said into a plan of the team, `later` [steps] after it did; its last step stays."""
-    steps = inputs.shape[0]
-    q = 6 + 2 * (inputs.shape[1] // 3)
-    for k in range(steps + 1):
-        at = min(k + later, 1.0 * steps)
-        j = min(int(at), steps - 1)
-        s = at - j
-        for i in range(SAID):
-            states[k, said_at(i, m, q)] = (1.0 - s) * said[j, i] + s * said[j + 1, i]
-    for k in range(steps):
-        for i in range(3):
-            at = 2 * q + 3 * m + i
-            inputs[k, 3 * m + i] = (states[k + 1, at] - states[k, at]) / h
-
-
-@kernel
 def plan_apart(given, settings, team, radio, plans, work, apart):
     """See `DistributedPlanner.plan`.
 
@@ -309,7 +270,7 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
             for n in range(count):
                 t = first + n
                 states, inputs = plans.states[t], plans.inputs[t]
-                set_start(n, given[0][t], states, inputs, h, begins)
+                set_start(n, given[0][t], states, begins)
                 follow_load(states, inputs, h, flat.model, given[1][t], apart.team, work.before[0])
                 loads = given[1][t : t + 1]
                 problem = Problem(apart.all_targets[n], apart.all_asked[n], h, flat.model, loads, objective, here)
@@ -324,33 +285,17 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
             t = first + n
             states, inputs = plans.states[t], plans.inputs[t]
             follow_load(states, inputs, h, flat.model, given[1][t], apart.team, work.before[0])
-            plans.failed[t] = not is_sound(states, inputs)
+            plans.failed[t] = not is_finite(states, inputs)
             if plans.failed[t]:
-                keep_rows(apart.all_targets[n], states)
-                keep_rows(apart.all_asked[n], inputs)
+                take_targets(states, inputs, apart.all_targets[n], apart.all_asked[n])
             keep_targets(t, apart.all_targets[n], plans)
         post.steps[e] = now + 1
 
 
 @kernel
-def hear(e, slot, later, links, post, plans, h):
-    """Let the drones of team e believe what those have said whom they hear, `later` [steps] ago."""
-    said = post.sent[e, slot]
-    count = said.shape[0]
-    for n in range(count):
-        for m in range(count):
-            if links.partners[n, m] and uniform(e, post) > links.loss:
-                t = e * count + n
-                believe(m, said[m], later, plans.states[t], plans.inputs[t], h)
-                post.has_loads[e, n, m] = True
-                for i in range(7):
-                    post.loads[e, n, m, i] = post.sent_loads[e, slot, m, i]
-
-
-@kernel
-def set_start(n, start, states, inputs, h, whole):
+def set_start(n, start, states, whole):
     """Let a plan begin at the payload and drone n as they are, or, if `whole`, at the whole team."""
-    count = inputs.shape[1] // 3
+    count = (start.shape[0] - 12) // 7
     q = 6 + 2 * count
     for i in range(6):
         states[0, i], states[0, q + i] = start[i], start[q + i]
@@ -383,24 +328,3 @@ def keep_rows(rows, into):
     for k in range(rows.shape[0]):
         for i in range(rows.shape[1]):
             into[k, i] = rows[k, i]
-
-
-@kernel
-def is_sound(states, inputs):
-    """Return whether a plan is finite."""
-    total = 0.0
-    for k in range(states.shape[0]):
-        for i in range(states.shape[1]):
-            total += states[k, i]
-    for i in range(inputs.shape[1]):
-        total += inputs[0, i]
-    return np.isfinite(total)
-
-
-@kernel
-def seed_of(start):
-    """Return a seed that belongs to a team's first state, whatever environments it is planned with."""
-    total = np.uint64(0)
-    for i in range(start.shape[0]):
-        total = total * np.uint64(6364136223846793005) + np.uint64(int(abs(start[i]) * 1e9))
-    return total

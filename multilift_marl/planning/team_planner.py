@@ -172,11 +172,11 @@ def plan_teams(given, settings, team, plans, work):
         here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, around.others)
         problem = Problem(targets, asked, h, flat.model, loads[e : e + 1], objective, here)
         _iterate(starts[e], states, inputs, problem, iterations, work)
-        plans.failed[e] = not _is_finite(states, inputs)
+        plans.failed[e] = not is_finite(states, inputs)
         if plans.failed[e]:  # again from the flat states; at last these themselves
             take_targets(states, inputs, targets, asked)
             _iterate(starts[e], states, inputs, problem, 1, work)
-            if not _is_finite(states, inputs):
+            if not is_finite(states, inputs):
                 take_targets(states, inputs, targets, asked)
         keep_targets(e, targets, plans)
 
@@ -238,7 +238,8 @@ def take_targets(states, inputs, targets, asked):
 
 
 @kernel
-def _is_finite(states, inputs):
+def is_finite(states, inputs):
+    """Return whether a plan is finite."""
     total = 0.0
     for k in range(states.shape[0]):
         for i in range(states.shape[1]):

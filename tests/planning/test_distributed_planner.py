@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 from conftest import make_system
 
-from multilift_marl.planning.distributed_planner import (
-    DistributedPlanner,
-    believe,
-    hear,
-    said_at,
-    set_others,
-    take_own,
-)
+from multilift_marl.planning.distributed_planner import DistributedPlanner, set_others, take_own
 from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.force_estimator import PAYLOAD, make_priors
+from multilift_marl.planning.plan_messages import believe, hear, said_at
 from multilift_marl.planning.team_model import ModelWork, accelerations, make_model, move_to_middle, state_size
 from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.schema.planner import PlannerConfig
