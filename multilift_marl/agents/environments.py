@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from multilift_marl.agents.diffmpc import DiffMpcRollouts, check_diffmpc
 from multilift_marl.agents.mappo import Learner, StochasticPolicy, check_communication
 from multilift_marl.agents.rigs import check_rigs, divide_rigs
 from multilift_marl.agents.rollouts import RigRollouts, Rollouts
@@ -27,6 +28,8 @@ def training_environment(config: Config) -> Config:
     check_interface(config.train.residual, environment.control.action, "train.residual")
     for env in (config.env, environment.env):
         check_communication(config.train, env)
+    if config.train.algorithm == "diffmpc":
+        check_diffmpc(config.train, environment.control.action)
     return environment
 
 
@@ -46,9 +49,13 @@ def make_envs(environment: Config, purpose: int = TRAINING) -> list[MultiliftEnv
     return envs
 
 
-def make_rollouts(environment: Config, envs: list[MultiliftEnv], learner: Learner) -> Rollouts | RigRollouts | Workers:
+def make_rollouts(
+    environment: Config, envs: list[MultiliftEnv], learner: Learner
+) -> Rollouts | RigRollouts | Workers | DiffMpcRollouts:
     """Return the rollouts of a learner's policy in what `make_envs` returned."""
     train, total = environment.train, environment.env.num_envs
+    if train.algorithm == "diffmpc":
+        return DiffMpcRollouts(envs[0], learner, total)
     if train.workers:
         return Workers(environment, learner.actor, envs[0].vec.purpose)
     policies = [learner.policy, *(StochasticPolicy(learner.actor) for _ in envs[1:])]

@@ -14,7 +14,7 @@ from torch import nn
 from torch.distributions import Independent, Normal
 from torchrl.modules import PopArtValueNorm
 
-from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, TeamNet, draw_action
+from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, NoCritic, TeamNet, draw_action
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
@@ -66,7 +66,7 @@ class Learner:
 
     config: TrainConfig
     actor: Actor
-    critic: CentralCritic | LocalCritic
+    critic: CentralCritic | LocalCritic | NoCritic
     policy: StochasticPolicy
     optimizer: torch.optim.Adam
 
@@ -99,8 +99,10 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
-    critic: CentralCritic | LocalCritic
-    if config.algorithm == "mappo":
+    critic: CentralCritic | LocalCritic | NoCritic
+    if config.algorithm == "diffmpc":
+        critic = NoCritic()
+    elif config.algorithm == "mappo":
         numbers = vec.task.drone_numbers
         critic = CentralCritic(config.critic, vec.state_size, numbers, config.hidden, value_norm, config.asinh)
     else:

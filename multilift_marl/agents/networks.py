@@ -301,3 +301,7 @@ class LocalCritic(nn.Module):
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """Return the value for each drone."""
         return self.value_norm.denormalize(self.net(self.normalizer(observation)))
+
+
+class NoCritic(nn.Module):
+    """What learns without values has in their place."""

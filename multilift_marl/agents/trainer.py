@@ -25,6 +25,7 @@ from multilift_marl.agents.checkpoint import (
     unlock_run,
 )
 from multilift_marl.agents.curriculum import Curriculum
+from multilift_marl.agents.diffmpc import DiffMpcRollouts
 from multilift_marl.agents.environments import make_envs, make_rollouts
 from multilift_marl.agents.episodes import EpisodeStatistics
 from multilift_marl.agents.evaluator import Evaluator, Gain
@@ -237,16 +238,20 @@ class Trainer:
         critic["lr"] = train.critic_learning_rate * left if train.critic_learning_rate else actor["lr"]
         rate = actor["lr"]
         # The critic learns alone at first: by its untrained values a good actor would only get worse.
-        if self.iteration < train.warmup:
+        if self.iteration < train.warmup and train.algorithm != "diffmpc":
             actor["lr"] = 0.0
         batches = self.rollouts.collect(self.iteration)
         sampling = time.perf_counter() - start
-        torch.set_num_threads(train.threads)
-        values = update(self.learner, batches)
-        torch.set_num_threads(1)
+        if isinstance(self.rollouts, DiffMpcRollouts):  # it has learned on the way
+            values = dict(self.rollouts.values)
+            sampling -= values["learning_seconds"]
+        else:
+            torch.set_num_threads(train.threads)
+            values = update(self.learner, batches)
+            torch.set_num_threads(1)
         actor["lr"] = rate
         # In the warm-up the policy does not move: a KL of 0 would only raise the rate.
-        if train.desired_kl and self.iteration >= train.warmup:
+        if train.desired_kl and self.iteration >= train.warmup and "approx_kl" in values:
             actor["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
         learning = values.pop("learning_seconds")
         values |= self.episodes.read(batches, self.iteration - self.curriculum.began)

@@ -29,6 +29,22 @@ from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_fr
 from multilift_marl.physical import GRAVITY
 from multilift_marl.schema.sections import ControlConfig
 
+PLANNER_WEIGHTS = {
+    "position": "the payload's horizontal position",
+    "height": "its height",
+    "tilt": "its roll and pitch",
+    "yaw": "its yaw",
+    "velocity": "its horizontal velocity",
+    "climb": "its vertical velocity",
+    "tilt_rate": "its body rates about x and y",
+    "yaw_rate": "that about z",
+    "cable": "the own cable's direction",
+    "cable_rate": "its rate",
+    "thrust": "the own thrust vector",
+    "thrust_rate": "its rate",
+    "end": "the state at the end of the horizon",
+}
+
 
 class ReferenceAction(Interface):
     """Offset of the drone's slot in the formation about the target payload pose; zero keeps the formation."""
@@ -122,6 +138,20 @@ class AccRatesAction(Interface):
         tracked = bind(track_own_state_to_yaw, lo, hi, team.state, team.reference, *smoothing)
         followed = (team.state, team.reference, team.cable_force, team.thrust, team.gains)
         return tracked, bind(fly, lo, hi, *followed, team.setpoint.rates)
+
+
+class PlannerWeightsAction(AccRatesAction):
+    """Weights of a model-predictive planner, which flies the team by `acc_rates`; zero: those of `planner`.
+
+    Each is that of `planner`, times `control.max_weight` to the power of the number: what a planner minimises are squared
+    deviations, each over its squared tolerance. Those of the payload, and the end, are the geometric mean of what the
+    drones say; those of a cable and a thrust are its drone's own.
+    """
+
+    numbers = tuple(
+        ActionComponent(f"{name}_weight", "-", "-", "max_weight", f"weight of {meaning}")
+        for name, meaning in PLANNER_WEIGHTS.items()
+    )
 
 
 class CtbrAction(Interface):
@@ -284,6 +314,7 @@ ACTIONS: dict[str, type[Interface]] = {
     "acceleration": AccelerationAction,
     "acc_rates": AccRatesAction,
     "full_state": FullStateAction,
+    "planner_weights": PlannerWeightsAction,
     "ctbr": CtbrAction,
     "ctbm": CtbmAction,
     "rotor": RotorAction,

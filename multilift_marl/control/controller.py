@@ -6,7 +6,7 @@ import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.control.action_interface import Call, ControlContext
-from multilift_marl.control.actions import ACTIONS
+from multilift_marl.control.actions import ACTIONS, AccRatesAction, PlannerWeightsAction
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
 from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.gains import make_gains
@@ -29,6 +29,7 @@ class Controller:
     Attributes:
         world, state: as given.
         action_names: names of the numbers of an action.
+        command_size: numbers of what the interface takes: A, unless a planner makes it from the actions.
         reference: what the drones follow; live arrays.
         gains: of the controller, for the nominal drones.
         disturbance: what `control.disturbance` remembers, None without.
@@ -43,6 +44,9 @@ class Controller:
         self.world, self.state = world, world.state if state is None else state
         self.interface = ACTIONS[settings.action](config.acting, dt)
         self.action_names = tuple(number.name for number in self.interface.numbers)
+        self.command_size = len(self.action_names)
+        if isinstance(self.interface, PlannerWeightsAction):
+            self.command_size = len(AccRatesAction.numbers)
         self.reference = Reference.zeros(e, n)
         self.disturbance: Disturbance | None = None
         self._setpoint = Setpoint.zeros(e, n)

@@ -11,6 +11,7 @@ import numpy as np
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
 from multilift_marl.control.controller import Controller
+from multilift_marl.envs.commander import COMMANDERS, Commander, find_commander
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.envs.pipeline import Pipeline, StageContext, describe_stages, join_pipelines
@@ -53,6 +54,7 @@ class MultiliftVec:
         seeds, episodes, steps: of the episodes in progress: seed, number, policy steps so far (E,) int64.
         world: the physics; `world.state` is the true state.
         controller: of the drones; `reference` is its reference.
+        commander: what makes commands of actions, see `envs/commander.py`; None: actions are commands.
         outcome: what the last step led to; live arrays.
         task: the task; `task.goal` and `task.errors` say where the payload should be.
 
@@ -83,7 +85,9 @@ class MultiliftVec:
         self.observation_names = observation_names(config.control.action, kind.extra(config), config.env.history)
         self.observation_size = len(self.observation_names)
         self._estimator = estimator
-        self._sensing = Sensing(config, self.world, estimator, (a, self.observation_size // config.env.history))
+        commands = self.controller.command_size
+        sizes = a, self.observation_size // config.env.history
+        self._sensing = Sensing(config, self.world, estimator, sizes, commands)
         self.task = kind(config, self.world, self.reference, self._sensing)
         self.state_size = self.task.critic.shape[1]
         self.reward_terms, self.failure_causes = tuple(kind.REWARD), kind.causes()
@@ -95,12 +99,15 @@ class MultiliftVec:
         self.steps, self._ended = np.zeros(e, np.int64), np.ones(e, bool)
         self.outcome = outcome = Outcome.of(self._stacked, self.task.terms)
         self._given, self._halted = np.zeros_like(self.task.action), np.zeros(e, bool)
+        planned = config.control.action in COMMANDERS
+        self._commands = np.zeros((e, self.num_drones, commands)) if planned else self.task.action
         actions = self.task.action, self.task.previous
         self._take_actions: Callable[[], Any] = bind(take_actions, self._given, self._halted, *actions)
         causes, counted = (self.task.cause, len(self.failure_causes)), (self.steps, self.max_steps, self._ended)
         self._end_step: Callable[[], Any] = bind(end_step, self.world.diverged, *causes, *counted, outcome)
         self._checked = False  # whether all components were seen to be written
         self._bind()
+        self.commander: Commander | None = find_commander(config.control.action)(self) if planned else None
         self._first_sense = self._sensing.bind_sense(self.task.view, first=True) if self._sensing.measures else None
         delays = self._sensing.delays_observation
         self._first_delay = self._sensing.bind_delay(observation) if delays else None
@@ -167,6 +174,8 @@ class MultiliftVec:
         # Those that were never reset are left out, so that they are refused below.
         begin = self._ended & (self.episodes >= 0) if restart and self._ended.any() else None
         self._set_action(action, self._ended if begin is None else self._ended & ~begin)
+        if self.commander is not None:
+            self._commands[:] = self.commander.command(self.task.action)
         for run in self._parts:  # one, unless the task has NumPy functions
             run()
         # Before the step is counted: one in which the simulation diverged has no reward.
@@ -237,6 +246,8 @@ class MultiliftVec:
         saved |= self.controller.state_dict()
         saved |= {f"sensing.{key}": array.copy() for key, array in self._sensing.arrays().items()}
         saved |= {name: getattr(self, name).copy() for name in _SAVED}
+        if self.commander is not None:
+            saved |= {f"commander.{name}": array.copy() for name, array in self.commander.arrays().items()}
         saved["task_name"] = fingerprint(self.task.name, self.num_envs)
         return saved
 
@@ -266,6 +277,9 @@ class MultiliftVec:
         self._starts.load_state_dict(groups["sensing"])
         for name in _SAVED:
             getattr(self, name)[:] = saved[name]
+        if self.commander is not None:
+            for name, array in self.commander.arrays().items():
+                array[:] = saved[f"commander.{name}"]
 
     def __reduce__(
         self,
@@ -288,6 +302,8 @@ class MultiliftVec:
         self.task.action[mask] = self.task.previous[mask] = 0.0
         self.steps[mask], self._ended[mask] = 0, False
         self.outcome.clear(mask)
+        if self.commander is not None:
+            self.commander.reset(mask)
         for e in chosen:
             self._sensing.start_sensors(e)
             self.controller.start(e)
@@ -323,7 +339,9 @@ class MultiliftVec:
 
     def _bind(self) -> None:
         """Build the stages of every shard, from the controller and the task as they are."""
-        teams = StageContext(self.world, self.controller, self.task, self._estimator, self._sensing, self._stacked)
+        teams = StageContext(
+            self.world, self.controller, self.task, self._estimator, self._sensing, self._commands, self._stacked
+        )
         self._pipelines = {shard.lo: Pipeline(teams, shard, self.control_ticks) for shard in self.world.shards}
         self._parts = join_pipelines(self._pipelines, self.world)
 

@@ -42,16 +42,18 @@ class StageContext(NamedTuple):
     task: Task
     estimator: StateEstimator | None
     sensing: Sensing
+    commands: np.ndarray
+    """(E, N, A) what the controller takes: the task's own array of actions, unless a planner makes it from them."""
     stacked: np.ndarray
     """(E, N, H D) float32 observations of the last H steps; the task's own array where H = 1."""
 
 
 def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[Stage], list[Stage], list[Stage]]:
     """Return what runs for a shard before its control ticks, at each of `ticks`, and after them."""
-    world, controller, task, estimator, sensing, stacked = teams
+    world, controller, task, estimator, sensing, commands, stacked = teams
     lo, hi = shard.lo, shard.hi
     on_shard = {name: partial(call, lo, hi) for name, call in task.stages.items()}
-    arriving = sensing.applied if sensing.delays_action else task.action
+    arriving = sensing.applied if sensing.delays_action else commands
 
     # once, before: the action arrives
     own, every = task.numpy, (0, world.num_envs)
@@ -59,7 +61,7 @@ def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[St
     plan = on_shard.get("plan")
     set_action, control = controller.bind(lo, hi, arriving, task.planned, plan)
     if sensing.delays_action:
-        before.append(Stage("delay action", partial(sensing.bind_send(task.action), lo, hi)))
+        before.append(Stage("delay action", partial(sensing.bind_send(commands), lo, hi)))
     before.append(Stage("set action", set_action))
 
     # at each control tick: plan, references, rejection of disturbances, rotor thrusts; then physics, sensors, filters

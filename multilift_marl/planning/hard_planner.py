@@ -24,6 +24,7 @@ from multilift_marl.planning.team_planner import (
 )
 from multilift_marl.rig.system import System
 from multilift_marl.schema.planner import PlannerConfig
+from multilift_marl.sim.obstacles import Obstacles
 
 TOLERANCE = 1e-6  # largest KKT residual of a plan that has converged
 MOST_ITERATIONS = 40
@@ -73,12 +74,14 @@ def make_hard_plans(num_envs: int, steps: int, n: int) -> HardPlans:
 class HardPlanner(TeamPlanner):
     """Plans of E teams within hard limits, each iterated from the last until it converges; see `TeamPlanner`.
 
+    Obstacles do not count.
+
     Attributes:
         limits: of the team.
         hard: HardPlans, live.
     """
 
-    def __init__(self, system: System, settings: PlannerConfig, num_envs: int):
+    def __init__(self, system: System, settings: PlannerConfig, num_envs: int, obstacles: Obstacles | None = None):
         super().__init__(system, settings, num_envs)
         n, steps = system.num_drones, settings.steps
         self.limits = make_limits(settings, system, self.model, self.objective)

@@ -334,39 +334,53 @@ def take_step(start, states, inputs, problem, w):
         states, inputs: of the trajectory, overwritten.
         problem, w: see `recur`.
     """
-    h, count = problem.step, problem.model.anchors.shape[0]
-    q = 6 + 2 * count
-    size = 2 * q + 3 * count
-    moved, half = w.force, 0.5 * h * h  # deviation of the present state
+    size, moved = states.shape[1], w.force  # deviation of the present state
     for i in range(size):
         moved[i] = start[i] - states[0, i]
     for k in range(inputs.shape[0]):
-        euler, slope, change, rates = w.euler[k], w.slope[k], w.change[k], w.lever
-        for i in range(3 * count):
+        change = w.change[k]
+        for i in range(inputs.shape[1]):
             for j in range(size):
                 change[i] += w.gain[k, i, j] * moved[j]
             inputs[k, i] += change[i]
         for i in range(size):
             states[k, i] += moved[i]
-        for i in range(q):  # of the accelerations
-            total = 0.0
-            for j in range(size):
-                total += slope[i, j] * moved[j]
-            for j in range(3 * count):
-                total += slope[i, 2 * q + j] * 0.5 * h * change[j]
-            rates[i] = total
-        e0, e1, e2 = moved[3], moved[4], moved[5]
-        t = (h * moved[q + 3] + half * rates[3], h * moved[q + 4] + half * rates[4], h * moved[q + 5] + half * rates[5])
-        for i in range(q):
-            moved[i] += h * moved[q + i] + half * rates[i] + w.gap[k, i]
-            moved[q + i] += h * rates[i] + w.gap[k, q + i]
-        g = w.gap[k]
-        moved[3] = e0 + t[0] + euler[0] * t[1] + euler[1] * t[2] + g[3]
-        moved[4] = e1 + euler[2] * t[1] + euler[3] * t[2] + g[4]
-        moved[5] = e2 + euler[4] * t[1] + euler[5] * t[2] + g[5]
-        for i in range(3):
-            moved[3 + i] += h * (e0 * euler[6 + 3 * i] + e1 * euler[7 + 3 * i] + e2 * euler[8 + 3 * i])
-        for i in range(3 * count):
-            moved[2 * q + i] += h * change[i] + g[2 * q + i]
+        advance(w.slope[k], w.euler[k], change, problem.step, w.lever, moved)
+        for i in range(size):
+            moved[i] += w.gap[k, i]
     for i in range(size):
         states[inputs.shape[0], i] += moved[i]
+
+
+@kernel
+def advance(slope, euler, change, h, rates, moved):
+    """Move the deviation of a state (12 + 7 N,) on by a linearised step, with the change (3 N,) of its input.
+
+    Args:
+        slope, euler: of the step, see `IterationWork`.
+        change: of the input.
+        h: [s].
+        rates: (6 + 2 N,) worked in.
+        moved: the deviation, overwritten.
+    """
+    q, nu = slope.shape[0], change.shape[0]
+    size, half = 2 * q + nu, 0.5 * h * h
+    for i in range(q):  # of the accelerations
+        total = 0.0
+        for j in range(size):
+            total += slope[i, j] * moved[j]
+        for j in range(nu):
+            total += slope[i, 2 * q + j] * 0.5 * h * change[j]
+        rates[i] = total
+    e0, e1, e2 = moved[3], moved[4], moved[5]
+    t = (h * moved[q + 3] + half * rates[3], h * moved[q + 4] + half * rates[4], h * moved[q + 5] + half * rates[5])
+    for i in range(q):
+        moved[i] += h * moved[q + i] + half * rates[i]
+        moved[q + i] += h * rates[i]
+    moved[3] = e0 + t[0] + euler[0] * t[1] + euler[1] * t[2]
+    moved[4] = e1 + euler[2] * t[1] + euler[3] * t[2]
+    moved[5] = e2 + euler[4] * t[1] + euler[5] * t[2]
+    for i in range(3):
+        moved[3 + i] += h * (e0 * euler[6 + 3 * i] + e1 * euler[7 + 3 * i] + e2 * euler[8 + 3 * i])
+    for i in range(nu):
+        moved[2 * q + i] += h * change[i]

@@ -167,18 +167,24 @@ def plan_teams(given, settings, team, plans, work):
     flat, objective, around = team
     starts, loads, _ = given
     for e in range(starts.shape[0]):
-        states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
         prepare_team(e, given, (elapsed, h), flat, plans, work)
         here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, around.others)
-        problem = Problem(targets, asked, h, flat.model, loads[e : e + 1], objective, here)
-        _iterate(starts[e], states, inputs, problem, iterations, work)
-        plans.failed[e] = not is_finite(states, inputs)
-        if plans.failed[e]:  # again from the flat states; at last these themselves
+        problem = Problem(work.targets, work.asked, h, flat.model, loads[e : e + 1], objective, here)
+        improve(e, starts[e], problem, iterations, plans, work)
+
+
+@kernel
+def improve(e, start, problem, iterations, plans, work):
+    """Iterate on the plan of team e, after `prepare_team`."""
+    states, inputs, targets, asked = plans.states[e], plans.inputs[e], work.targets, work.asked
+    _iterate(start, states, inputs, problem, iterations, work)
+    plans.failed[e] = not is_finite(states, inputs)
+    if plans.failed[e]:  # again from the flat states; at last these themselves
+        take_targets(states, inputs, targets, asked)
+        _iterate(start, states, inputs, problem, 1, work)
+        if not is_finite(states, inputs):
             take_targets(states, inputs, targets, asked)
-            _iterate(starts[e], states, inputs, problem, 1, work)
-            if not is_finite(states, inputs):
-                take_targets(states, inputs, targets, asked)
-        keep_targets(e, targets, plans)
+    keep_targets(e, targets, plans)
 
 
 @kernel

@@ -58,6 +58,11 @@ class LastPlan:
         last = self._inputs.shape[1] - 1
         return np.where((at <= last)[:, None], self._inputs[every, np.minimum(at, last)], 0.0)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the live arrays, by name."""
+        names = "_states", "_inputs", "age", "without", "steps", "late", "failed"
+        return {name.lstrip("_"): getattr(self, name) for name in names}
+
     def metrics(self) -> dict[str, np.ndarray]:
         """Return the shares of policy steps (E,) by metric."""
         steps = np.maximum(self.steps, 1.0)

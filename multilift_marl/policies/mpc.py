@@ -8,7 +8,7 @@ plan is late or not finite flies on by its last one, and after `planner.patience
 from __future__ import annotations
 
 from time import perf_counter
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from multilift_marl.envs.core import MultiliftVec
+    from multilift_marl.policies.policy import Policy
 
     Preview = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
 
@@ -105,25 +106,26 @@ class TeamMpc:
             self._observer = TeamObserver(self.planner.model, teams, share, late)
         lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)
         self._full_state, self._feedback = None, settings.feedback
-        if self._feedback < 1.0 and config.control.action != "full_state":
+        interface = self._interface(vec)
+        if self._feedback < 1.0 and interface != "full_state":
             raise ConfigError(
                 f"planner.feedback={self._feedback:g} gives drones plans to follow, which control.action="
                 f"{config.control.action} does not; set control.action=full_state, or planner.feedback=1"
             )
-        if config.control.action == "full_state":
+        if interface == "full_state":
             self._full_state = FullStateCommand(vec, self.planner.model, settings.delay, self._feedback == 1.0)
         self._lead = lag + 0.5 * self._dt if settings.lead is None else settings.lead
         self._drag = np.array([vehicle.drag for vehicle in system.vehicles], float)
         self._lift = np.array([vehicle.thrust_coefficient for vehicle in system.vehicles], float)
         under_way = round(settings.delay / self._dt)
         self._sent = np.zeros((under_way + 1, teams, 3 * n))
-        self._starts = [np.zeros((teams, 12 + 7 * n)) for _ in range(under_way + 1)]  # of the plans for now and later
+        self._starts = np.zeros((under_way + 1, teams, 12 + 7 * n))  # of the plans for now and later
         self._fresh, self._acted = np.ones(teams, bool), np.zeros(teams)
         self._last = LastPlan(self.planner.plans, settings.step, self._dt)
-        self._without_plan = HoldAccRates(vec) if self._full_state is None else HoldFullState(vec)
+        self._without_plan = self._make_fallback()
         self._approach = Approach.zeros(teams)
         self._offsets = np.zeros((teams, settings.steps + 1, 12))
-        enough = ENOUGH[config.control.action]
+        enough = ENOUGH[interface]
         if any(getattr(config.acting, key) < least for key, (least, _) in enough.items()):
             cure = " ".join(f"control.{key}={wide:g}" for key, (_, wide) in enough.items())
             warn_once("mpc", f"actions of these full scales limit what policy=mpc can command; set {cure}")
@@ -135,6 +137,14 @@ class TeamMpc:
         vec, settings = self._vec, self._vec.config.planner
         team = vec.world.system, settings, vec.num_envs
         return HardPlanner(*team) if settings.limits == "hard" else TeamPlanner(*team, vec.world.obstacles)
+
+    def _interface(self, vec: MultiliftVec) -> str:
+        """Return by which interface it acts."""
+        return vec.config.control.action
+
+    def _make_fallback(self) -> Policy:
+        """Return what flies teams that have had no plan for a while."""
+        return HoldAccRates(self._vec) if self._full_state is None else HoldFullState(self._vec)
 
     def _time(self) -> np.ndarray:
         """Return the time of each plan (E,) [s]."""
@@ -149,6 +159,20 @@ class TeamMpc:
     def metrics(self) -> dict[str, np.ndarray]:
         """Return the shares of the episodes' steps (E,) with a plan that came late, or failed: was not finite."""
         return self._last.metrics()
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return live arrays of all that later actions depend on, environment first, by name."""
+        groups: list[NamedTuple] = [self.planner.plans, self._approach]
+        if self._estimator is not None:
+            groups.append(self._estimator.estimate)
+        if isinstance(self.planner, HardPlanner):
+            groups.append(self.planner.hard.multipliers)
+        found = {f"{type(group).__name__}.{name}": array for group in groups for name, array in group._asdict().items()}
+        found |= {f"last.{name}": array for name, array in self._last.arrays().items()}
+        if self._observer is not None:
+            found |= {"observer.states": self._observer.states, "observer.fresh": self._observer.fresh}
+        found |= {"sent": np.moveaxis(self._sent, 1, 0), "starts": np.moveaxis(self._starts, 1, 0)}
+        return found | {"fresh": self._fresh, "acted": self._acted}
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (E, N, A) in [-1, 1] for the present state of the environments, whose observations these are.
@@ -198,10 +222,10 @@ class TeamMpc:
         planner.predict(states, self._sent, self._dt, loads)
         if following.any():
             states[following] = planned[following]
-        for start in self._starts:
-            start[~following] = states[~following]  # they begin
-        self._starts = [*self._starts[1:], states.copy()]
-        self._acted = self._time().copy()
+        self._starts[:, ~following] = states[~following]  # they begin
+        self._starts[:-1] = self._starts[1:]
+        self._starts[-1] = states
+        self._acted[:] = self._time()
         if shapes is not None:
             shapes = np.ascontiguousarray(shapes.reshape(*poses, -1, 3)[:, :, SHAPES])
         plans = planner.plan(states, positions.reshape(*poses, 3), rotations, self._dt, self._offsets, loads, shapes)

@@ -203,9 +203,9 @@ class CableConfig(Section):
 class ControlConfig(Section):
     """The drones' geometric controller and its action interface."""
 
-    action: Literal["reference", "velocity", "acceleration", "acc_rates", "full_state", "ctbr", "ctbm", "rotor"] = (
-        Field("reference", description="what an action means (docs/control.md)")
-    )
+    action: Literal[
+        "reference", "velocity", "acceleration", "acc_rates", "full_state", "planner_weights", "ctbr", "ctbm", "rotor"
+    ] = Field("reference", description="what an action means (docs/control.md)")
     heading: Literal["target", "outward"] = Field(
         "target", description="drones face where the target does, or away from the payload, each through its slot"
     )
@@ -233,6 +233,9 @@ class ControlConfig(Section):
     )
     max_angular_acceleration: Annotated[Float, Between(0, 1e4, "rad/s²")] = Field(
         200.0, gt=0, description="[rad/s²] of a full action of `ctbm`, about each axis"
+    )
+    max_weight: Annotated[Float, Between(1, 1e6)] = Field(
+        100.0, gt=1, description="[-] factor of a planner's weight of a full action of `planner_weights`"
     )
     reference_frequency: Annotated[Float, Between(0.01, 1e4, "rad/s")] = Field(
         6.0, gt=0, description="[rad/s] bandwidth of the smoothed reference"

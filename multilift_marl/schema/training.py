@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 
 from multilift_marl.errors import nearest
 from multilift_marl.schema.files import pin_overrides, pin_policy
-from multilift_marl.schema.values import Float, Int, Section
+from multilift_marl.schema.values import Float, Int, NotNegative, Section
 
 BASE_POLICIES = (
     "formation", "formation_integral", "formation_feedback", "formation_gusts", "formation_lead", "formation_narrow",
@@ -77,10 +77,28 @@ def check_stages(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
     return stages
 
 
-class TrainConfig(Section):
-    """PPO for a team with shared parameters."""
+class DiffMpcConfig(Section):
+    """Training through the planner, `train.algorithm=diffmpc`."""
 
-    algorithm: Literal["mappo", "ippo"] = Field("mappo", description="mappo: central critic; ippo: local critic")
+    window: Int = Field(20, ge=1, le=10_000, description="policy steps that gradients go back")
+    every: Int | None = Field(None, ge=1, le=10_000, description="policy steps between updates; None: a window")
+    fresh_adam: bool = Field(
+        False, description="whether Adam begins anew at each update, so that it follows signs alone (Auto-Multilift)"
+    )
+    loss: tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative, NotNegative] = Field(
+        (1.0, 0.1, 0.0, 0.05, 0.01, 0.0),
+        description="weights of squared deviations: the payload's position [1/m²] and attitude [1/rad²], cables' "
+        "direction, velocity [s²/m²], body rates [s²/rad²], cables' rates [s²]",
+    )
+
+
+class TrainConfig(Section):
+    """PPO for a team with shared parameters, or the gradient of a planner."""
+
+    algorithm: Literal["mappo", "ippo", "diffmpc"] = Field(
+        "mappo", description="mappo: central critic; ippo: local critic; diffmpc: gradient through the planner"
+    )
+    diffmpc: DiffMpcConfig = DiffMpcConfig()
     actor: Literal["local", "set", "attention"] = Field(
         "local", description="local: own observation; set, attention: what the other drones' networks hold, too"
     )

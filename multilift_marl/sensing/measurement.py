@@ -51,7 +51,7 @@ class DelayBuffers(NamedTuple):
     observation_delay: np.ndarray
     """(E,) [policy steps]."""
     actions: np.ndarray
-    """(E, K, N, A) the last ones, at their number modulo K."""
+    """(E, K, N, commands) the last ones, at their number modulo K."""
     observations: np.ndarray
     """(E, K, N, D) as the array before."""
 
@@ -64,6 +64,7 @@ class Sensing:
         world: the teams.
         estimator: of the drones' own states, None where they know the truth.
         sizes: A, D.
+        commands: numbers of what reaches a drone, A unless a planner makes it from the actions.
 
     Attributes:
         memory: DelayBuffers.
@@ -74,13 +75,17 @@ class Sensing:
         measures, delays_observation, delays_action: whether what drones know is not the truth, whether there is a delay
             of observations, one of actions.
         enabled: whether there is any of these.
-        applied: actions that reach the drones (E, N, A).
+        applied: what reaches the drones (E, N, commands).
         action_size, observation_size: A, D.
     """
 
-    def __init__(self, config: Config, world: World, estimator: StateEstimator | None, sizes: tuple[int, int]):
+    def __init__(
+        self, config: Config, world: World, estimator: StateEstimator | None, sizes: tuple[int, int],
+        commands: int | None = None,
+    ):  # fmt: skip
         ranges, level = config.randomization, config.env.sensing
         e, n, (a, d) = world.num_envs, world.num_drones, sizes
+        sent_size = a if commands is None else commands
         self.action_size, self.observation_size = a, d
         self.noise = STANDARD * ranges.observation_noise
         self.bias = STANDARD * ranges.observation_bias
@@ -98,9 +103,9 @@ class Sensing:
         sent, seen, action_delay, observation_delay = (np.zeros(e, np.int64) for _ in range(4))
         self.memory = DelayBuffers(
             np.zeros(e, np.uint64), np.zeros((e, n + 1, 4, 3)), sent, seen, action_delay, observation_delay,
-            np.zeros((e, acted, n, a)), np.zeros((e, observed, n, d), np.float32),
+            np.zeros((e, acted, n, sent_size)), np.zeros((e, observed, n, d), np.float32),
         )  # fmt: skip
-        self.applied = np.zeros((e, n, a))
+        self.applied = np.zeros((e, n, sent_size))
         self._true, self._estimator, self._attitude = world.state, estimator, config.system.payload_shape != "point"
         self._load_sensing: LoadSensing | None = None
         self.state = world.state

@@ -1,0 +1,190 @@
+"""Training through the planner: its weights follow the gradient of tracking errors, `train.algorithm=diffmpc`.
+
+A network says, by each drone's observation, what weighs how much in the team's plan (`control.action=planner_weights`).
+Flights of a few steps are differentiated by these weights (`planning/sensitivity.py`), along the states that the
+simulation went through, with the Jacobians of the planner's model; observations count as given. The network follows that
+gradient by Adam. Auto-Multilift (Wang et al., arXiv 2406.04858) learns so, with a new Adam in every step: signs alone.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from multilift_marl.agents.mappo import Learner
+from multilift_marl.agents.rollouts import Batches
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.envs.torchrl_env import MultiliftEnv
+from multilift_marl.errors import ConfigError
+from multilift_marl.planning.weighted_planner import FlightGradient, TeamWeights
+from multilift_marl.policies.planner_weights import PlannerWeights
+from multilift_marl.schema.training import TrainConfig
+
+
+def check_diffmpc(train: TrainConfig, action: str) -> None:
+    """Refuse, by a ConfigError, what cannot be trained through a planner."""
+    if action != "planner_weights":
+        raise ConfigError(
+            f"train.algorithm=diffmpc learns the weights of a planner; set control.action=planner_weights, not {action}"
+        )
+    for key in ("gru", "workers", "rigs"):
+        if getattr(train, key):
+            raise ConfigError(f"train.algorithm=diffmpc has no train.{key}; leave it out, or take mappo")
+    window, horizon = train.diffmpc.window, train.horizon
+    if horizon <= window:
+        raise ConfigError(
+            f"train.horizon={horizon} holds no window of train.diffmpc.window={window} steps and the state after it; "
+            "raise the one or lower the other"
+        )
+
+
+def loss_weights(train: TrainConfig, vec: MultiliftVec) -> np.ndarray:
+    """Return the weights (12 + 7 N,) of squared deviations from targets in the loss."""
+    position, attitude, cable, velocity, rates, swing = train.diffmpc.loss
+    n = vec.num_drones
+    moving = [velocity] * 3 + [rates] * 3 + [swing] * (2 * n)
+    return np.array([position] * 3 + [attitude] * 3 + [cable] * (2 * n) + moving + [0.0] * (3 * n))
+
+
+class DiffMpcRollouts:
+    """Flights that the learner's policy is improved by on the way; see `Rollouts`.
+
+    Args:
+        env: what is simulated.
+        learner: whose actor flies, and learns.
+        total: environments of the training.
+
+    Attributes:
+        env: as given.
+        values: numbers to log of the last batch.
+    """
+
+    def __init__(self, env: MultiliftEnv, learner: Learner, total: int):
+        commander = env.vec.commander
+        assert isinstance(commander, PlannerWeights)
+        self.env, self.values = env, dict[str, float]()
+        self._learner, self._total, self._commander = learner, total, commander
+        vec, train = env.vec, learner.config
+        self._settings, self._horizon = train.diffmpc, train.horizon
+        self._flight = FlightGradient(commander.planner, self._settings.window, vec.task.dt)
+        self._loss = loss_weights(train, vec)
+        shape = self._settings.window + 1, vec.num_envs, vec.num_drones
+        self._observed = np.zeros((*shape, vec.observation_size), np.float32)
+        self._started = False
+
+    def collect(self, iteration: int) -> Batches:
+        """Fly the next steps of all environments, learn, and return them as one batch of size [E, T]."""
+        vec, window = self.env.vec, self._settings.window
+        every = min(self._settings.every or window, window)
+        self._start()
+        observation, _ = vec.current()
+        rows: list[dict[str, np.ndarray]] = []
+        losses: list[float] = []
+        norms: list[float] = []
+        seconds, slot = 0.0, 0
+        self._learner.actor.normalizer.update(torch.from_numpy(observation))
+        for _ in range(self._horizon):
+            self._fly(observation, slot, rows)
+            observation = vec.outcome.observation.copy()
+            slot += 1
+            if slot <= window:
+                continue
+            begin = time.perf_counter()
+            loss, norm = self._learn()
+            losses.append(loss)
+            norms.append(norm)
+            self._shift(every)
+            slot -= every
+            seconds += time.perf_counter() - begin
+        self.values = {
+            "loss": float(np.mean(losses)), "gradient": float(np.mean(norms)), "learning_seconds": seconds,
+        }  # fmt: skip
+        return [_join(rows, vec)]
+
+    def _fly(self, observation: np.ndarray, slot: int, rows: list[dict[str, np.ndarray]]) -> None:
+        """Make a step, and keep what its derivatives need in a slot of the window."""
+        vec, flight, planner = self.env.vec, self._flight, self._commander.planner
+        with torch.no_grad():
+            action = self._learner.actor(torch.from_numpy(observation))[0].clamp(-1, 1).numpy()
+        self._observed[slot] = observation
+        for kept, weights in zip(flight.weights, self._commander.weigh(action.astype(float)), strict=True):
+            kept[slot] = weights
+        planner.slot = slot
+        began = vec.ended
+        outcome = vec.step_live(action, restart=True)
+        terminated, truncated, success, failure, diverged = outcome.flags
+        done = terminated | truncated
+        flight.tape.cut[slot] |= done | began
+        rows.append(
+            {
+                "reward": outcome.reward[..., None].copy(), "done": done[:, None].copy(),
+                "reward_terms": vec.task.terms.copy(), "success": success[:, None].copy(),
+                "failure": failure[:, None].copy(), "diverged": diverged[:, None].copy(),
+            }
+        )  # fmt: skip
+
+    def _learn(self) -> tuple[float, float]:
+        """Follow the gradient of the flights in the window once; return their loss and the gradient's norm."""
+        learner, settings, flight = self._learner, self._settings, self._flight
+        off = np.moveaxis(flight.tape.off[:, :, 0], 0, 1)
+        off = np.where(np.isfinite(off), off, 0.0)
+        costs = off * self._loss
+        costs[:, 0] = 0.0
+        gradient = flight.find(costs)
+        weights = TeamWeights(*(each[:-1] for each in flight.weights))
+        by_action = np.nan_to_num(self._commander.pull_back(gradient, weights)) / off.shape[0]
+        mean = learner.actor(torch.from_numpy(self._observed[:-1]))[0]
+        slope = torch.from_numpy(by_action.astype(np.float32))
+        # What is beyond the bounds of actions counts where it would come back.
+        outside = (mean.detach().abs() > 1) & (slope * mean.detach() < 0)
+        learner.optimizer.zero_grad()
+        (mean * slope.masked_fill(outside, 0.0)).sum().backward()
+        parameters = [each for each in learner.actor.parameters() if each.grad is not None]
+        norm = torch.nn.utils.clip_grad_norm_(parameters, learner.config.max_grad_norm)
+        if settings.fresh_adam:
+            learner.optimizer.state.clear()
+        learner.optimizer.step()
+        return float(0.5 * (off**2 * self._loss)[:, 1:].sum(axis=2).mean()), float(norm)
+
+    def _shift(self, every: int) -> None:
+        """Let the window move on by so many steps."""
+        tape = self._flight.tape
+        by_env = tape.states, tape.inputs, tape.loads
+        for array in by_env:
+            array[:, :-every] = array[:, every:].copy()
+        by_step = [array for array in tape if not any(array is other for other in by_env)]
+        for array in (*by_step, *self._flight.weights, self._observed):
+            array[:-every] = array[every:].copy()
+
+    def get_state(self) -> dict[str, torch.Tensor]:
+        """See `Rollouts.get_state`."""
+        self._start()
+        return self.env.get_state()
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """See `Rollouts.set_state`."""
+        self.env.set_state(saved)
+        self._started = True
+
+    def close(self, at_once: bool = False) -> None:
+        """Do nothing: there is no other process."""
+
+    def _start(self) -> None:
+        if not self._started:
+            vec = self.env.vec
+            vec.reset(seed=vec.config.seed)
+            vec.stagger(self._total)
+            self._started = True
+
+
+def _join(rows: list[dict[str, np.ndarray]], vec: MultiliftVec) -> TensorDict:
+    """Return steps as a batch [E, T], as of TorchRL's collector."""
+    joined = {name: torch.from_numpy(np.stack([row[name] for row in rows], axis=1)) for name in rows[0]}
+    size = [vec.num_envs, len(rows)]
+    info = TensorDict({name: joined[name] for name in ("reward_terms", "success", "failure", "diverged")}, size)
+    agents = TensorDict({"reward": joined["reward"]}, size)
+    return TensorDict({"next": TensorDict({"agents": agents, "done": joined["done"], "info": info}, size)}, size)

@@ -1,0 +1,35 @@
+"""Action interfaces whose actions are no commands: a planner makes commands of them, once in a policy step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from multilift_marl.envs.core import MultiliftVec
+
+COMMANDERS = {"planner_weights": "multilift_marl.policies.planner_weights:PlannerWeights"}
+"""What makes commands, by `control.action`, as an entry point: it reads environments, which know nothing of it."""
+
+
+class Commander(Protocol):
+    """Makes commands of the actions of E teams."""
+
+    def command(self, action: np.ndarray) -> np.ndarray:
+        """Return what the controller takes (E, N, commands) for actions (E, N, A) in [-1, 1]."""
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Begin anew in the environments of the mask (E,)."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return live arrays of all that later commands depend on, environment first, by name."""
+
+
+def find_commander(action: str) -> Callable[[MultiliftVec], Commander]:
+    """Return what makes the commander of environments with this `control.action`."""
+    module, _, name = COMMANDERS[action].partition(":")
+    found: Callable[[MultiliftVec], Commander] = getattr(import_module(module), name)
+    return found

@@ -1,0 +1,141 @@
+"""What flies teams by `control.action=planner_weights`: a planner whose weights are the drones' actions.
+
+Each drone says what weighs how much in the plan of the team (`control.actions.PLANNER_WEIGHTS`); the plan is that of
+`policy=mpc`, whose commands are those of `acc_rates`.
+"""
+
+from __future__ import annotations
+
+from math import log
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from multilift_marl.control.actions import PLANNER_WEIGHTS, AccRatesAction
+from multilift_marl.errors import ConfigError
+from multilift_marl.planning.sensitivity import Gradient
+from multilift_marl.planning.weighted_planner import TeamWeights, WeightedHardPlanner, WeightedPlanner
+from multilift_marl.policies.mpc import TeamMpc
+
+if TYPE_CHECKING:
+    from multilift_marl.envs.core import MultiliftVec
+    from multilift_marl.policies.policy import Policy
+
+_NAMES = tuple(PLANNER_WEIGHTS)
+_PAYLOAD = [("position", (0, 1)), ("height", (2,)), ("tilt", (3, 4)), ("yaw", (5,))]
+_MOVING = [("velocity", (0, 1)), ("climb", (2,)), ("tilt_rate", (3, 4)), ("yaw_rate", (5,))]
+
+
+class PlannerWeights:
+    """Commands of E teams, see `envs/commander.py`.
+
+    Args:
+        vec: the environments.
+
+    Attributes:
+        mpc: that plans.
+
+    Raises:
+        ConfigError: see `TeamMpc`.
+    """
+
+    def __init__(self, vec: MultiliftVec):
+        self._vec, self.mpc = vec, _WeightedMpc(vec)
+        n = vec.num_drones
+        self._scale = log(vec.config.control.max_weight)
+        self._by_drone, self._rate_by_drone, self._by_end = weight_map(n)
+
+    @property
+    def planner(self) -> WeightedPlanner:
+        """That which plans."""
+        return self.mpc.planner
+
+    def command(self, action: np.ndarray) -> np.ndarray:
+        """See `Commander.command`."""
+        for mine, weights in zip(self.planner.weights, self.weigh(action), strict=True):
+            mine[:] = weights
+        return self.mpc.act(self._vec.task.observation)
+
+    def weigh(self, action: np.ndarray) -> TeamWeights:
+        """Return the weights of actions (..., N, A)."""
+        action = action.reshape(*action.shape[:-2], -1)
+        objective = self.planner.objective
+        return TeamWeights(
+            objective.state * np.exp(self._scale * action @ self._by_drone),
+            objective.end * np.exp(self._scale * action @ (self._by_drone + self._by_end)),
+            objective.rate * np.exp(self._scale * action @ self._rate_by_drone),
+        )
+
+    def pull_back(self, gradient: Gradient, weights: TeamWeights) -> np.ndarray:
+        """Return derivatives (T, E, N, A) by actions of which `weigh` made weights (T, E, ...), from those by weights."""
+        by_state, by_end, by_rate = (
+            given * weight
+            for given, weight in zip((gradient.state, gradient.end, gradient.rate), weights, strict=True)
+        )
+        total = by_state @ self._by_drone.T + by_end @ (self._by_drone + self._by_end).T
+        total += by_rate @ self._rate_by_drone.T
+        return self._scale * total.reshape(*total.shape[:-1], self._vec.num_drones, len(_NAMES))
+
+    def reset(self, mask: np.ndarray) -> None:
+        """See `Commander.reset`."""
+        self.mpc.reset(mask)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """See `Commander.arrays`."""
+        return self.mpc.arrays()
+
+
+def weight_map(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return by how much the logarithm of each weight of N drones changes by each number of their actions.
+
+    Of the state (13 N, 12 + 7 N), of the inputs (13 N, 3 N), and of the state at the end beside that (13 N, 12 + 7 N).
+    """
+    q, size = 6 + 2 * n, 12 + 7 * n
+    state, rate, end = np.zeros((n, len(_NAMES), size)), np.zeros((n, len(_NAMES), 3 * n)), np.zeros((n, 13, size))
+    for first, parts in ((0, _PAYLOAD), (q, _MOVING)):
+        for name, places in parts:
+            for place in places:
+                state[:, _NAMES.index(name), first + place] = 1.0 / n
+    for m in range(n):
+        for name, first, count in (("cable", 6, 2), ("cable_rate", q + 6, 2), ("thrust", 2 * q, 3)):
+            state[m, _NAMES.index(name), first + count * m : first + count * (m + 1)] = 1.0
+        rate[m, _NAMES.index("thrust_rate"), 3 * m : 3 * (m + 1)] = 1.0
+    end[:, _NAMES.index("end")] = 1.0 / n
+    return state.reshape(-1, size), rate.reshape(-1, 3 * n), end.reshape(-1, size)
+
+
+class _WeightedMpc(TeamMpc):
+    """See `TeamMpc`; it acts by `acc_rates`, whatever the environment's actions are."""
+
+    planner: WeightedPlanner
+
+    def __init__(self, vec: MultiliftVec):
+        if vec.config.planner.feedback < 1.0:
+            raise ConfigError("control.action=planner_weights commands acc_rates; set planner.feedback=1")
+        super().__init__(vec)
+
+    def _interface(self, vec: MultiliftVec) -> str:
+        return "acc_rates"
+
+    def _make_planner(self) -> WeightedPlanner:
+        vec, settings = self._vec, self._vec.config.planner
+        if settings.limits == "hard":
+            return WeightedHardPlanner(vec.world.system, settings, vec.num_envs)
+        return WeightedPlanner(vec.world.system, settings, vec.num_envs, vec.world.obstacles)
+
+    def _make_fallback(self) -> Policy:
+        return _Nothing(self._vec.num_drones)
+
+
+class _Nothing:
+    """Commands zero accelerations relative to the formation."""
+
+    def __init__(self, n: int):
+        self._shape = n, len(AccRatesAction.numbers)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return zeros (E, N, 5)."""
+        return np.zeros((len(observation), *self._shape))
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Do nothing."""
