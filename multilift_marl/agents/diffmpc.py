@@ -86,7 +86,6 @@ class DiffMpcRollouts:
         losses: list[float] = []
         norms: list[float] = []
         seconds, slot = 0.0, 0
-        self._learner.actor.normalizer.update(torch.from_numpy(observation))
         for _ in range(self._horizon):
             self._fly(observation, slot, rows)
             observation = vec.outcome.observation.copy()
@@ -137,7 +136,8 @@ class DiffMpcRollouts:
         gradient = flight.find(costs)
         weights = TeamWeights(*(each[:-1] for each in flight.weights))
         by_action = np.nan_to_num(self._commander.pull_back(gradient, weights)) / off.shape[0]
-        mean = learner.actor(torch.from_numpy(self._observed[:-1]))[0]
+        observed = torch.from_numpy(self._observed[:-1])
+        mean = learner.actor(observed)[0]
         slope = torch.from_numpy(by_action.astype(np.float32))
         # What is beyond the bounds of actions counts where it would come back.
         outside = (mean.detach().abs() > 1) & (slope * mean.detach() < 0)
@@ -148,6 +148,7 @@ class DiffMpcRollouts:
         if settings.fresh_adam:
             learner.optimizer.state.clear()
         learner.optimizer.step()
+        learner.actor.normalizer.update(observed)
         return float(0.5 * (off**2 * self._loss)[:, 1:].sum(axis=2).mean()), float(norm)
 
     def _shift(self, every: int) -> None:
