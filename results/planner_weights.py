@@ -89,7 +89,6 @@ def learn(config: Config, method: str, frames: int, seed: int) -> Path:
 
 def find(config: Config, method: str, frames: int, seed: int) -> Callable[[MultiliftVec], Policy]:
     """Return the maker of a method's policy, found now unless it is kept."""
-    HERE.mkdir(exist_ok=True)
     if method == "cma":
         kept = HERE / f"cma_{seed}.json"
         if not kept.exists():
@@ -118,6 +117,7 @@ def main(arguments: list[str]) -> None:
     values |= dict(argument.split("=", 1) for argument in arguments)
     seeds, frames, episodes = (int(values[key]) for key in ("seeds", "frames", "episodes"))
     config = load_config(CONFIG, {"env.num_threads": 1})
+    HERE.mkdir(exist_ok=True)
     hand = fly(config, "hand", lambda vec: Constant(vec, np.zeros(vec.action_size)), episodes)
     teams = {"hand": [hand]}
     for seed in range(seeds):

@@ -58,12 +58,17 @@ class PlannerWeights:
 
     def weigh(self, action: np.ndarray) -> TeamWeights:
         """Return the weights of actions (..., N, A)."""
-        action = action.reshape(*action.shape[:-2], -1)
+        action = self._scale * action.reshape(*action.shape[:-2], -1)
         objective = self.planner.objective
+
+        def factor(by_action: np.ndarray) -> np.ndarray:
+            # No matrix product: its bits depend on the number of rows.
+            return np.exp(np.einsum("...a,ab->...b", action, by_action))
+
         return TeamWeights(
-            objective.state * np.exp(self._scale * action @ self._by_drone),
-            objective.end * np.exp(self._scale * action @ (self._by_drone + self._by_end)),
-            objective.rate * np.exp(self._scale * action @ self._rate_by_drone),
+            objective.state * factor(self._by_drone),
+            objective.end * factor(self._by_drone + self._by_end),
+            objective.rate * factor(self._rate_by_drone),
         )
 
     def pull_back(self, gradient: Gradient, weights: TeamWeights) -> np.ndarray:

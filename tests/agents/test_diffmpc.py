@@ -1,0 +1,86 @@
+"""Training through the planner: it learns, resumes bit for bit, and says what it cannot do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import multilift_marl as ml
+from multilift_marl.agents.checkpoint import load_checkpoint
+from multilift_marl.agents.policy import load_policy
+from multilift_marl.agents.trainer import Trainer, new_run, resume_run
+from multilift_marl.errors import ConfigError
+
+SMALL = {
+    "env.num_drones": 3, "env.num_envs": 2, "env.num_threads": 1, "train.horizon": 45, "train.overrides": {},
+    "train.hidden": [16], "eval.episodes": 2, "eval.every": 100, "env.episode_seconds": 2.0,
+}  # fmt: skip
+POOR = {  # weights that follow badly
+    "planner.position": 0.5, "planner.velocity": 0.5, "planner.thrust": 0.05, "planner.steps": 10,
+    "task_options.speed": 2.0, "task_options.acceleration": 4.0,
+}  # fmt: skip
+
+
+def config(**keys):
+    return ml.load_config("track_weights", SMALL | keys)
+
+
+@pytest.mark.parametrize("own", [{}, {"train.diffmpc.every": 1, "train.diffmpc.fresh_adam": True}])
+def test_poor_weights_get_better(own):
+    """Against the same training at a learning rate that moves nothing."""
+    losses = []
+    for rate in (1e-12, 3e-3):
+        trainer = Trainer(config(**POOR, **own, **{"train.learning_rate": rate, "train.frames": 1800}), Path("unused"))
+        losses.append([trainer.step()["loss"] for _ in range(12)])
+    still, learned = (np.mean(each[-4:]) for each in losses)
+    assert learned < 0.5 * still
+
+
+def test_a_resumed_training_goes_on_bit_for_bit(tmp_path):
+    whole = new_run(config(**{"train.frames": 360}), "whole", tmp_path)
+    for _ in range(4):
+        whole.step()
+    halves = new_run(config(**{"train.frames": 360}), "halves", tmp_path)
+    for _ in range(2):
+        halves.step()
+    halves.evaluate()
+    halves.save("last")
+    again = resume_run(halves.folder, {})
+    assert again.iteration == 2
+    values = [again.step() for _ in range(2)][-1]
+    assert values["loss"] > 0
+    for name, expected in whole.learner.actor.state_dict().items():
+        assert torch.equal(again.learner.actor.state_dict()[name], expected), name
+
+
+def test_a_run_is_evaluated_and_exported_as_any_other(tmp_path):
+    trainer = new_run(config(**{"train.frames": 90}), "short", tmp_path)
+    assert trainer.run()
+    policy = load_policy(trainer.folder, "last")
+    vec = ml.make_vec(policy.config, num_envs=1)
+    observation, _ = vec.reset(seed=0)
+    action = policy.bind(vec).act(observation)
+    assert action.shape == (1, 3, vec.action_size)
+    assert (trainer.folder / "metrics.csv").read_text().splitlines()[0].count("loss") == 1
+    assert "critic" in load_checkpoint(trainer.folder / "checkpoints" / "last.pt")
+    from multilift_marl.agents.export import export_policy
+
+    export_policy(policy, tmp_path / "policy.onnx")
+    assert load_policy(tmp_path / "policy.onnx").act(observation) == pytest.approx(action, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"control.action": "acc_rates"}, r"set control\.action=planner_weights"),
+        ({"train.gru": 8}, r"has no train\.gru"),
+        ({"train.rigs": [{"payload.mass": 1.0}, {"payload.mass": 2.0}]}, r"has no train\.rigs"),
+        ({"train.horizon": 20}, r"train\.horizon=20 holds no window"),
+    ],
+)
+def test_what_cannot_be_trained_so_is_refused(own, message):
+    with pytest.raises(ConfigError, match=message):
+        Trainer(config(**own), Path("unused"))

@@ -1,0 +1,120 @@
+"""`control.action=planner_weights`: actions that are the weights of a planner, and derivatives of flights by them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import multilift_marl as ml
+from multilift_marl.errors import ConfigError
+from multilift_marl.planning.weighted_planner import FlightGradient, TeamWeights
+from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.planner_weights import weight_map
+
+WIDE = {"control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0, "env.num_threads": 1, "env.num_drones": 3}
+WEIGHTS = WIDE | {"control.action": "planner_weights"}
+
+
+@pytest.mark.parametrize("limits", ["soft", "hard"])
+def test_zero_actions_fly_as_mpc_bit_for_bit(limits):
+    own = {"planner.limits": limits, "task_options.speed": 2.0, "task_options.acceleration": 4.0, "num_envs": 2}
+    ours, theirs = (ml.make_vec("track", seed=3, **keys, **own) for keys in (WEIGHTS, WIDE | {"control.action": "acc_rates"}))
+    policy = make_scripted("mpc", theirs)
+    observation, _ = theirs.reset(seed=3)
+    ours.reset(seed=3)
+    for _ in range(15):
+        ours.step(np.zeros((2, 3, ours.action_size)))
+        observation = theirs.step(policy.act(observation))[0]
+    assert (ours.world.state.payload_position == theirs.world.state.payload_position).all()
+    assert (ours.world.state.drone_rotation == theirs.world.state.drone_rotation).all()
+
+
+def test_a_saved_flight_goes_on_bit_for_bit():
+    keys = WEIGHTS | {"randomization.payload_mass": 0.2, "randomization.action_delay": [0, 2], "env.sensing": "mocap"}
+    first, second = (ml.make_vec("track", num_envs=2, **keys) for _ in range(2))
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2, 3, first.action_size))
+    first.reset(seed=1)
+    for action in actions[:10]:
+        first.step(action)
+    second.reset(seed=7)
+    second.load_state_dict(first.state_dict())
+    for action in actions[10:]:
+        assert (first.step(action)[0] == second.step(action)[0]).all()
+
+
+def test_an_environment_is_the_same_in_any_batch():
+    alone, batch = (ml.make_vec("track", num_envs=e, first_env=f, **WEIGHTS) for e, f in ((1, 2), (4, 0)))
+    action = np.random.default_rng(0).uniform(-0.5, 0.5, (4, 3, alone.action_size))
+    alone.reset(seed=1)
+    batch.reset(seed=1)
+    for _ in range(10):
+        one, many = alone.step(action[2:3])[0], batch.step(action)[0]
+    assert (one[0] == many[2]).all()
+
+
+def test_weights_are_the_drones_own_and_means_of_what_they_say():
+    vec = ml.make_vec("track", num_envs=1, **WEIGHTS)
+    commander, objective = vec.commander, vec.commander.planner.objective
+    names = [name.removesuffix("_weight") for name in vec.action_names]
+    action = np.zeros((1, 3, len(names)))
+    action[0, :, names.index("position")] = 1.0, -1.0, 0.5
+    action[0, 1, names.index("thrust")] = 0.5
+    action[0, 2, names.index("thrust_rate")] = -1.0
+    action[0, :, names.index("end")] = 0.3
+    weights = commander.weigh(action)
+    factor = weights.state[0] / objective.state
+    assert factor[:2] == pytest.approx(100 ** (0.5 / 3))
+    assert factor[24:33] == pytest.approx([1, 1, 1, 10, 10, 10, 1, 1, 1])
+    assert factor[2:24] == pytest.approx(1)
+    assert weights.rate[0] / objective.rate == pytest.approx([1] * 6 + [0.01] * 3)
+    assert weights.end[0] / objective.end == pytest.approx(factor * 100**0.3)
+    assert all((part != 0).any(axis=1).sum() for part in weight_map(3))
+    # Each number of an action moves some weight.
+    assert (np.hstack(weight_map(3)) != 0).any(axis=1).all()
+
+
+@pytest.mark.parametrize("limits", ["soft", "hard"])
+def test_derivatives_by_actions_are_differences_of_simulated_flights(limits):
+    """The flights are MuJoCo's, with motor lag and controllers; the derivatives those of the planner's model."""
+    keys = {"planner.limits": limits, "planner.steps": 10, "planner.position": 0.3, "task_options.speed": 2.0}
+    vec = ml.make_vec("track", num_envs=1, **WEIGHTS, **keys, **{"task_options.acceleration": 4.0})
+    commander, steps = vec.commander, 20
+    vec.reset(seed=1)
+    still = np.zeros((1, 3, vec.action_size))
+    for _ in range(100):
+        vec.step(still)
+    saved, flight = vec.state_dict(), FlightGradient(commander.planner, steps, vec.task.dt)
+    loss = np.concatenate([np.ones(3), np.full(3, 0.1), np.zeros(27)])
+
+    def fly(action):
+        vec.load_state_dict(saved)
+        for t in range(steps + 1):
+            for kept, weights in zip(flight.weights, commander.weigh(action), strict=True):
+                kept[t] = weights
+            commander.planner.slot = t
+            vec.step(action)
+        off = np.moveaxis(flight.tape.off[:, :, 0], 0, 1).copy()
+        off[:, 0] = 0.0
+        return 0.5 * (off**2 * loss).sum(), off * loss
+
+    slopes = fly(still)[1]
+    gradient = flight.find(slopes)
+    weights = TeamWeights(*(each[:-1] for each in flight.weights))
+    found = commander.pull_back(gradient, weights).sum(axis=(0, 1))
+    expected = np.zeros_like(found)
+    for n, k in [(0, k) for k in range(vec.action_size)] + [(2, 8), (2, 10), (2, 11)]:
+        change = still.copy()
+        change[0, n, k] = 0.05
+        expected[n, k] = (fly(change)[0] - fly(-change)[0]) / 0.1
+    counted = expected != 0
+    assert counted.sum() == vec.action_size + 3
+    assert found[counted] == pytest.approx(expected[counted], abs=0.05 * abs(expected).max())
+
+
+def test_what_cannot_be_planned_is_refused():
+    with pytest.raises(ConfigError, match="cannot fly task recover"):
+        ml.make_vec("recover", **{"control.action": "planner_weights"})
+    with pytest.raises(ConfigError, match=r"planner\.feedback=1"):
+        ml.make_vec("track", **WEIGHTS, **{"planner.feedback": 0.5})
+    with pytest.raises(ConfigError, match=r"control\.max_weight"):
+        ml.load_config("track", {"control.max_weight": 1.0})
