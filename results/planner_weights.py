@@ -1,4 +1,4 @@
-"""What learning a planner's weights gains: `python results/planner_weights.py [seeds=3] [frames=200000] [episodes=48]`.
+"""What learning a planner's weights gains: `python results/planner_weights.py [seeds=3] [frames=100000] [episodes=48]`.
 
 Four ways to weights of `control.action=planner_weights`, with as many environment steps each, in `track_weights_realistic`:
 those of `planner` as they are, the same for all; CMA-ES over 13 constants (`pip install cma`); a network by
@@ -113,7 +113,7 @@ def fly(config: Config, name: str, make: Callable[[MultiliftVec], Policy], episo
 
 def main(arguments: list[str]) -> None:
     """Train, search, fly, and write the table."""
-    values = {"seeds": "3", "frames": "200000", "episodes": "48", "methods": ",".join(METHODS)}
+    values = {"seeds": "3", "frames": "100000", "episodes": "48", "methods": ",".join(METHODS)}
     values |= dict(argument.split("=", 1) for argument in arguments)
     seeds, frames, episodes = (int(values[key]) for key in ("seeds", "frames", "episodes"))
     config = load_config(CONFIG, {"env.num_threads": 1})

@@ -2,13 +2,14 @@
 
 A network says, by each drone's observation, what weighs how much in the team's plan (`control.action=planner_weights`).
 Flights of a few steps are differentiated by these weights (`planning/sensitivity.py`), along the states that the
-simulation went through, with the Jacobians of the planner's model; observations count as given. The network follows that
-gradient by Adam. Auto-Multilift (Wang et al., arXiv 2406.04858) learns so, with a new Adam in every step: signs alone.
+simulation went through, with the Jacobians of the planner's model, the lag of the rotors, and the delay of actions that
+the simulation has drawn; observations count as given. The network follows that gradient by Adam. Auto-Multilift (Wang et al., arXiv 2406.04858) learns so, with a new Adam in every step: signs alone.
 """
 
 from __future__ import annotations
 
 import time
+from math import exp
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,9 @@ class DiffMpcRollouts:
         self._learner, self._total, self._commander = learner, total, commander
         vec, train = env.vec, learner.config
         self._settings, self._horizon = train.diffmpc, train.horizon
-        self._flight = FlightGradient(commander.planner, self._settings.window, vec.task.dt)
+        slowest = max(vehicle.rotor_time_constant for vehicle in vec.world.system.vehicles)
+        response = 1.0 - exp(-vec.task.dt / slowest) if slowest else 1.0
+        self._flight = FlightGradient(commander.planner, self._settings.window, vec.task.dt, response)
         self._loss = loss_weights(train, vec)
         shape = self._settings.window + 1, vec.num_envs, vec.num_drones
         self._observed = np.zeros((*shape, vec.observation_size), np.float32)
@@ -110,14 +113,15 @@ class DiffMpcRollouts:
         with torch.no_grad():
             action = self._learner.actor(torch.from_numpy(observation))[0].clamp(-1, 1).numpy()
         self._observed[slot] = observation
-        for kept, weights in zip(flight.weights, self._commander.weigh(action.astype(float)), strict=True):
-            kept[slot] = weights
         planner.slot = slot
         began = vec.ended
         outcome = vec.step_live(action, restart=True)
+        for kept, weights in zip(flight.weights, planner.weights, strict=True):
+            kept[slot] = weights
         terminated, truncated, success, failure, diverged = outcome.flags
         done = terminated | truncated
         flight.tape.cut[slot] |= done | began
+        flight.tape.late[slot] = vec.task.view.action_delay
         rows.append(
             {
                 "reward": outcome.reward[..., None].copy(), "done": done[:, None].copy(),

@@ -7,8 +7,9 @@ recursion has found, from −Q⁻¹ v on (Amos et al. 2018; Jin et al. 2020, "Po
 Derivatives by the present state are the first gain. Limits that are exceeded count as in the iteration. What an iteration
 owes to its guess is left out: it vanishes as plans converge.
 
-A flight moves by the reduced model, an input in each policy step; the adjoint of its states runs back through the
-model's Jacobians and the gains (distributed sensitivity propagation, Wang et al. 2024, in one pass).
+A flight moves by the reduced model; the adjoint of its states runs back through the model's Jacobians and the gains. A
+plan commands thrust vectors ahead of the present ones, F + lead u, which rotors approach by a share `response` in a policy
+step, perhaps some steps late: where none are, and response · lead is a policy step, u is the input of the model.
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ class Tape(NamedTuple):
     """(E, T, 3 N) it moved by."""
     loads: np.ndarray
     """(E, T, 7), see `team_model.accelerations`."""
+    late: np.ndarray
+    """(T, E) int64, after how many further policy steps what a plan commands reaches the rotors."""
     cut: np.ndarray
     """(T, E) bool, steps after which an episode ended, or whose plan failed: nothing goes back through them."""
 
@@ -63,7 +66,7 @@ class Tape(NamedTuple):
             (*te, nu, nu), (*te, horizon + 1, size), (*te, horizon, nu), (*te, horizon, n), (*te, horizon + 1, n, 3),
             (num_envs, steps + 1, size), (num_envs, steps, nu), (num_envs, steps, 7),
         )  # fmt: skip
-        return cls(*(np.zeros(shape) for shape in shapes), np.zeros(te, bool))
+        return cls(*(np.zeros(shape) for shape in shapes), np.zeros(te, np.int64), np.zeros(te, bool))
 
 
 class Gradient(NamedTuple):
@@ -84,6 +87,8 @@ class Gradient(NamedTuple):
     """(T, E, K, 3 N) of the inputs."""
     starts: np.ndarray
     """(E, 12 + 7 N) of where flights began."""
+    by_input: np.ndarray
+    """(T, 3 N) of the last team, by how its thrust vectors changed."""
 
     @classmethod
     def of(cls, steps: int, num_envs: int, horizon: int, n: int) -> Gradient:
@@ -91,7 +96,7 @@ class Gradient(NamedTuple):
         size, nu, te = state_size(n), 3 * n, (steps, num_envs)
         shapes = (
             (*te, size), (*te, size), (*te, nu), (*te, n), (*te, n), (*te, horizon + 1, size), (*te, horizon, nu),
-            (num_envs, size),
+            (num_envs, size), (steps, nu),
         )  # fmt: skip
         return cls(*(np.zeros(shape) for shape in shapes))
 
@@ -242,7 +247,7 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
 
     Args:
         costs: (E, T + 1, 12 + 7 N) its derivatives by the states of the flight.
-        times: policy step, and step of the plans [s].
+        times: policy step, step of the plans [s], response [-] and lead [s], see above.
         weights: state and end (T, E, 12 + 7 N), and rate (T, E, 3 N) of the plans.
         model: TeamModel.
         surroundings: Objective and Surroundings, which do not count.
@@ -250,7 +255,8 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
         w: IterationWork of a plan of as many steps, or more.
         gradient: Gradient, overwritten.
     """
-    dt, h = times
+    dt, h, response, lead = times
+    stiff = response / dt
     state, end, rate = weights
     objective, around = surroundings
     envs, steps, nu = tape.inputs.shape
@@ -263,12 +269,14 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
     gradient.thrust[:] = 0.0
     gradient.targets[:] = 0.0
     gradient.asked[:] = 0.0
-    costate, before, slope = w.effect[0], w.effect[1], w.change[0]
+    costate, before, slope, by_input = w.effect[0], w.effect[1], w.change[0], gradient.by_input
     for e in range(envs):
+        by_input[:] = 0.0
         for i in range(size):
             costate[i] = costs[e, steps, i]
         for t in range(steps - 1, -1, -1):
             if tape.cut[t, e]:
+                by_input[:] = 0.0
                 for i in range(size):
                     costate[i] = costs[e, t, i]
                 continue
@@ -276,8 +284,12 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
             one = Problem(states, inputs, dt, model, tape.loads[e, t : t + 1], objective, around)
             linearise(0, states, inputs, one, w)
             pull_back(0, costate, before, q, size, dt, w)
+            arrives = t + tape.late[t, e]
             for i in range(nu):
-                slope[i] = 0.5 * dt * (before[f + i] + costate[f + i])
+                by_input[t, i] = 0.5 * dt * (before[f + i] + costate[f + i])
+                later = by_input[arrives, i] if arrives < steps else 0.0
+                before[f + i] += stiff * (later - by_input[t, i])
+                slope[i] = stiff * lead * later
             for i in range(size):
                 for j in range(nu):
                     before[i] += tape.gain[t, e, 0, j, i] * slope[j]

@@ -149,6 +149,7 @@ class FlightGradient:
         planner: that plans, whose `tape` this makes, with a slot more: for where flights end.
         steps: T.
         dt: policy step [s].
+        response, lead: of the rotors to what plans command, see `sensitivity.py`; None: as the model's inputs.
 
     Attributes:
         tape: Tape.
@@ -156,13 +157,14 @@ class FlightGradient:
         gradient: Gradient of the T plans.
     """
 
-    def __init__(self, planner: WeightedPlanner, steps: int, dt: float):
+    def __init__(self, planner: WeightedPlanner, steps: int, dt: float, response: float = 1.0, lead: float | None = None):
         num_envs, horizon = len(planner.plans.states), planner.settings.steps
         n = len(planner.model.anchors)
         self.tape = planner.tape = Tape.of(steps + 1, num_envs, horizon, n)
         self.weights = TeamWeights(*(np.zeros((steps + 1, *each.shape)) for each in planner.weights))
         self.gradient = Gradient.of(steps, num_envs, horizon, n)
-        self._planner, self._dt = planner, dt
+        self._planner = planner
+        self._times = dt, planner.settings.step, response, dt / response if lead is None else lead
         self._work = IterationWork.of(horizon, n)
 
     def find(self, costs: np.ndarray) -> Gradient:
@@ -170,6 +172,5 @@ class FlightGradient:
         tape, planner = self.tape, self._planner
         used = tape._replace(inputs=tape.inputs[:, :-1].copy())
         around = planner.objective, planner.around
-        times = self._dt, planner.settings.step
-        pull_flight_back(costs, times, self.weights, planner.model, around, used, self._work, self.gradient)
+        pull_flight_back(costs, self._times, self.weights, planner.model, around, used, self._work, self.gradient)
         return self.gradient

@@ -316,7 +316,7 @@ class TeamMpc:
         cable = hook - position[:, None] - arm
         length = np.linalg.norm(cable, axis=-1, keepdims=True)
         direction = cable / length
-        moved = own.drone_velocity - velocity[:, None] - np.cross(turning[:, None], arm)
+        moved = own.drone_velocity - velocity[:, None] - _cross(turning[:, None], arm)
         swing = (moved - direction * (direction * moved).sum(-1, keepdims=True)) / length
         air = np.einsum("enji,enj->eni", own.drone_rotation, own.drone_velocity)
         drag = np.einsum("enij,enj->eni", own.drone_rotation, self._drag * air)
@@ -361,12 +361,18 @@ class TeamMpc:
         change = (rate - up * (up * rate).sum(-1, keepdims=True)) / size
         yaw = vec.reference.yaw
         forward = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
-        left = np.cross(up, forward)
+        left = _cross(up, forward)
         left /= np.linalg.norm(left, axis=-1, keepdims=True)
-        front = np.cross(left, up)
+        front = _cross(left, up)
         roll, pitch = -(left * change).sum(-1), (front * change).sum(-1)
         c, s = np.cos(yaw), np.sin(yaw)
         cosine, sine = c * along + s * across, s * along - c * across
         action[..., 3] = (cosine * roll - sine * pitch) / fastest
         action[..., 4] = (sine * roll + cosine * pitch) / fastest
         return np.clip(action, -1.0, 1.0)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a × b (..., 3), several times as fast as np.cross for few rows."""
+    a0, a1, a2, b0, b1, b2 = (each[..., i] for each in (a, b) for i in range(3))
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
