@@ -1,9 +1,9 @@
 """What learning a planner's weights gains: `python results/planner_weights.py [seeds=3] [frames=100000] [episodes=48]`.
 
-Four ways to weights of `control.action=planner_weights`, with as many environment steps each, in `track_weights_realistic`:
-those of `planner` as they are, the same for all; CMA-ES over 13 constants (`pip install cma`); a network by
-`train.algorithm=diffmpc`; and one by `mappo`. Each is flown on the paths below, on the same evaluation episodes. What is
-done is kept in results/planner_weights, and not done again; docs/data/planner_weights.csv is written of it.
+Four ways to weights of `control.action=planner_weights`, in `track_weights_realistic`: those of `planner` as they are;
+CMA-ES over 13 constants (`pip install cma`); a network by `train.algorithm=diffmpc`; and one by `mappo`, the last three
+with as many environment steps. Each is flown on the paths below, on the same evaluation episodes. What is done is kept
+in results/planner_weights, and not done again; docs/data/planner_weights.csv is written of it.
 """
 
 from __future__ import annotations
@@ -99,7 +99,9 @@ def find(config: Config, method: str, frames: int, seed: int) -> Callable[[Multi
     return load_policy(path if path.exists() else learn(config, method, frames, seed)).bind
 
 
-def fly(config: Config, name: str, make: Callable[[MultiliftVec], Policy], episodes: int) -> list[dict[str, np.ndarray]]:
+def fly(
+    config: Config, name: str, make: Callable[[MultiliftVec], Policy], episodes: int
+) -> list[dict[str, np.ndarray]]:
     """Return success and errors of episodes on each path, flown now unless they are kept."""
     flown = []
     for number, options in enumerate(PATHS.values()):
@@ -124,7 +126,9 @@ def main(arguments: list[str]) -> None:
         for method in values["methods"].split(","):
             make = find(config, method, frames, seed)
             teams.setdefault(method, []).append(fly(config, f"{method}_{seed}", make, episodes))
-            print(method, seed, [f"{100 * each['payload_rmse_m'].mean():.2f}" for each in teams[method][-1]], flush=True)
+            print(
+                method, seed, [f"{100 * each['payload_rmse_m'].mean():.2f}" for each in teams[method][-1]], flush=True
+            )
     lines = []
     for number, path in enumerate(PATHS):
         for method, flights in teams.items():

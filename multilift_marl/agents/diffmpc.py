@@ -1,9 +1,10 @@
 """Training through the planner: its weights follow the gradient of tracking errors, `train.algorithm=diffmpc`.
 
 A network says, by each drone's observation, what weighs how much in the team's plan (`control.action=planner_weights`).
-Flights of a few steps are differentiated by these weights (`planning/sensitivity.py`), along the states that the
+Flights of a few steps are differentiated by these weights (`diffmpc/sensitivity.py`), along the states that the
 simulation went through, with the Jacobians of the planner's model, the lag of the rotors, and the delay of actions that
-the simulation has drawn; observations count as given. The network follows that gradient by Adam. Auto-Multilift (Wang et al., arXiv 2406.04858) learns so, with a new Adam in every step: signs alone.
+the simulation has drawn; observations count as given. The network follows that gradient by Adam. Auto-Multilift (Wang
+et al., arXiv 2406.04858) learns so, with a new Adam in every step: by signs alone.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from tensordict import TensorDict
 
 from multilift_marl.agents.mappo import Learner
 from multilift_marl.agents.rollouts import Batches
+from multilift_marl.diffmpc.weighted_planner import FlightGradient, TeamWeights
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
-from multilift_marl.planning.weighted_planner import FlightGradient, TeamWeights
 from multilift_marl.policies.planner_weights import PlannerWeights
 from multilift_marl.schema.training import TrainConfig
 

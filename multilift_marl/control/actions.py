@@ -143,9 +143,9 @@ class AccRatesAction(Interface):
 class PlannerWeightsAction(AccRatesAction):
     """Weights of a model-predictive planner, which flies the team by `acc_rates`; zero: those of `planner`.
 
-    Each is that of `planner`, times `control.max_weight` to the power of the number: what a planner minimises are squared
-    deviations, each over its squared tolerance. Those of the payload, and the end, are the geometric mean of what the
-    drones say; those of a cable and a thrust are its drone's own.
+    Each is that of `planner`, times `control.max_weight` to the power of the number: a planner minimises squared
+    deviations, each over its squared tolerance. Those of the payload, and of the end, are the geometric mean of what
+    the drones say; those of a cable and a thrust are its drone's own.
     """
 
     numbers = tuple(

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from multilift_marl.control.actions import PLANNER_WEIGHTS, AccRatesAction
+from multilift_marl.diffmpc.sensitivity import Gradient
+from multilift_marl.diffmpc.weighted_planner import TeamWeights, WeightedHardPlanner, WeightedPlanner
 from multilift_marl.errors import ConfigError
-from multilift_marl.planning.sensitivity import Gradient
-from multilift_marl.planning.weighted_planner import TeamWeights, WeightedHardPlanner, WeightedPlanner
 from multilift_marl.policies.mpc import TeamMpc
 
 if TYPE_CHECKING:
@@ -72,10 +72,9 @@ class PlannerWeights:
         )
 
     def pull_back(self, gradient: Gradient, weights: TeamWeights) -> np.ndarray:
-        """Return derivatives (T, E, N, A) by actions of which `weigh` made weights (T, E, ...), from those by weights."""
+        """Return derivatives (T, E, N, A) by actions, from those by the weights (T, E, ...) that `weigh` made."""
         by_state, by_end, by_rate = (
-            given * weight
-            for given, weight in zip((gradient.state, gradient.end, gradient.rate), weights, strict=True)
+            given * weight for given, weight in zip((gradient.state, gradient.end, gradient.rate), weights, strict=True)
         )
         total = by_state @ self._by_drone.T + by_end @ (self._by_drone + self._by_end).T
         total += by_rate @ self._rate_by_drone.T

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
+from multilift_marl.diffmpc.weighted_planner import FlightGradient, TeamWeights
 from multilift_marl.errors import ConfigError
-from multilift_marl.planning.weighted_planner import FlightGradient, TeamWeights
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.planner_weights import weight_map
 
@@ -18,7 +18,9 @@ WEIGHTS = WIDE | {"control.action": "planner_weights"}
 @pytest.mark.parametrize("limits", ["soft", "hard"])
 def test_zero_actions_fly_as_mpc_bit_for_bit(limits):
     own = {"planner.limits": limits, "task_options.speed": 2.0, "task_options.acceleration": 4.0, "num_envs": 2}
-    ours, theirs = (ml.make_vec("track", seed=3, **keys, **own) for keys in (WEIGHTS, WIDE | {"control.action": "acc_rates"}))
+    ours, theirs = (
+        ml.make_vec("track", seed=3, **keys, **own) for keys in (WEIGHTS, WIDE | {"control.action": "acc_rates"})
+    )
     policy = make_scripted("mpc", theirs)
     observation, _ = theirs.reset(seed=3)
     ours.reset(seed=3)

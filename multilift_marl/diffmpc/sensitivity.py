@@ -1,15 +1,15 @@
-"""Derivatives of plans, and of flights by plans, by weights, targets and limits: exact adjoints of a planner's iteration.
+"""Derivatives of plans, and of flights by plans, by weights, targets and limits: adjoints of a planner's iteration.
 
 The iteration minimises a quadratic cost along linearised dynamics. By the implicit function theorem the derivative of
-v·u, u the first input, by a number θ of that cost is −p·∂²L/∂z∂θ, with p what the iteration would change all its states
-and inputs by, if v were the slope of the cost by −u: as slopes of later steps are zero, p follows the gains that the
-recursion has found, from −Q⁻¹ v on (Amos et al. 2018; Jin et al. 2020, "Pontryagin differentiable programming").
-Derivatives by the present state are the first gain. Limits that are exceeded count as in the iteration. What an iteration
-owes to its guess is left out: it vanishes as plans converge.
+v·u, u the first input, by a number θ of that cost is −p·∂²L/∂z∂θ, with p what the iteration would change all states
+and inputs z by, if −v were the slope of the cost by u: as slopes of later steps are zero, p follows the gains that the
+recursion has found, from Q⁻¹ v on (Amos et al., NeurIPS 2018; Jin et al., NeurIPS 2020). Derivatives by the present
+state are the first gain. Limits that are exceeded count as in the iteration. What an iteration owes to its guess is
+left out: it vanishes as plans converge.
 
 A flight moves by the reduced model; the adjoint of its states runs back through the model's Jacobians and the gains. A
-plan commands thrust vectors ahead of the present ones, F + lead u, which rotors approach by a share `response` in a policy
-step, perhaps some steps late: where none are, and response · lead is a policy step, u is the input of the model.
+plan commands thrust vectors ahead of the present ones, F + lead u, which rotors approach by a share `response` in a
+policy step, perhaps some steps late: where none are, and response · lead is a policy step, u is the model's input.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.planning.newton import find_step
-from multilift_marl.planning.riccati import IterationWork, Problem, advance, linearise, pull_back
+from multilift_marl.planning.riccati import Problem, advance, linearise, pull_back
 from multilift_marl.planning.team_model import solve_factorised, state_size
 
 ACTIVE = 1e-9  # multiplier from which a limit counts as active, in costs by tolerances

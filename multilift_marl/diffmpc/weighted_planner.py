@@ -6,13 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl.kernels.jit import kernel
-from multilift_marl.planning.augmented_lagrangian import CONVERGED
-from multilift_marl.planning.hard_limits import LimitedProblem
-from multilift_marl.planning.hard_planner import MOST_ITERATIONS, TOLERANCE, HardPlanner, solve_teams
-from multilift_marl.planning.newton import Multipliers, Trajectory
-from multilift_marl.planning.riccati import IterationWork, Objective, Problem
-from multilift_marl.planning.sensitivity import (
+from multilift_marl.diffmpc.sensitivity import (
     Gradient,
     Tape,
     pull_flight_back,
@@ -20,6 +14,12 @@ from multilift_marl.planning.sensitivity import (
     record_converged,
     record_thrusts,
 )
+from multilift_marl.kernels.jit import kernel
+from multilift_marl.planning.augmented_lagrangian import CONVERGED
+from multilift_marl.planning.hard_limits import LimitedProblem
+from multilift_marl.planning.hard_planner import MOST_ITERATIONS, TOLERANCE, HardPlanner, solve_teams
+from multilift_marl.planning.newton import Multipliers, Trajectory
+from multilift_marl.planning.riccati import IterationWork, Objective, Problem
 from multilift_marl.planning.soft_limits import Surroundings
 from multilift_marl.planning.team_planner import Plans, TeamPlanner, improve, prepare_team
 from multilift_marl.rig.system import System
@@ -157,7 +157,9 @@ class FlightGradient:
         gradient: Gradient of the T plans.
     """
 
-    def __init__(self, planner: WeightedPlanner, steps: int, dt: float, response: float = 1.0, lead: float | None = None):
+    def __init__(
+        self, planner: WeightedPlanner, steps: int, dt: float, response: float = 1.0, lead: float | None = None
+    ):
         num_envs, horizon = len(planner.plans.states), planner.settings.steps
         n = len(planner.model.anchors)
         self.tape = planner.tape = Tape.of(steps + 1, num_envs, horizon, n)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
+from multilift_marl.diffmpc.sensitivity import Gradient, Tape, pull_plan_back, record, record_thrusts
+from multilift_marl.diffmpc.weighted_planner import FlightGradient, WeightedHardPlanner, WeightedPlanner
 from multilift_marl.planning.expert import TeamExpert
 from multilift_marl.planning.riccati import IterationWork, Problem, find_gains, take_step
-from multilift_marl.planning.sensitivity import Gradient, Tape, pull_plan_back, record, record_thrusts
 from multilift_marl.planning.team_model import ModelWork, state_size, step_state
-from multilift_marl.planning.weighted_planner import FlightGradient, WeightedHardPlanner, WeightedPlanner
 
 STEPS, STEP, DT = 20, 0.05, 0.02
 
