@@ -4,7 +4,8 @@
 
 First, a team is 0.1 m from its target at rest. Stated are medians, and the least and the largest time [ms], of a
 Gauss-Newton iteration: the trajectory linearised, the Riccati recursion, and its step; of a whole plan with its flat
-states; and of one drone's share in plans of drones that plan for themselves, with `planner.sweeps`. Then plans within
+states; and of one drone's share in plans of drones that plan for themselves, with `planner.sweeps`; and of the plans of
+20 policy steps whose derivatives are wanted, and of these (`diffmpc/`). Then plans within
 hard limits, from the random states of `TeamExpert.random_states`: how many converge within 40 iterations; iterations
 and times, median and ninth decile; the same a policy step later, from states that are disturbed by 5 mm, 2 cm/s, 0.01
 and 0.05 1/s at most; and times of a quadratic program of the same size by PIQP, if it is installed
@@ -22,6 +23,7 @@ from planner_qp import time_piqp
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config, parse_overrides
+from multilift_marl.diffmpc.weighted_planner import FlightGradient, WeightedPlanner
 from multilift_marl.planning.distributed_planner import DistributedPlanner
 from multilift_marl.planning.expert import TeamExpert
 from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
@@ -81,6 +83,31 @@ def measure(config: Config, repeats: int) -> tuple[np.ndarray, ...]:
     )
 
 
+def differentiate(config: Config, repeats: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of 20 plans that leave what derivatives need, and of all their derivatives [ms]."""
+    n, steps, horizon = config.system.num_drones, 20, config.planner.steps
+    planner = WeightedPlanner(config.system, config.planner, 1)
+    rest = TeamExpert(config).rest_states(np.array([0.0, 0.0, 1.0]))
+    start = rest.copy()
+    start[:, 0] += 0.1
+    shape = (1, *planner.times.shape)
+    motion = np.tile([0.0, 0.0, 1.0], (*shape, 1)), np.tile(np.eye(3), (*shape, 1, 1))
+    offsets = np.zeros((1, horizon + 1, 12))
+    flight = FlightGradient(planner, steps, LATER)
+    for kept, mine in zip(flight.weights, planner.weights, strict=True):
+        kept[:] = mine
+
+    def fly() -> None:
+        for t in range(steps):
+            planner.slot = t
+            planner.plan(start, *motion, LATER, offsets)
+
+    fly()
+    flight.tape.states[:, steps] = start
+    slopes = np.ones((1, steps + 1, state_size(n)))
+    return timed(fly, repeats // 10), timed(lambda: flight.find(slopes), repeats // 10)
+
+
 def converge(config: Config, count: int) -> list[str]:
     """Return the cells of a row about plans within hard limits."""
     expert, home = TeamExpert(config), np.array([0.0, 0.0, 1.0])
@@ -123,10 +150,12 @@ def main(arguments: list[str]) -> None:
     values = parse_overrides(arguments, ["drones"])
     repeats, drones, starts = (values.pop(key, default) for key, default in DEFAULTS.items())
     configs = {n: load_config("hover", values | {"env.num_drones": int(n)}) for n in str(drones).split(",")}
-    print("| drones | iteration [ms] | plan [ms] | share of one drone [ms] |\n|---|---|---|---|")
+    titles = "drones", "iteration [ms]", "plan [ms]", "share of one drone [ms]", "20 plans [ms]", "derivatives [ms]"
+    print(f"| {' | '.join(titles)} |", f"|{'---|' * len(titles)}", sep="\n")
     for n, config in configs.items():
         cells = (
-            f"{np.median(times):.2f} ({times.min():.2f} - {times.max():.2f})" for times in measure(config, int(repeats))
+            f"{np.median(times):.2f} ({times.min():.2f} - {times.max():.2f})"
+            for times in (*measure(config, int(repeats)), *differentiate(config, int(repeats)))
         )
         print(f"| {n} | {' | '.join(cells)} |", flush=True)
     if not int(starts):

@@ -40,6 +40,7 @@ def train(way: str, seed: int, path: str) -> dict[str, str]:
     with tempfile.TemporaryDirectory() as folder:
         first = Trainer(load_config("track_auto6_weights", flown | {"train.learning_rate": 1e-12}), Path(folder))
         untrained = first.step()["loss"]
+        (Path(folder) / "checkpoints").mkdir()
         trainer = Trainer(config, Path(folder))
         losses = []
         while not trainer.finished:

@@ -1,4 +1,4 @@
-"""What learning a planner's weights gains: `python results/planner_weights.py [seeds=3] [frames=100000] [episodes=48]`.
+"""What learning a planner's weights gains: `python results/planner_weights.py [seeds=3] [frames=96000] [episodes=48]`.
 
 Four ways to weights of `control.action=planner_weights`, in `track_weights_realistic`: those of `planner` as they are;
 CMA-ES over 13 constants (`pip install cma`); a network by `train.algorithm=diffmpc`; and one by `mappo`, the last three
@@ -83,7 +83,7 @@ def learn(config: Config, method: str, frames: int, seed: int) -> Path:
     (folder / "checkpoints").mkdir(parents=True, exist_ok=True)
     Trainer(build_config(config.model_dump(), own), folder).run()
     path = HERE / f"{method}_{seed}.pt"
-    strip_checkpoint(folder / "checkpoints" / "last.pt", path)
+    strip_checkpoint(folder / "checkpoints" / "best.pt", path)
     return path
 
 
@@ -115,7 +115,7 @@ def fly(
 
 def main(arguments: list[str]) -> None:
     """Train, search, fly, and write the table."""
-    values = {"seeds": "3", "frames": "100000", "episodes": "48", "methods": ",".join(METHODS)}
+    values = {"seeds": "3", "frames": "96000", "episodes": "48", "methods": ",".join(METHODS)}
     values |= dict(argument.split("=", 1) for argument in arguments)
     seeds, frames, episodes = (int(values[key]) for key in ("seeds", "frames", "episodes"))
     config = load_config(CONFIG, {"env.num_threads": 1})

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -66,7 +67,7 @@ class Learner:
 
     config: TrainConfig
     actor: Actor
-    critic: CentralCritic | LocalCritic | NoCritic
+    critic: CentralCritic | LocalCritic
     policy: StochasticPolicy
     optimizer: torch.optim.Adam
 
@@ -99,7 +100,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
 
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
-    critic: CentralCritic | LocalCritic | NoCritic
+    critic: Any
     if config.algorithm == "diffmpc":
         critic = NoCritic()
     elif config.algorithm == "mappo":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from multilift_marl.control.action_interface import (
@@ -152,6 +154,7 @@ class PlannerWeightsAction(AccRatesAction):
         ActionComponent(f"{name}_weight", "-", "-", "max_weight", f"weight of {meaning}")
         for name, meaning in PLANNER_WEIGHTS.items()
     )
+    supports: ClassVar[tuple[str, ...]] = ()  # the planner rejects unknown forces
 
 
 class CtbrAction(Interface):

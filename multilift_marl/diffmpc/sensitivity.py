@@ -66,7 +66,8 @@ class Tape(NamedTuple):
             (*te, nu, nu), (*te, horizon + 1, size), (*te, horizon, nu), (*te, horizon, n), (*te, horizon + 1, n, 3),
             (num_envs, steps + 1, size), (num_envs, steps, nu), (num_envs, steps, 7),
         )  # fmt: skip
-        return cls(*(np.zeros(shape) for shape in shapes), np.zeros(te, np.int64), np.zeros(te, bool))
+        arrays = [np.zeros(shape) for shape in shapes]
+        return cls(*arrays, *(np.zeros(te, kind) for kind in (np.int64, bool)))
 
 
 class Gradient(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -74,7 +74,7 @@ class WeightedPlanner(TeamPlanner):
             tape.loads[:, self.slot] = loads
         return self.plans
 
-    def _plan(self, given: tuple, elapsed: float, recorded: tuple[int, Tape]) -> None:
+    def _plan(self, given: tuple[Any, ...], elapsed: float, recorded: tuple[int, Tape]) -> None:
         settings = elapsed, self.settings.step, self.settings.iterations or 1
         team = self._flat, self.objective, self.weights, self.around
         plan_weighted(given, settings, team, self.plans, self._work, recorded)
@@ -83,7 +83,7 @@ class WeightedPlanner(TeamPlanner):
 class WeightedHardPlanner(WeightedPlanner, HardPlanner):
     """The same within hard limits: plans converge, and derivatives are exact."""
 
-    def _plan(self, given: tuple, elapsed: float, recorded: tuple[int, Tape]) -> None:
+    def _plan(self, given: tuple[Any, ...], elapsed: float, recorded: tuple[int, Tape]) -> None:
         settings = elapsed, self.settings.step, self.settings.iterations or MOST_ITERATIONS, TOLERANCE
         team = self._flat, self.objective, self.weights, self.limits, self.around
         solve_weighted(given, settings, team, self.plans, self.hard, self._newton, recorded)

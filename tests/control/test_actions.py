@@ -21,6 +21,12 @@ CALM = {
 }  # fmt: skip
 
 
+def check_drones(action: str, num_drones: int) -> None:
+    """Skip what no planner can fly."""
+    if action == "planner_weights" and num_drones == 1:
+        pytest.skip("a body on one cable, which planners refuse")
+
+
 def flying(action: str, num_envs: int = 2, num_drones: int = 4, **overrides):
     """Return teams at rest in formation, with the action interface `action`."""
     vec = make(num_envs=num_envs, num_drones=num_drones, **CALM | {"control.action": action} | overrides)
@@ -45,6 +51,7 @@ def test_the_table_is_what_can_be_configured():
 
 @pytest.mark.parametrize("action", ACTIONS)
 def test_sizes_and_names_follow_the_interface(action, num_drones):
+    check_drones(action, num_drones)
     vec = flying(action, num_drones=num_drones)
     observation, _ = vec.current()
     assert vec.action_size == len(vec.action_names) == len(set(vec.action_names))
@@ -59,6 +66,7 @@ def test_sizes_and_names_follow_the_interface(action, num_drones):
 @pytest.mark.parametrize("action", ACTIONS)
 @pytest.mark.parametrize("num_drones", [1, 2, 4])
 def test_zero_keeps_a_team_at_rest_at_rest(action, num_drones):
+    check_drones(action, num_drones)
     vec = flying(action, num_drones=num_drones)
     start = vec.world.state.drone_position.copy()
     for _ in range(50):
@@ -71,6 +79,7 @@ def test_zero_keeps_a_team_at_rest_at_rest(action, num_drones):
 @pytest.mark.parametrize("action", ACTIONS)
 @pytest.mark.parametrize("num_drones", [1, 2, 4])
 def test_zero_keeps_a_team_up_for_a_second_whatever_is_hidden(action, num_drones):
+    check_drones(action, num_drones)
     vec = make(num_envs=16, num_drones=num_drones, **{"control.action": action})
     vec.reset(seed=0)
     start = vec.world.state.drone_position.copy()
