@@ -127,7 +127,7 @@ class AccRatesAction(Interface):
         *tilt_rate_components("angular velocity of the attitude that this asks for,"),
     )
     by_rates = True
-    supports = ("indi",)
+    supports: ClassVar[tuple[str, ...]] = ("indi",)
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""

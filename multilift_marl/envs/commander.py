@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import TYPE_CHECKING, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from multilift_marl.envs.core import MultiliftVec
 
 COMMANDERS = {"planner_weights": "multilift_marl.policies.planner_weights:PlannerWeights"}
 """What makes commands, by `control.action`, as an entry point: it reads environments, which know nothing of it."""
@@ -28,8 +25,8 @@ class Commander(Protocol):
         """Return live arrays of all that later commands depend on, environment first, by name."""
 
 
-def find_commander(action: str) -> Callable[[MultiliftVec], Commander]:
-    """Return what makes the commander of environments with this `control.action`."""
+def find_commander(action: str) -> Callable[[Any], Commander]:
+    """Return what makes the commander of environments (MultiliftVec) with this `control.action`."""
     module, _, name = COMMANDERS[action].partition(":")
-    found: Callable[[MultiliftVec], Commander] = getattr(import_module(module), name)
+    found: Callable[[Any], Commander] = getattr(import_module(module), name)
     return found
