@@ -83,7 +83,7 @@ def learn(config: Config, method: str, frames: int, seed: int) -> Path:
     (folder / "checkpoints").mkdir(parents=True, exist_ok=True)
     Trainer(build_config(config.model_dump(), own), folder).run()
     path = HERE / f"{method}_{seed}.pt"
-    strip_checkpoint(folder / "checkpoints" / "best.pt", path)
+    strip_checkpoint(folder / "checkpoints" / "last.pt", path)
     return path
 
 
@@ -137,6 +137,7 @@ def main(arguments: list[str]) -> None:
             line = {"path": path, "weights": method, "seeds": len(flights), "episodes": errors.shape[1]}
             line["success_percent"] = f"{100 * success.mean():.1f}"
             line["rmse_cm"] = f"{100 * errors.mean():.2f}"
+            line["median_rmse_cm"] = f"{100 * np.median(errors):.2f}"
             line["rmse_of_seeds_cm"] = " ".join(f"{100 * each.mean():.2f}" for each in errors)
             for other in ("hand", "cma"):
                 if other in teams and other != method:
