@@ -199,7 +199,7 @@ def commands_of(block):
                 yield part
 
 
-SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 eval.episodes=2"  # a training of one iteration
+SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 train.diffmpc.window=4 eval.episodes=2"  # one iteration
 SHORTER = {  # of each script: keys that go, and what is added
     "train.py": (re.findall(r"(\S+)=", SHORT), SHORT),
     "evaluate.py": (["episodes"], "episodes=1 env.episode_seconds=0.4"),
