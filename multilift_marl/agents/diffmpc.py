@@ -15,20 +15,25 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 
 from multilift_marl.agents.mappo import Learner
-from multilift_marl.agents.rollouts import Batches
-from multilift_marl.diffmpc.weighted_planner import FlightGradient, TeamWeights
+from multilift_marl.agents.rollouts import Batches, join_steps
+from multilift_marl.diffmpc.weighted_planner import FlightGradient, WeightedPlanner
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
+from multilift_marl.planning.team_weights import TeamWeights
 from multilift_marl.policies.planner_weights import PlannerWeights
 from multilift_marl.schema.training import TrainConfig
 
 
-def check_diffmpc(train: TrainConfig, action: str) -> None:
+def check_diffmpc(train: TrainConfig, action: str, distributed: bool) -> None:
     """Refuse, by a ConfigError, what cannot be trained through a planner."""
+    if distributed:
+        raise ConfigError(
+            "train.algorithm=diffmpc follows derivatives of the team's plan; set planner.distributed=false, and "
+            "true to fly what was learned"
+        )
     if action != "planner_weights":
         raise ConfigError(
             f"train.algorithm=diffmpc learns the weights of a planner; set control.action=planner_weights, not {action}"
@@ -67,14 +72,15 @@ class DiffMpcRollouts:
 
     def __init__(self, env: MultiliftEnv, learner: Learner, total: int):
         commander = env.vec.commander
-        assert isinstance(commander, PlannerWeights)
+        assert isinstance(commander, PlannerWeights) and isinstance(commander.planner, WeightedPlanner)
         self.env, self.values = env, dict[str, float]()
         self._learner, self._total, self._commander = learner, total, commander
         vec, train = env.vec, learner.config
         self._settings, self._horizon = train.diffmpc, train.horizon
         slowest = max(vehicle.rotor_time_constant for vehicle in vec.world.system.vehicles)
         response = 1.0 - exp(-vec.task.dt / slowest) if slowest else 1.0
-        self._flight = FlightGradient(commander.planner, self._settings.window, vec.task.dt, response)
+        self._planner = commander.planner
+        self._flight = FlightGradient(self._planner, self._settings.window, vec.task.dt, response)
         self._loss = loss_weights(train, vec)
         shape = self._settings.window + 1, vec.num_envs, vec.num_drones
         self._observed = np.zeros((*shape, vec.observation_size), np.float32)
@@ -106,11 +112,11 @@ class DiffMpcRollouts:
         self.values = {
             "loss": float(np.mean(losses)), "gradient": float(np.mean(norms)), "learning_seconds": seconds,
         }  # fmt: skip
-        return [_join(rows, vec)]
+        return [join_steps(rows, vec)]
 
     def _fly(self, observation: np.ndarray, slot: int, rows: list[dict[str, np.ndarray]]) -> None:
         """Make a step, and keep what its derivatives need in a slot of the window."""
-        vec, flight, planner = self.env.vec, self._flight, self._commander.planner
+        vec, flight, planner = self.env.vec, self._flight, self._planner
         with torch.no_grad():
             action = self._learner.actor(torch.from_numpy(observation))[0].clamp(-1, 1).numpy()
         self._observed[slot] = observation
@@ -185,12 +191,3 @@ class DiffMpcRollouts:
             vec.reset(seed=vec.config.seed)
             vec.stagger(self._total)
             self._started = True
-
-
-def _join(rows: list[dict[str, np.ndarray]], vec: MultiliftVec) -> TensorDict:
-    """Return steps as a batch [E, T], as of TorchRL's collector."""
-    joined = {name: torch.from_numpy(np.stack([row[name] for row in rows], axis=1)) for name in rows[0]}
-    size = [vec.num_envs, len(rows)]
-    info = TensorDict({name: joined[name] for name in ("reward_terms", "success", "failure", "diverged")}, size)
-    agents = TensorDict({"reward": joined["reward"]}, size)
-    return TensorDict({"next": TensorDict({"agents": agents, "done": joined["done"], "info": info}, size)}, size)

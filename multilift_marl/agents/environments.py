@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from multilift_marl.agents.dagger import DaggerRollouts, check_dagger
 from multilift_marl.agents.diffmpc import DiffMpcRollouts, check_diffmpc
 from multilift_marl.agents.mappo import Learner, StochasticPolicy, check_communication
 from multilift_marl.agents.rigs import check_rigs, divide_rigs
@@ -29,7 +30,9 @@ def training_environment(config: Config) -> Config:
     for env in (config.env, environment.env):
         check_communication(config.train, env)
     if config.train.algorithm == "diffmpc":
-        check_diffmpc(config.train, environment.control.action)
+        check_diffmpc(config.train, environment.control.action, environment.planner.distributed)
+    if config.train.algorithm == "dagger":
+        check_dagger(config.train)
     return environment
 
 
@@ -51,11 +54,13 @@ def make_envs(environment: Config, purpose: int = TRAINING) -> list[MultiliftEnv
 
 def make_rollouts(
     environment: Config, envs: list[MultiliftEnv], learner: Learner
-) -> Rollouts | RigRollouts | Workers | DiffMpcRollouts:
+) -> Rollouts | RigRollouts | Workers | DiffMpcRollouts | DaggerRollouts:
     """Return the rollouts of a learner's policy in what `make_envs` returned."""
     train, total = environment.train, environment.env.num_envs
     if train.algorithm == "diffmpc":
         return DiffMpcRollouts(envs[0], learner, total)
+    if train.algorithm == "dagger":
+        return DaggerRollouts(envs[0], learner, total)
     if train.workers:
         return Workers(environment, learner.actor, envs[0].vec.purpose)
     policies = [learner.policy, *(StochasticPolicy(learner.actor) for _ in envs[1:])]

@@ -24,7 +24,7 @@ from multilift_marl.tasks import find_task
 
 _KEY = "train.init"
 _MEANINGS = ("control.action", "env.units")
-_NETWORK = ("train.actor", "train.hidden", "train.gru", "train.asinh")
+_NETWORK = ("train.actor", "train.hidden", "train.gru", "train.asinh", "train.observe")
 
 
 class Initial(NamedTuple):

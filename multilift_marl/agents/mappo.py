@@ -15,7 +15,15 @@ from torch import nn
 from torch.distributions import Independent, Normal
 from torchrl.modules import PopArtValueNorm
 
-from multilift_marl.agents.networks import Actor, CentralCritic, LocalCritic, NoCritic, TeamNet, draw_action
+from multilift_marl.agents.networks import (
+    Actor,
+    CentralCritic,
+    LocalCritic,
+    NoCritic,
+    TeamNet,
+    build_actor,
+    draw_action,
+)
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
@@ -80,8 +88,7 @@ class Learner:
 def make_actor(config: TrainConfig, vec: MultiliftVec) -> Actor:
     """Return an untrained policy for `vec`, which acts as its base policy."""
     base = torch.from_numpy(base_matrix(config.residual, vec))
-    sizes = (vec.observation_size, vec.action_size)
-    return Actor(config.actor, *sizes, config.hidden, config.initial_std, base, config.gru, config.asinh)
+    return build_actor(config, base, vec.observation_names)
 
 
 def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
@@ -101,7 +108,7 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     # 2. The critic, in units of running statistics of the returns (Yu et al. 2022).
     value_norm = PopArtValueNorm(shape=1, beta=0.999)
     critic: Any
-    if config.algorithm == "diffmpc":
+    if config.algorithm in ("diffmpc", "dagger"):
         critic = NoCritic()
     elif config.algorithm == "mappo":
         numbers = vec.task.drone_numbers

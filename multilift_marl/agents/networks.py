@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
+from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.mdp.global_state import DroneNumbers
+from multilift_marl.schema.training import TrainConfig
 
 if TYPE_CHECKING:  # policies need torch only
     from torchrl.modules import ValueNorm
@@ -194,16 +196,20 @@ class Actor(nn.Module):
         base: matrix of the base policy (A, D).
         gru: H, size of the memory; 0 for a policy without.
         asinh: see `Normalizer`.
+        used: bool (D,), which numbers of an observation the network takes; the base policy takes all. None: all.
     """
 
     base: torch.Tensor
+    used: torch.Tensor | None
 
     def __init__(
         self, kind: str, observation_size: int, action_size: int, hidden: Sequence[int], initial_std: float,
-        base: torch.Tensor, gru: int = 0, asinh: float = 0.0,
+        base: torch.Tensor, gru: int = 0, asinh: float = 0.0, used: torch.Tensor | None = None,
     ):  # fmt: skip
         super().__init__()
         self.normalizer = Normalizer(observation_size, asinh)
+        factors = None if used is None else used.float().repeat_interleave(self.normalizer.copies)
+        self.register_buffer("used", factors, persistent=False)
         inputs = self.normalizer.outputs
         # gain=0: the last layer starts at zero, and with it the network's part of the action.
         self.team = TeamNet(kind, inputs + gru, hidden, action_size, gain=0.0)
@@ -220,7 +226,7 @@ class Actor(nn.Module):
             observation: (..., N, D).
             memory: (..., N, H) that has taken in this observation, of a policy with a GRU.
         """
-        rows = self.normalizer(observation)
+        rows = self._take(observation)
         inputs = rows if memory is None else torch.cat([rows, memory], -1)
         # The script reads the raw observation: its gains are in units, not in standard deviations.
         mean = self.team(inputs) + observation @ self.base.T
@@ -229,12 +235,41 @@ class Actor(nn.Module):
     def remember(self, observation: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:
         """Return the memory (..., N, H) that has taken in one more observation (..., N, D)."""
         assert self.memory is not None
-        return self.memory.remember(self.normalizer(observation), memory)
+        return self.memory.remember(self._take(observation), memory)
 
     def unroll(self, observation: torch.Tensor, memory: torch.Tensor, started: torch.Tensor) -> torch.Tensor:
         """Return the memories (B, L, N, H) of sequences of observations (B, L, N, D); see `Memory.unroll`."""
         assert self.memory is not None
-        return self.memory.unroll(self.normalizer(observation), memory, started)
+        return self.memory.unroll(self._take(observation), memory, started)
+
+    def _take(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return what the network takes of observations (..., N, D)."""
+        rows: torch.Tensor = self.normalizer(observation)
+        return rows if self.used is None else rows * self.used
+
+
+def build_actor(train: TrainConfig, base: torch.Tensor, names: Sequence[str]) -> Actor:
+    """Return an untrained policy.
+
+    Args:
+        train: its network.
+        base: matrix of the base policy (A, D).
+        names: of the numbers of an observation (D,).
+
+    Raises:
+        ConfigError: `train.observe` names a component that there is not.
+    """
+    used = None
+    if train.observe is not None:
+        parts = [name.partition("@")[0].rpartition("_")[0] for name in names]
+        for name in train.observe:
+            if name not in parts:
+                raise ConfigError(f"train.observe names no component '{name}'{nearest(name, dict.fromkeys(parts))}")
+        used = torch.tensor([part in train.observe for part in parts])
+    action_size, size = base.shape
+    return Actor(
+        train.actor, size, action_size, train.hidden, train.initial_std, base, train.gru, train.asinh, used
+    )  # fmt: skip
 
 
 @torch.no_grad()

@@ -172,7 +172,7 @@ class LearnedPolicy(TrainedPolicy):
         import torch
 
         from multilift_marl.agents.checkpoint import check_like
-        from multilift_marl.agents.networks import Actor
+        from multilift_marl.agents.networks import build_actor
 
         check_policy(content, source)
         # Before the configuration is built, which imports the modules that it names.
@@ -180,11 +180,9 @@ class LearnedPolicy(TrainedPolicy):
         config = build_config(content["config"])
         super().__init__(config, content["observation_names"], content["action_names"], source)
         self.frames: int = content["frames"]
-        size = (len(self.observation_names), len(self.action_names))
-        train = config.train
+        size = (len(self.action_names), len(self.observation_names))
         with torch.random.fork_rng(devices=[]):  # initial weights, overwritten at once, must not cost random numbers
-            base = torch.zeros(size[1], size[0])
-            self.actor = Actor(train.actor, *size, train.hidden, train.initial_std, base, train.gru, train.asinh)
+            self.actor = build_actor(config.train, torch.zeros(size), self.observation_names)
         try:
             check_like(content["actor"], self.actor.state_dict(), "actor")
         except ValueError as error:

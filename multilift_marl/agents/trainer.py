@@ -25,6 +25,7 @@ from multilift_marl.agents.checkpoint import (
     unlock_run,
 )
 from multilift_marl.agents.curriculum import Curriculum
+from multilift_marl.agents.dagger import DaggerRollouts
 from multilift_marl.agents.diffmpc import DiffMpcRollouts
 from multilift_marl.agents.environments import make_envs, make_rollouts
 from multilift_marl.agents.episodes import EpisodeStatistics
@@ -238,11 +239,11 @@ class Trainer:
         critic["lr"] = train.critic_learning_rate * left if train.critic_learning_rate else actor["lr"]
         rate = actor["lr"]
         # The critic learns alone at first: by its untrained values a good actor would only get worse.
-        if self.iteration < train.warmup and train.algorithm != "diffmpc":
+        if self.iteration < train.warmup and train.algorithm in ("mappo", "ippo"):
             actor["lr"] = 0.0
         batches = self.rollouts.collect(self.iteration)
         sampling = time.perf_counter() - start
-        if isinstance(self.rollouts, DiffMpcRollouts):  # it has learned on the way
+        if isinstance(self.rollouts, DiffMpcRollouts | DaggerRollouts):  # it has learned on the way
             values = dict(self.rollouts.values)
             sampling -= values["learning_seconds"]
         else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,28 +19,13 @@ from multilift_marl.planning.augmented_lagrangian import CONVERGED
 from multilift_marl.planning.hard_limits import LimitedProblem
 from multilift_marl.planning.hard_planner import MOST_ITERATIONS, TOLERANCE, HardPlanner, solve_teams
 from multilift_marl.planning.newton import Multipliers, Trajectory
-from multilift_marl.planning.riccati import IterationWork, Objective, Problem
+from multilift_marl.planning.riccati import IterationWork, Problem
 from multilift_marl.planning.soft_limits import Surroundings
 from multilift_marl.planning.team_planner import Plans, TeamPlanner, improve, prepare_team
+from multilift_marl.planning.team_weights import TeamWeights, weigh
 from multilift_marl.rig.system import System
 from multilift_marl.schema.planner import PlannerConfig
 from multilift_marl.sim.obstacles import Obstacles
-
-
-class TeamWeights(NamedTuple):
-    """Weights of E teams, see `riccati.Objective`."""
-
-    state: np.ndarray
-    """(E, 12 + 7 N)."""
-    end: np.ndarray
-    """(E, 12 + 7 N)."""
-    rate: np.ndarray
-    """(E, 3 N)."""
-
-    @classmethod
-    def of(cls, objective: Objective, num_envs: int) -> TeamWeights:
-        """Return those of an objective, for each team."""
-        return cls(*(np.tile(each, (num_envs, 1)) for each in (objective.state, objective.end, objective.rate)))
 
 
 class WeightedPlanner(TeamPlanner):
@@ -87,15 +72,6 @@ class WeightedHardPlanner(WeightedPlanner, HardPlanner):
         settings = elapsed, self.settings.step, self.settings.iterations or MOST_ITERATIONS, TOLERANCE
         team = self._flat, self.objective, self.weights, self.limits, self.around
         solve_weighted(given, settings, team, self.plans, self.hard, self._newton, recorded)
-
-
-@kernel
-def weigh(e, weights, objective):
-    """Return an objective with the weights of team e."""
-    return Objective(
-        weights.state[e], weights.end[e], weights.rate[e], objective.tension, objective.thrust, objective.separation,
-        objective.weights,
-    )  # fmt: skip
 
 
 @kernel

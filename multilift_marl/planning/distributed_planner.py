@@ -33,6 +33,7 @@ from multilift_marl.planning.team_planner import (
     prepare_team,
     take_targets,
 )
+from multilift_marl.planning.team_weights import TeamWeights, weigh
 from multilift_marl.rig.system import System
 from multilift_marl.schema.planner import PlannerConfig
 from multilift_marl.sensing.communication import Links
@@ -88,6 +89,9 @@ class DistributedPlanner(TeamPlanner):
     Args:
         system, settings, num_envs, obstacles: see `TeamPlanner`.
         links: who hears whom; without delay after each sweep, else once in a policy step.
+
+    Attributes:
+        weights: (E N, ...) TeamWeights, live; of each plan those of the payload and of the drone that has it count.
     """
 
     def __init__(
@@ -101,6 +105,7 @@ class DistributedPlanner(TeamPlanner):
             np.zeros(num_envs, np.uint64), np.zeros(num_envs, np.int64), np.zeros(shape), np.zeros((*shape[:3], 7)),
             np.zeros((num_envs, n, n, 7)), np.zeros((num_envs, n, n), bool),
         )  # fmt: skip
+        self.weights = TeamWeights.of(self.objective, n * num_envs)
         self._apart = ApartWork.of(steps, n)
 
     @property
@@ -117,7 +122,7 @@ class DistributedPlanner(TeamPlanner):
         loads = self._agree(self._unloaded if loads is None else loads)
         given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
         settings = elapsed, self.settings.step, self.sweeps
-        team = self._flat, self.objective, self.around
+        team = self._flat, self.objective, self.weights, self.around
         plan_apart(given, settings, team, (self.links, self.post), self.plans, self._work, self._apart)
         return self.plans
 
@@ -239,14 +244,15 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
     """See `DistributedPlanner.plan`.
 
     Args:
-        given, settings, team: see `plan_teams`, with the number of sweeps in place of iterations.
+        given, settings, team: see `plan_teams`, with the number of sweeps in place of iterations, and TeamWeights
+            after the objective.
         radio: Links, Post.
         plans: Plans, overwritten.
         work: PlannerWork.
         apart: ApartWork.
     """
     elapsed, h, sweeps = settings
-    flat, objective, around = team
+    flat, objective, weights, around = team
     links, post = radio
     count = flat.model.anchors.shape[0]
     q, later = 6 + 2 * count, links.delay * elapsed / h
@@ -273,7 +279,8 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
                 set_start(n, given[0][t], states, begins)
                 follow_load(states, inputs, h, flat.model, given[1][t], apart.team, work.before[0])
                 loads = given[1][t : t + 1]
-                problem = Problem(apart.all_targets[n], apart.all_asked[n], h, flat.model, loads, objective, here)
+                own = weigh(t, weights, objective)
+                problem = Problem(apart.all_targets[n], apart.all_asked[n], h, flat.model, loads, own, here)
                 improve_own(n, states[0], states, inputs, problem, apart)
                 move_own(n, states, inputs, 1.0 / count, MOMENTUM * (sweep > 0), apart)
                 for k in range(states.shape[0]):

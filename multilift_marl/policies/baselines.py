@@ -30,6 +30,7 @@ from multilift_marl.policies.mpc_distributed import DistributedMpc, DistributedR
 from multilift_marl.policies.payload_geometric import PayloadGeometric
 from multilift_marl.policies.policy import OwnPolicy, Policy
 from multilift_marl.policies.route_baselines import NarrowRouteMpc, PayloadRouteMpc, PotentialRouteMpc
+from multilift_marl.policies.route_formation import RouteFormation
 from multilift_marl.policies.route_mpc import RouteMpc
 from multilift_marl.policies.tuned import tuned_policy
 from multilift_marl.schema.training import TUNED
@@ -54,12 +55,14 @@ LINEAR: dict[str, type[Formation]] = {
     "hold_rotor": HoldRotor,
 }
 """Baselines that are linear maps of the observation."""
-SCRIPTED: dict[str, type[Formation] | type[PayloadGeometric] | type[TeamMpc]] = {
+Script = type[Formation] | type[PayloadGeometric] | type[TeamMpc] | type[RouteFormation]
+SCRIPTED: dict[str, Script] = {
     **LINEAR,
     "mpc": TeamMpc,
     "mpc_distributed": DistributedMpc,
     "mpc_route": RouteMpc,
     "mpc_route_distributed": DistributedRouteMpc,
+    "formation_route": RouteFormation,
     "mpc_payload": PayloadRouteMpc,
     "mpc_narrow": NarrowRouteMpc,
     "mpc_potential": PotentialRouteMpc,
@@ -74,7 +77,7 @@ _OTHERWISE = {
 """What else cures a baseline of another interface, by the key that names it."""
 
 
-def _by_name(name: str) -> type[Formation] | type[PayloadGeometric] | type[TeamMpc]:
+def _by_name(name: str) -> Script:
     """Return the class of a baseline or of tuned gains; of a name that both have, the baseline."""
     return SCRIPTED[name] if name in SCRIPTED else tuned_policy(name)
 

@@ -69,6 +69,7 @@ class TeamMpc:
 
     INTERFACE: ClassVar[str] = "acc_rates"
     INTERFACES: ClassVar[tuple[str, ...]] = ("acc_rates", "full_state")
+    _vec: MultiliftVec
 
     def __init__(self, vec: MultiliftVec, preview: Preview | None = None):
         system, config, n = vec.world.system, vec.config, vec.num_drones

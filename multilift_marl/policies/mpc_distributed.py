@@ -51,6 +51,11 @@ class DistributedMpc(TeamMpc):
         """See `TeamMpc.reset`."""
         super().reset(None if mask is None else np.repeat(mask, self._vec.num_drones))
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """See `TeamMpc.arrays`; plans and messages of teams, drones of one after another."""
+        post = self.planner.post._asdict()
+        return super().arrays() | {f"Post.{name}": array for name, array in post.items()}
+
     def metrics(self) -> dict[str, np.ndarray]:
         """See `TeamMpc.metrics`: means over the drones."""
         found = super().metrics()

@@ -1,7 +1,8 @@
 """What flies teams by `control.action=planner_weights`: a planner whose weights are the drones' actions.
 
 Each drone says what weighs how much in the plan of the team (`control.actions.PLANNER_WEIGHTS`); the plan is that of
-`policy=mpc`, whose commands are those of `acc_rates`.
+`policy=mpc`, whose commands are those of `acc_rates`. With `planner.distributed` plans are those of `mpc_distributed`:
+each drone weighs its own.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ import numpy as np
 
 from multilift_marl.control.actions import PLANNER_WEIGHTS, AccRatesAction
 from multilift_marl.diffmpc.sensitivity import Gradient
-from multilift_marl.diffmpc.weighted_planner import TeamWeights, WeightedHardPlanner, WeightedPlanner
+from multilift_marl.diffmpc.weighted_planner import WeightedHardPlanner, WeightedPlanner
 from multilift_marl.errors import ConfigError
+from multilift_marl.planning.distributed_planner import DistributedPlanner
+from multilift_marl.planning.team_weights import TeamWeights
 from multilift_marl.policies.mpc import TeamMpc
+from multilift_marl.policies.mpc_distributed import DistributedMpc
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -40,19 +44,24 @@ class PlannerWeights:
     """
 
     def __init__(self, vec: MultiliftVec):
-        self._vec, self.mpc = vec, _WeightedMpc(vec)
+        if vec.config.planner.feedback < 1.0:
+            raise ConfigError("control.action=planner_weights commands acc_rates; set planner.feedback=1")
+        self._apart = vec.config.planner.distributed
+        self._vec, self.mpc = vec, _DistributedWeightedMpc(vec) if self._apart else _WeightedMpc(vec)
         n = vec.num_drones
         self._scale = log(vec.config.control.max_weight)
         self._by_drone, self._rate_by_drone, self._by_end = weight_map(n)
 
     @property
-    def planner(self) -> WeightedPlanner:
+    def planner(self) -> WeightedPlanner | DistributedPlanner:
         """That which plans."""
         return self.mpc.planner
 
     def command(self, action: np.ndarray) -> np.ndarray:
         """See `Commander.command`."""
-        for mine, weights in zip(self.planner.weights, self.weigh(action), strict=True):
+        # Of drones that plan for themselves each takes what it says for what all say.
+        said = np.repeat(action.reshape(-1, 1, action.shape[-1]), action.shape[1], axis=1) if self._apart else action
+        for mine, weights in zip(self.planner.weights, self.weigh(said), strict=True):
             mine[:] = weights
         return self.mpc.act(self._vec.task.observation)
 
@@ -108,18 +117,22 @@ def weight_map(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return state.reshape(-1, size), rate.reshape(-1, 3 * n), end.reshape(-1, size)
 
 
-class _WeightedMpc(TeamMpc):
-    """See `TeamMpc`; it acts by `acc_rates`, whatever the environment's actions are."""
+class _ByRates:
+    """What acts by `acc_rates`, whatever the environment's actions are."""
 
-    planner: WeightedPlanner
-
-    def __init__(self, vec: MultiliftVec):
-        if vec.config.planner.feedback < 1.0:
-            raise ConfigError("control.action=planner_weights commands acc_rates; set planner.feedback=1")
-        super().__init__(vec)
+    _vec: MultiliftVec
 
     def _interface(self, vec: MultiliftVec) -> str:
         return "acc_rates"
+
+    def _make_fallback(self) -> Policy:
+        return _Nothing(self._vec.num_drones)
+
+
+class _WeightedMpc(_ByRates, TeamMpc):
+    """See `TeamMpc`."""
+
+    planner: WeightedPlanner
 
     def _make_planner(self) -> WeightedPlanner:
         vec, settings = self._vec, self._vec.config.planner
@@ -127,8 +140,9 @@ class _WeightedMpc(TeamMpc):
             return WeightedHardPlanner(vec.world.system, settings, vec.num_envs)
         return WeightedPlanner(vec.world.system, settings, vec.num_envs, vec.world.obstacles)
 
-    def _make_fallback(self) -> Policy:
-        return _Nothing(self._vec.num_drones)
+
+class _DistributedWeightedMpc(_ByRates, DistributedMpc):
+    """See `DistributedMpc`."""
 
 
 class _Nothing:

@@ -23,6 +23,9 @@ class PlannerConfig(Section):
     sweeps: Int = Field(
         3, ge=1, le=100, description="in each policy step in which the drones of mpc_distributed improve their plans"
     )
+    distributed: bool = Field(
+        False, description="whether with control.action=planner_weights each drone plans for itself, as mpc_distributed"
+    )
     position: Annotated[Float, Between(1e-4, 100, "m")] = Field(0.02, description="[m] tolerance of the payload")
     attitude: Annotated[Float, Between(0.01, 1000, "deg")] = Field(5.0, description="[deg] of the payload")
     cable: Annotated[Float, Between(0.01, 1000, "deg")] = Field(8.6, description="[deg] of each cable's direction")

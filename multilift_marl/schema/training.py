@@ -92,18 +92,33 @@ class DiffMpcConfig(Section):
     )
 
 
-class TrainConfig(Section):
-    """PPO for a team with shared parameters, or the gradient of a planner."""
+class DaggerConfig(Section):
+    """Imitation of a teacher on the states that the learner comes to, `train.algorithm=dagger`."""
 
-    algorithm: Literal["mappo", "ippo", "diffmpc"] = Field(
-        "mappo", description="mappo: central critic; ippo: local critic; diffmpc: gradient through the planner"
+    teacher: str = Field("formation_route", description="scripted policy whose commands are learned")
+    truth: bool = Field(True, description="whether it knows the true states of team and payload")
+    capacity: Int = Field(500_000, ge=1, description="environment steps that are kept, the latest")
+    handover: Int = Field(200_000, ge=0, description="environment steps within which the learner takes over from it")
+    teacher_share: Float = Field(0.1, ge=0, le=1, description="[-] of episodes that it flies itself, at least")
+
+
+class TrainConfig(Section):
+    """PPO for a team with shared parameters, the gradient of a planner, or imitation of one."""
+
+    algorithm: Literal["mappo", "ippo", "diffmpc", "dagger"] = Field(
+        "mappo",
+        description="mappo: central critic; ippo: local critic; diffmpc: gradient through a planner; dagger: imitation",
     )
     diffmpc: DiffMpcConfig = DiffMpcConfig()
+    dagger: DaggerConfig = DaggerConfig()
     actor: Literal["local", "set", "attention"] = Field(
         "local", description="local: own observation; set, attention: what the other drones' networks hold, too"
     )
     gru: Int = Field(
         0, ge=0, le=8192, description="units of each drone's memory of earlier observations, a GRU; 0: no memory"
+    )
+    observe: tuple[str, ...] | None = Field(
+        None, min_length=1, description="components of the observation that the network takes, by name; None: all"
     )
     sequence: Int = Field(
         32, ge=1, le=100_000, description="steps that gradients of a GRU go back: train.horizon, or a part of it"

@@ -4,8 +4,10 @@ import pytest
 import torch
 from torchrl.modules import PopArtValueNorm
 
-from multilift_marl.agents.networks import Actor, CentralCritic, Tanh, draw_action
+from multilift_marl.agents.networks import Actor, CentralCritic, Tanh, build_actor, draw_action
+from multilift_marl.errors import ConfigError
 from multilift_marl.mdp.global_state import DroneNumbers
+from multilift_marl.schema.training import TrainConfig
 
 KINDS = ("local", "set", "attention")
 SHARED, SIZE, REST = 5, 7, 3
@@ -91,3 +93,34 @@ def test_the_fast_tanh_is_tanh_and_its_gradient_too():
     with torch.no_grad():
         assert torch.equal(tanh(wide), tanh(wide.detach()))
     assert torch.equal(tanh(wide).detach(), tanh(wide.detach()))
+
+
+@pytest.mark.parametrize("gru", [0, 8])
+@pytest.mark.parametrize("asinh", [0.0, 20.0])
+def test_networks_take_the_components_that_are_named_alone(gru, asinh):
+    """Neither action nor memory changes with another number, whereas the base policy takes all."""
+    torch.manual_seed(0)
+    names = ["slot_error_0", "slot_error_1", "velocity_0", "slot_error_0@-1"]
+    train = TrainConfig(hidden=(16,), gru=gru, asinh=asinh, observe=("slot_error",))
+    actor = build_actor(train, torch.zeros(2, 4), names)
+    actor.normalizer.update(torch.randn(100, 4))
+    with torch.no_grad():
+        torch.nn.init.orthogonal_(actor.team.net[-1].weight)
+
+    def act(observation):
+        memory = actor.remember(observation, torch.zeros(1, gru)) if gru else None
+        return actor(observation, memory)[0]
+
+    first = torch.randn(1, 4)
+    for number, counts in enumerate((True, True, False, True)):
+        other = first.clone()
+        other[0, number] += 0.5
+        assert bool((act(other) != act(first)).any()) == counts, names[number]
+    actor.base[0, 2] = 1.0
+    other = first + torch.tensor([0.0, 0.0, 0.5, 0.0])
+    torch.testing.assert_close(act(other)[0, 0] - act(first)[0, 0], torch.tensor(0.5))
+
+
+def test_a_component_that_is_not_observed_is_refused_by_name():
+    with pytest.raises(ConfigError, match="no component 'slot_eror'; did you mean 'slot_error'"):
+        build_actor(TrainConfig(observe=("slot_eror",)), torch.zeros(1, 1), ["slot_error_0"])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
-from multilift_marl.diffmpc.weighted_planner import FlightGradient, TeamWeights
+from multilift_marl.diffmpc.weighted_planner import FlightGradient
 from multilift_marl.errors import ConfigError
+from multilift_marl.planning.team_weights import TeamWeights
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.planner_weights import weight_map
 
@@ -15,13 +16,19 @@ WIDE = {"control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0, "env.nu
 WEIGHTS = WIDE | {"control.action": "planner_weights"}
 
 
-@pytest.mark.parametrize("limits", ["soft", "hard"])
-def test_zero_actions_fly_as_mpc_bit_for_bit(limits):
-    own = {"planner.limits": limits, "task_options.speed": 2.0, "task_options.acceleration": 4.0, "num_envs": 2}
+@pytest.mark.parametrize("name, limits", [("mpc", "soft"), ("mpc", "hard"), ("mpc_distributed", "soft")])
+def test_zero_actions_fly_as_the_planner_bit_for_bit(name, limits):
+    own = {
+        "planner.limits": limits,
+        "planner.distributed": name == "mpc_distributed",
+        "task_options.speed": 2.0,
+        "task_options.acceleration": 4.0,
+        "num_envs": 2,
+    }
     ours, theirs = (
         ml.make_vec("track", seed=3, **keys, **own) for keys in (WEIGHTS, WIDE | {"control.action": "acc_rates"})
     )
-    policy = make_scripted("mpc", theirs)
+    policy = make_scripted(name, theirs)
     observation, _ = theirs.reset(seed=3)
     ours.reset(seed=3)
     for _ in range(15):
@@ -31,8 +38,12 @@ def test_zero_actions_fly_as_mpc_bit_for_bit(limits):
     assert (ours.world.state.drone_rotation == theirs.world.state.drone_rotation).all()
 
 
-def test_a_saved_flight_goes_on_bit_for_bit():
+@pytest.mark.parametrize(
+    "apart", [{}, {"planner.distributed": True, "env.communication": "neighbours", "env.sensing": "onboard"}]
+)
+def test_a_saved_flight_goes_on_bit_for_bit(apart):
     keys = WEIGHTS | {"randomization.payload_mass": 0.2, "randomization.action_delay": [0, 2], "env.sensing": "mocap"}
+    keys |= apart
     first, second = (ml.make_vec("track", num_envs=2, **keys) for _ in range(2))
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2, 3, first.action_size))
     first.reset(seed=1)
@@ -52,6 +63,27 @@ def test_an_environment_is_the_same_in_any_batch():
     for _ in range(10):
         one, many = alone.step(action[2:3])[0], batch.step(action)[0]
     assert (one[0] == many[2]).all()
+
+
+def test_drones_that_plan_for_themselves_weigh_as_they_say():
+    """Also the payload: two drones' weights, said by one of them, do not count for the other."""
+    vec = ml.make_vec("track", num_envs=1, **WEIGHTS, **{"planner.distributed": True})
+    commander, planner = vec.commander, vec.commander.planner
+    vec.reset(seed=0)
+    action = np.zeros((1, 3, vec.action_size))
+    position, cable = (vec.action_names.index(f"{name}_weight") for name in ("position", "cable"))
+    action[0, 1, [position, cable]] = 1.0
+    commander.command(action)
+    most, rest = vec.config.control.max_weight, planner.objective.state
+    assert (planner.weights.state[[0, 2]] == rest).all()
+    assert planner.weights.state[1, :2] == pytest.approx(most * rest[:2], rel=1e-12)
+    assert planner.weights.state[1, 8:10] == pytest.approx(most * rest[8:10], rel=1e-12)
+    assert planner.weights.state[1, 2] == rest[2]
+    plans = planner.plans.inputs.copy()
+    vec.reset(seed=0)
+    commander.command(np.zeros_like(action))
+    moved = np.abs(plans - planner.plans.inputs).reshape(3, -1, 3, 3).max(axis=(1, 3))
+    assert moved[1, 1] > 1e-3  # its own part of its own plan
 
 
 def test_weights_are_the_drones_own_and_means_of_what_they_say():

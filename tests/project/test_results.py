@@ -231,7 +231,8 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "scene.reserved",
         "env.obstacle_sensing",
         "control.max_weight",
-        *(key for key in later if key.startswith("train.diffmpc.")),
+        "train.observe",
+        *(key for key in later if key.startswith(("train.diffmpc.", "train.dagger."))),
         *(key for key in later if key.startswith("env.obstacles.")),
     }
     stored["train.residual"] = check_base_policy(stored["train.residual"])  # tuned gains had no names once

@@ -1,0 +1,121 @@
+"""Imitation of a teacher that knows more: it learns, goes on where it stopped, and says what it cannot do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import multilift_marl as ml
+from multilift_marl.agents.dagger import DaggerRollouts
+from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.trainer import Trainer, new_run, resume_run
+from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.truth import with_truth
+
+SMALL = {
+    "env.num_drones": 3, "env.num_envs": 4, "env.num_threads": 1, "env.episode_seconds": 3.0,
+    "train.algorithm": "dagger",
+    "train.dagger.teacher": "payload_geometric", "train.hidden": [32], "train.horizon": 25, "train.minibatches": 4,
+    "train.learning_rate": 3e-3, "train.frames": 4000, "train.dagger.handover": 1000, "train.overrides": {},
+    "eval.episodes": 4, "eval.every": 1000,
+}  # fmt: skip
+
+
+def config(**keys):
+    return ml.load_config("hover", SMALL | keys)
+
+
+def error_of(config, make):
+    return np.mean(run_episodes(config, make, 8, 7)["payload_position_error_m"])
+
+
+def policy_of(trainer):
+    return LearnedPolicy(trainer._content(), "the trained one")
+
+
+def test_a_team_learns_to_fly_as_its_teacher_does():
+    """From where it begins, beside the same training at a learning rate that moves nothing."""
+    errors = []
+    for rate in (1e-12, 3e-3):
+        trainer = Trainer(config(**{"train.learning_rate": rate}), Path("unused"))
+        losses = [trainer.step()["loss"] for _ in range(trainer.iterations)]
+        errors.append((losses[-1], error_of(trainer.config, policy_of(trainer).bind)))
+    (still, untrained), (learned, error) = errors
+    taught = error_of(trainer.config, lambda vec: make_scripted("payload_geometric", vec))
+    assert learned < 0.15 * still
+    assert abs(error - taught) < 0.15 * abs(untrained - taught)
+
+
+def test_the_teacher_flies_first_and_the_learner_later():
+    trainer = Trainer(config(**{"train.dagger.teacher_share": 0.0}), Path("unused"))
+    shares = [trainer.step()["teacher_share"] for _ in range(12)]
+    assert shares[0] == 1.0 and shares[5] == pytest.approx(0.5) and shares[-1] == 0.0
+
+
+def test_steps_are_kept_as_they_were_flown_and_the_oldest_make_room():
+    """Of a step that only resets nothing is kept."""
+    small = {"train.dagger.capacity": 150, "train.dagger.teacher_share": 1.0, "env.episode_seconds": 0.5}
+    trainer = Trainer(config(**small), Path("unused"))
+    rollouts = trainer.rollouts
+    assert isinstance(rollouts, DaggerRollouts)
+    trainer.step()
+    # 25 steps of 4 environments whose staggered episodes of 25 steps have begun anew, but for the last step's
+    assert rollouts.count == 97
+    first = rollouts.observed[90].clone()
+    trainer.step()
+    assert rollouts.count == 193
+    assert len(rollouts.observed) == 150
+    assert torch.equal(rollouts.observed[90], first)
+    assert not torch.equal(rollouts.observed[193 - 150 - 1], torch.zeros_like(first))
+
+
+def test_a_resumed_training_goes_on_with_its_networks(tmp_path):
+    trainer = new_run(config(), "first", tmp_path)
+    losses = [trainer.step()["loss"] for _ in range(12)]
+    trainer.evaluate()
+    trainer.save("last")
+    again = resume_run(trainer.folder, {})
+    assert again.iteration == 12
+    for name, expected in trainer.learner.actor.state_dict().items():
+        assert torch.equal(again.learner.actor.state_dict()[name], expected), name
+    assert again.step()["loss"] < 0.5 * losses[0]
+
+
+def test_a_teacher_with_the_truth_flies_as_if_nothing_disturbed_its_senses():
+    """Bit for bit: noise, sensors and what they cost are drawn apart from what moves the team."""
+    keys = {
+        "control.action": "acc_rates",
+        "control.max_acceleration": 25.0,
+        "control.max_tilt_rate": 15.0,
+        "num_envs": 2,
+    }
+    ideal = ml.make_vec("track", seed=3, **keys)
+    seen = ml.make_vec("track", seed=3, **keys, **{"randomization.observation_noise": 1.0})
+    first, second = make_scripted("mpc", ideal), make_scripted("mpc", with_truth(seen))
+    one, two = ideal.reset(seed=3)[0], seen.reset(seed=3)[0]
+    for _ in range(40):
+        one, two = ideal.step(first.act(one))[0], seen.step(second.act(two))[0]
+    assert (ideal.world.state.payload_position == seen.world.state.payload_position).all()
+    assert (one != two).any()
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"train.gru": 8}, "dagger has no train.gru"),
+        ({"train.dagger.teacher": "formation_rout"}, "formation_route"),
+        ({"train.dagger.teacher": "hold_ctbr"}, "control.action=ctbr"),
+        (
+            {"train.dagger.teacher": "formation_route"},
+            "navigate",
+        ),
+    ],
+)
+def test_what_cannot_be_learned_is_refused_in_a_sentence(own, message):
+    with pytest.raises(ConfigError, match=message):
+        Trainer(config(**own), Path("unused"))
