@@ -29,6 +29,7 @@ from multilift_marl.policies.mpc import TeamMpc
 from multilift_marl.policies.mpc_distributed import DistributedMpc, DistributedRouteMpc
 from multilift_marl.policies.payload_geometric import PayloadGeometric
 from multilift_marl.policies.policy import OwnPolicy, Policy
+from multilift_marl.policies.repelled import FormationRepelled
 from multilift_marl.policies.route_baselines import NarrowRouteMpc, PayloadRouteMpc, PotentialRouteMpc
 from multilift_marl.policies.route_formation import RouteFormation
 from multilift_marl.policies.route_mpc import RouteMpc
@@ -55,7 +56,7 @@ LINEAR: dict[str, type[Formation]] = {
     "hold_rotor": HoldRotor,
 }
 """Baselines that are linear maps of the observation."""
-Script = type[Formation] | type[PayloadGeometric] | type[TeamMpc] | type[RouteFormation]
+Script = type[Formation] | type[PayloadGeometric] | type[TeamMpc] | type[RouteFormation] | type[FormationRepelled]
 SCRIPTED: dict[str, Script] = {
     **LINEAR,
     "mpc": TeamMpc,
@@ -63,6 +64,7 @@ SCRIPTED: dict[str, Script] = {
     "mpc_route": RouteMpc,
     "mpc_route_distributed": DistributedRouteMpc,
     "formation_route": RouteFormation,
+    "formation_repelled": FormationRepelled,
     "mpc_payload": PayloadRouteMpc,
     "mpc_narrow": NarrowRouteMpc,
     "mpc_potential": PotentialRouteMpc,

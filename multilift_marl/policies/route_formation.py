@@ -20,7 +20,8 @@ from multilift_marl.policies.route_search import RouteSearch
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
-CLEARANCE = 0.12  # [m] that routes keep where there is room
+CLEARANCE = 0.2  # [m] that routes keep where there is room
+COMFORT = 0.4  # [m] of clearance beyond which more is worth nothing
 STRAYED = 0.4  # [m] from the route behind its place, beyond which it is searched anew from where the team is
 AFTER = 0.3  # [s] after the last search, at least
 _NEXT = np.arange(0.0, 0.6, 0.01)  # [s] in which the next place on a route is sought ...
@@ -66,7 +67,7 @@ class RouteFormation(RouteSearch):
 
     def make_route(self, e: int, start: np.ndarray, settings: RouteSettings, departure: np.ndarray | None) -> Route:
         """See `RouteSearch.make_route`."""
-        return super().make_route(e, start, replace(settings, clearance=CLEARANCE), departure)
+        return super().make_route(e, start, replace(settings, clearance=CLEARANCE, comfort=COMFORT), departure)
 
     def is_lost(self, e: int, time: float) -> bool:
         """See `RouteSearch.is_lost`: the payload is far from the route behind its place."""

@@ -1,0 +1,70 @@
+"""A potential field by each drone's own senses, `policy=formation_repelled`: slots moved away from what is near.
+
+Each drone moves its slot against the nearest points of obstacles that it observes, within a distance and in proportion
+to how much nearer they are, and is drawn back by nothing else than the target's motion. Numbers: most successes on
+training maps of `navigate_senses`, `results/tune_repelled.py`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from multilift_marl.errors import ConfigError
+from multilift_marl.math3d import heading
+
+if TYPE_CHECKING:
+    from multilift_marl.envs.core import MultiliftVec
+
+
+class FormationRepelled:
+    """Acts by `reference`.
+
+    Args:
+        vec: environments with `env.obstacle_sensing` map or local; what the drones observe is read at every `act`.
+
+    Class attributes:
+        DISTANCE: from a drone within which an obstacle moves its slot [m].
+        GAIN: by which, over how much nearer it is [-].
+        SWAY: share of that across the way alone, in which the target's velocity points [-].
+    """
+
+    INTERFACE: ClassVar[str] = "reference"
+    DISTANCE: float = 1.3
+    GAIN: float = 0.7
+    SWAY: float = 0.0
+
+    def __init__(self, vec: MultiliftVec):
+        if vec.config.env.obstacle_sensing not in ("map", "local"):
+            raise ConfigError(
+                "policy=formation_repelled needs the nearest points of obstacles; set env.obstacle_sensing=local"
+            )
+        self._vec = vec
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Do nothing: it remembers nothing."""
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return actions (E, N, 4) in [-1, 1] for the present state of the environments."""
+        vec, goal, view = self._vec, self._vec.task.goal, self._vec.task.view
+        e, n = vec.num_envs, vec.num_drones
+        assert view.obstacle_readings is not None
+        points = view.obstacle_readings.reshape(e, n, -1, 3)
+        level = points[..., :2]
+        far = np.maximum(np.linalg.norm(level, axis=-1), 1e-3)
+        high = np.abs(points[..., 2]) > self.DISTANCE  # those that are not there are straight above
+        push = np.where(high, 0.0, self.GAIN * np.maximum(self.DISTANCE - far, 0.0))
+        away = -(level / far[..., None] * push[..., None]).sum(axis=2)
+        rotation = view.estimated.drone_rotation
+        yaw = np.array([[heading(tuple(each.ravel())) for each in team] for team in rotation])
+        c, s = np.cos(yaw), np.sin(yaw)
+        world = np.stack([c * away[..., 0] - s * away[..., 1], s * away[..., 0] + c * away[..., 1]], axis=-1)
+        speed = np.linalg.norm(goal.velocity[:, :2], axis=1)[:, None]
+        way = np.where(speed > 1e-6, goal.velocity[:, :2] / np.maximum(speed, 1e-6), 0.0)[:, None]
+        world -= self.SWAY * (world * way).sum(axis=-1, keepdims=True) * way
+        c, s = goal.slot_frame[..., 0], goal.slot_frame[..., 1]
+        action = np.zeros((e, n, 4))
+        action[..., 0] = c * world[..., 0] + s * world[..., 1]
+        action[..., 1] = c * world[..., 1] - s * world[..., 0]
+        return np.clip(action / vec.config.control.max_offset, -1.0, 1.0)

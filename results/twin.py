@@ -1,0 +1,118 @@
+"""Compare a learned team with its linear twin: `python results/twin.py policy=<run> [episodes=200] [others=a,b]`.
+
+The twin is the linear map of the same observation, with a constant, that fits the learned team's actions best: by least
+squares over the steps of `rounds=4` batches of flights, the first flown by the learned team, the others by the twin so
+far, with what the learned team would have done. Both, and other baselines by name, fly the same evaluation episodes.
+`table=<file>` is a CSV file that the rows go to; further arguments change the configuration.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from multilift_marl.agents.policy import load_policy
+from multilift_marl.config.config import Config
+from multilift_marl.config.load import build_config, parse_overrides
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.evaluation.metrics import bootstrap, wilson
+from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.policy import Policy
+
+TRAINING, EVALUATION = 500, 1000  # seeds
+BATCH = 64  # episodes of a round
+RIDGE = 1e-6  # of the mean square of each number
+
+
+class Linear:
+    """Acts by a matrix (D + 1, A), the last row constant."""
+
+    def __init__(self, matrix: np.ndarray):
+        self.matrix = matrix
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return actions (E, N, A)."""
+        return np.clip(observation @ self.matrix[:-1] + self.matrix[-1], -1.0, 1.0)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Do nothing."""
+
+
+class Taught:
+    """Flies by one policy, and adds what another would do to sums of squares."""
+
+    def __init__(self, flies: Policy, teaches: Policy, sums: tuple[np.ndarray, np.ndarray]):
+        self._flies, self._teaches, self._sums = flies, teaches, sums
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return actions (E, N, A)."""
+        taught = self._teaches.act(observation)
+        rows = np.concatenate([observation, np.ones((*observation.shape[:-1], 1))], -1, dtype=float)
+        rows = rows.reshape(-1, rows.shape[-1])
+        self._sums[0][:] += rows.T @ rows
+        self._sums[1][:] += rows.T @ taught.reshape(len(rows), -1)
+        return self._flies.act(observation)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Begin anew in the environments of the mask (E,)."""
+        self._flies.reset(mask)
+        self._teaches.reset(mask)
+
+
+def fit(config: Config, learned: Callable[[MultiliftVec], Policy], rounds: int) -> np.ndarray:
+    """Return the matrix (D + 1, A) of the twin of a policy."""
+    vec = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
+    size = vec.observation_size + 1
+    sums = np.zeros((size, size)), np.zeros((size, vec.action_size))
+    matrix = None
+    for number in range(rounds):
+
+        def make(vec: MultiliftVec, matrix: np.ndarray | None = matrix) -> Taught:
+            return Taught(learned(vec) if matrix is None else Linear(matrix), learned(vec), sums)
+
+        run_episodes(config, make, BATCH, TRAINING, first=number * BATCH)
+        square = sums[0] + RIDGE * np.diag(np.diag(sums[0]) + 1e-9)
+        matrix = np.linalg.solve(square, sums[1])
+    assert matrix is not None
+    return matrix
+
+
+def main(arguments: list[str]) -> None:
+    """Fit, fly and say."""
+    values: dict[str, Any] = parse_overrides(arguments)
+    own = {"episodes": 200, "rounds": 4, "others": "", "table": None}
+    own = {key: values.pop(key, default) for key, default in own.items()}
+    name, episodes = values.pop("policy"), int(own["episodes"])
+    policy = load_policy(name)
+    config = build_config(policy.config.model_dump(), values)
+    matrix = fit(config, policy.bind, int(own["rounds"]))
+    teams: dict[str, Callable[[MultiliftVec], Policy]] = {"learned": policy.bind}
+    teams["linear twin"] = lambda vec: Linear(matrix)
+    for other in filter(None, own["others"].split(",")):
+        teams[other] = partial(make_scripted, other)
+    flown = {who: run_episodes(config, make, episodes, EVALUATION)["success_rate"] for who, make in teams.items()}
+    rows = []
+    for who, success in flown.items():
+        low, high = (100 * each for each in wilson(int(success.sum()), episodes))
+        row = {"team": who, "episodes": episodes, "success_percent": f"{100 * success.mean():.1f}"}
+        row |= {"ci95": f"{low:.1f}-{high:.1f}"}
+        if who != "learned":
+            low, high = (100 * each for each in bootstrap(flown["learned"] - success))
+            row["learned_minus_this"] = f"{low:.1f} to {high:.1f}"
+        rows.append(row)
+        print(*(f"{key}={value}" for key, value in row.items()))
+    if own["table"]:
+        with open(own["table"], "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(rows[-1]), lineterminator="\n", restval="")
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
