@@ -3,7 +3,7 @@
 Four ways to weights of `control.action=planner_weights`, in `track_weights_realistic`: those of `planner` as they are;
 CMA-ES over 13 constants (`pip install cma`); a network by `train.algorithm=diffmpc`; and one by `mappo`, the last three
 with as many environment steps. Each is flown on the paths below, on the same evaluation episodes. What is done is kept
-in results/planner_weights, and not done again; docs/data/planner_weights.csv is written of it.
+in results/planner_weights, and not done again; docs/data/planner_weights.csv is written of all that is there.
 """
 
 from __future__ import annotations
@@ -121,14 +121,16 @@ def main(arguments: list[str]) -> None:
     config = load_config(CONFIG, {"env.num_threads": 1})
     HERE.mkdir(exist_ok=True)
     hand = fly(config, "hand", lambda vec: Constant(vec, np.zeros(vec.action_size)), episodes)
-    teams = {"hand": [hand]}
     for seed in range(seeds):
         for method in values["methods"].split(","):
             make = find(config, method, frames, seed)
-            teams.setdefault(method, []).append(fly(config, f"{method}_{seed}", make, episodes))
-            print(
-                method, seed, [f"{100 * each['payload_rmse_m'].mean():.2f}" for each in teams[method][-1]], flush=True
-            )
+            flown = fly(config, f"{method}_{seed}", make, episodes)
+            print(method, seed, [f"{100 * each['payload_rmse_m'].mean():.2f}" for each in flown], flush=True)
+    teams = {"hand": [hand]}
+    for method in METHODS:
+        names = sorted(path.name.removesuffix("_path0.npz") for path in HERE.glob(f"{method}_*_path0.npz"))
+        if names:
+            teams[method] = [[dict(np.load(HERE / f"{name}_path{k}.npz")) for k in range(len(PATHS))] for name in names]
     lines = []
     for number, path in enumerate(PATHS):
         for method, flights in teams.items():

@@ -96,7 +96,10 @@ def main(arguments: list[str]) -> None:
     teams["linear twin"] = lambda vec: Linear(matrix)
     for other in filter(None, own["others"].split(",")):
         teams[other] = partial(make_scripted, other)
-    flown = {who: run_episodes(config, make, episodes, EVALUATION)["success_rate"] for who, make in teams.items()}
+    flown = {
+        who: run_episodes(config, make, episodes, EVALUATION)["success_rate"].astype(float)
+        for who, make in teams.items()
+    }
     rows = []
     for who, success in flown.items():
         low, high = (100 * each for each in wilson(int(success.sum()), episodes))
