@@ -85,12 +85,15 @@ def _by_name(name: str) -> Script:
 
 
 def fitting_scripts(vec: MultiliftVec) -> list[str]:
-    """Return the names of the baselines that can act in the environments `vec`."""
+    """Return the names of the baselines that can act in the environments `vec`, without those that plan."""
     fitting = []
     for name, script in SCRIPTED.items():
-        if issubclass(script, TeamMpc):
+        if issubclass(script, TeamMpc | RouteFormation):
             continue
-        known = not script.refusal(vec) if issubclass(script, Formation) else vec.config.env.sensing == "ideal"
+        if issubclass(script, FormationRepelled):
+            known = script.sees(vec)
+        else:
+            known = not script.refusal(vec) if issubclass(script, Formation) else vec.config.env.sensing == "ideal"
         if known and script.INTERFACE == vec.config.control.action:
             fitting.append(name)
     return fitting

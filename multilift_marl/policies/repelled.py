@@ -36,11 +36,16 @@ class FormationRepelled:
     SWAY: float = 0.0
 
     def __init__(self, vec: MultiliftVec):
-        if vec.config.env.obstacle_sensing not in ("map", "local"):
+        if not self.sees(vec):
             raise ConfigError(
                 "policy=formation_repelled needs the nearest points of obstacles; set env.obstacle_sensing=local"
             )
         self._vec = vec
+
+    @staticmethod
+    def sees(vec: MultiliftVec) -> bool:
+        """Return whether drones observe the nearest points of obstacles."""
+        return vec.config.env.obstacle_sensing in ("map", "local")
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Do nothing: it remembers nothing."""

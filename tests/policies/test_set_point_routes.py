@@ -8,7 +8,7 @@ import pytest
 import multilift_marl as ml
 from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.rollout import run_episodes
-from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.baselines import fitting_scripts, make_scripted
 
 ALONE = {
     "scene.reserved": 0, "task_options.level": "given", "task_options.start": [-4, 0, 1.5],
@@ -79,3 +79,10 @@ def test_slots_are_pushed_away_from_what_their_own_drones_observe():
 def test_without_nearest_points_nothing_is_pushed():
     with pytest.raises(ConfigError, match="needs the nearest points"):
         make_scripted("formation_repelled", make([], **{"env.obstacle_sensing": "ranges", "train.observe": None}))
+
+
+@pytest.mark.parametrize(("sensing", "fits"), [("local", True), ("map", True), ("ranges", False), ("none", False)])
+def test_it_is_offered_where_drones_observe_points(sensing, fits):
+    vec = make([], **{"env.obstacle_sensing": sensing, "train.observe": None})
+    assert ("formation_repelled" in fitting_scripts(vec)) == fits
+    assert "formation_route" not in fitting_scripts(vec)  # it plans
