@@ -31,8 +31,9 @@ def review(values: Any, source: object) -> None:
 
     A module may run that the user has named in this process (`import=`, `policy=module:Class`) or trusts, that is
     imported already, or that is part of an installed package with an entry point of `plugins.GROUP`. A class that
-    `train.residual` names is refused when it is needed, by `plugins.find_callable`: those who fly do not need it. So is
-    a cluster that `train.ray` names, by `check_cluster`: what it returns is unpickled, and so may run anything.
+    `train.residual` or `train.dagger.teacher` names is refused when it is needed, by `plugins.find_callable`: those
+    who fly do not need it. So is a cluster that `train.ray` names, by `check_cluster`: what it returns is
+    unpickled, and so may run anything.
 
     Args:
         values: the stored configuration, nested; of any content.
@@ -51,13 +52,15 @@ def review(values: Any, source: object) -> None:
         for reference in _references(part):
             if not _may_run(reference) and not _is_imported(reference):
                 raise ConfigError(explain_refusal("import", reference, reference, source))
-    name = train.get("residual")
-    if isinstance(name, str) and ":" in name:
-        module = name.rpartition(":")[0]
-        if _may_run(module):
-            plugins.refused.pop(name, None)
-        else:
-            plugins.refused[name] = explain_refusal("train.residual", name, module, source)
+    dagger = train.get("dagger")
+    teacher = dagger.get("teacher") if isinstance(dagger, Mapping) else None
+    for key, name in (("train.residual", train.get("residual")), ("train.dagger.teacher", teacher)):
+        if isinstance(name, str) and ":" in name:
+            module = name.rpartition(":")[0]
+            if _may_run(module):
+                plugins.refused.pop(name, None)
+            else:
+                plugins.refused[name] = explain_refusal(key, name, module, source)
     if isinstance(address := train.get("ray"), str) and address not in _OWN_CLUSTERS:
         key = _cluster(address)
         if _trusted.get():

@@ -9,15 +9,16 @@ that is resumed begins new episodes, and collects anew.
 
 from __future__ import annotations
 
+import os
 import time
 from typing import Any
 
 import numpy as np
 import torch
 
+from multilift_marl.agents.learning_rollouts import LearningRollouts, join_steps, list_step
 from multilift_marl.agents.mappo import Learner
-from multilift_marl.agents.rollouts import Batches, join_steps
-from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.agents.rollouts import Batches
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
 from multilift_marl.policies.baselines import make_scripted
@@ -34,64 +35,56 @@ def check_dagger(train: TrainConfig) -> None:
             raise ConfigError(f"train.algorithm=dagger has no train.{key}; leave it out, or take mappo")
 
 
-class DaggerRollouts:
-    """Flights whose steps the learner's policy is fitted to the teacher's commands of; see `Rollouts`.
-
-    Args:
-        env: what is simulated.
-        learner: whose actor flies, and learns.
-        total: environments of the training.
+class DaggerRollouts(LearningRollouts):
+    """Flights whose steps the policy is fitted to the teacher's commands of; see `LearningRollouts`.
 
     Attributes:
-        env: as given.
-        values: numbers to log of the last batch.
         observed, taught: (S, N, D), (S, N, A) steps that are kept, and the teacher's commands in them.
         count: of steps so far; those beyond S have overwritten the oldest.
+
+    Raises:
+        ConfigError: a teacher that cannot fly these environments, or more steps than this machine's memory holds.
     """
 
     def __init__(self, env: MultiliftEnv, learner: Learner, total: int):
-        self.env, self.values = env, dict[str, float]()
+        super().__init__(env, learner, total)
         vec, train = env.vec, learner.config
-        self._learner, self._total, self._train, self._settings = learner, total, train, train.dagger
+        self._train, self._settings = train, train.dagger
         self._teacher = make_scripted(self._settings.teacher, with_truth(vec) if self._settings.truth else vec)
-        size = min(
-            self._settings.capacity, -(-train.frames // (vec.num_envs * train.horizon)) * vec.num_envs * train.horizon
-        )
-        n = vec.num_drones
+        size, n = min(self._settings.capacity, train.frames + vec.num_envs * train.horizon), vec.num_drones
+        needed = 4 * size * n * (vec.observation_size + vec.action_size)
+        if needed > (there := os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")):
+            raise ConfigError(
+                f"{size} steps take {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
+                "train.dagger.capacity"
+            )
         self.observed = torch.zeros(size, n, vec.observation_size)
         self.taught = torch.zeros(size, n, vec.action_size)
         self.count = 0
-        self._by_teacher = np.ones(vec.num_envs, bool)
-        self._started = False
+        self._by_teacher: np.ndarray | None = None  # which episodes it flies
 
     def collect(self, iteration: int) -> Batches:
-        """Fly the next steps of all environments, learn, and return them as one batch of size [E, T]."""
-        self._start()
+        """See `LearningRollouts.collect`."""
+        self.start()
         vec, train = self.env.vec, self._train
         share = max(0.0, 1.0 - iteration * vec.num_envs * train.horizon / max(self._settings.handover, 1))
         share = max(share, self._settings.teacher_share)
         rng = np.random.default_rng(np.random.SeedSequence(vec.config.seed, spawn_key=(TEACHER, iteration)))
+        if self._by_teacher is None:
+            self._by_teacher = rng.uniform(size=vec.num_envs) < share
         rows: list[dict[str, np.ndarray]] = []
         observation, _ = vec.current()
         for _ in range(train.horizon):
             began = vec.ended
             taught = self._teacher.act(observation)
-            with torch.no_grad():
-                own = self._learner.actor(torch.from_numpy(observation))[0].clamp(-1, 1).numpy()
             self._keep(observation, taught, ~began)
-            outcome = vec.step_live(np.where(self._by_teacher[:, None, None], taught, own), restart=True)
+            action = np.where(self._by_teacher[:, None, None], taught, self.act(observation))
+            outcome = vec.step_live(action, restart=True)
             if began.any():
                 self._teacher.reset(began)
                 self._by_teacher[began] = rng.uniform(size=int(began.sum())) < share
             observation = outcome.observation.copy()
-            terminated, truncated, success, failure, diverged = outcome.flags
-            rows.append(
-                {
-                    "reward": outcome.reward[..., None].copy(), "done": (terminated | truncated)[:, None].copy(),
-                    "reward_terms": vec.task.terms.copy(), "success": success[:, None].copy(),
-                    "failure": failure[:, None].copy(), "diverged": diverged[:, None].copy(),
-                }
-            )  # fmt: skip
+            rows.append(list_step(outcome, vec))
         begin = time.perf_counter()
         torch.set_num_threads(train.threads)
         loss = self._learn(vec.num_envs * train.horizon)
@@ -110,7 +103,6 @@ class DaggerRollouts:
     def _learn(self, fresh: int) -> float:
         """Fit the policy to what is kept, `epochs` times as many steps as there are `fresh` ones; return the loss."""
         learner, train, kept = self._learner, self._train, min(self.count, len(self.observed))
-        parameters = [each for each in learner.actor.parameters()]
         recent = torch.arange(max(self.count - fresh, 0), self.count) % len(self.observed)
         learner.actor.normalizer.update(self.observed[recent])
         size = max(fresh // train.minibatches, 1)
@@ -121,28 +113,13 @@ class DaggerRollouts:
             mean = learner.actor(self.observed[chosen])[0]
             loss = (mean - self.taught[chosen]).square().mean()
             loss.backward()
-            torch.nn.utils.clip_grad_norm_([each for each in parameters if each.grad is not None], train.max_grad_norm)
+            parameters = [each for each in learner.actor.parameters() if each.grad is not None]
+            torch.nn.utils.clip_grad_norm_(parameters, train.max_grad_norm)
             learner.optimizer.step()
             losses.append(loss.detach())
         return float(torch.stack(losses).mean())
 
-    def get_state(self) -> dict[str, torch.Tensor]:
-        """See `Rollouts.get_state`."""
-        self._start()
-        return self.env.get_state()
-
     def set_state(self, saved: dict[str, Any]) -> None:
         """Go on in the episodes after those that were under way."""
-        self.env.set_state(saved)
+        super().set_state(saved)
         self.env.vec.reset()
-        self._started = True
-
-    def close(self, at_once: bool = False) -> None:
-        """Do nothing: there is no other process."""
-
-    def _start(self) -> None:
-        if not self._started:
-            vec: MultiliftVec = self.env.vec
-            vec.reset(seed=vec.config.seed)
-            vec.stagger(self._total)
-            self._started = True

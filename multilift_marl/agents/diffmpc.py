@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import time
 from math import exp
-from typing import Any
 
 import numpy as np
 import torch
 
+from multilift_marl.agents.learning_rollouts import LearningRollouts, join_steps, list_step
 from multilift_marl.agents.mappo import Learner
-from multilift_marl.agents.rollouts import Batches, join_steps
+from multilift_marl.agents.rollouts import Batches
 from multilift_marl.diffmpc.weighted_planner import FlightGradient, WeightedPlanner
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
@@ -57,24 +57,14 @@ def loss_weights(train: TrainConfig, vec: MultiliftVec) -> np.ndarray:
     return np.array([position] * 3 + [attitude] * 3 + [cable] * (2 * n) + moving + [0.0] * (3 * n))
 
 
-class DiffMpcRollouts:
-    """Flights that the learner's policy is improved by on the way; see `Rollouts`.
-
-    Args:
-        env: what is simulated.
-        learner: whose actor flies, and learns.
-        total: environments of the training.
-
-    Attributes:
-        env: as given.
-        values: numbers to log of the last batch.
-    """
+class DiffMpcRollouts(LearningRollouts):
+    """Flights that the learner's policy is improved by on the way; see `LearningRollouts`."""
 
     def __init__(self, env: MultiliftEnv, learner: Learner, total: int):
+        super().__init__(env, learner, total)
         commander = env.vec.commander
         assert isinstance(commander, PlannerWeights) and isinstance(commander.planner, WeightedPlanner)
-        self.env, self.values = env, dict[str, float]()
-        self._learner, self._total, self._commander = learner, total, commander
+        self._commander = commander
         vec, train = env.vec, learner.config
         self._settings, self._horizon = train.diffmpc, train.horizon
         slowest = max(vehicle.rotor_time_constant for vehicle in vec.world.system.vehicles)
@@ -84,13 +74,12 @@ class DiffMpcRollouts:
         self._loss = loss_weights(train, vec)
         shape = self._settings.window + 1, vec.num_envs, vec.num_drones
         self._observed = np.zeros((*shape, vec.observation_size), np.float32)
-        self._started = False
 
     def collect(self, iteration: int) -> Batches:
-        """Fly the next steps of all environments, learn, and return them as one batch of size [E, T]."""
+        """See `LearningRollouts.collect`."""
         vec, window = self.env.vec, self._settings.window
         every = min(self._settings.every or window, window)
-        self._start()
+        self.start()
         observation, _ = vec.current()
         rows: list[dict[str, np.ndarray]] = []
         losses: list[float] = []
@@ -117,25 +106,16 @@ class DiffMpcRollouts:
     def _fly(self, observation: np.ndarray, slot: int, rows: list[dict[str, np.ndarray]]) -> None:
         """Make a step, and keep what its derivatives need in a slot of the window."""
         vec, flight, planner = self.env.vec, self._flight, self._planner
-        with torch.no_grad():
-            action = self._learner.actor(torch.from_numpy(observation))[0].clamp(-1, 1).numpy()
+        action = self.act(observation)
         self._observed[slot] = observation
         planner.slot = slot
         began = vec.ended
         outcome = vec.step_live(action, restart=True)
         for kept, weights in zip(flight.weights, planner.weights, strict=True):
             kept[slot] = weights
-        terminated, truncated, success, failure, diverged = outcome.flags
-        done = terminated | truncated
-        flight.tape.cut[slot] |= done | began
+        rows.append(list_step(outcome, vec))
+        flight.tape.cut[slot] |= rows[-1]["done"][:, 0] | began
         flight.tape.late[slot] = vec.task.view.action_delay
-        rows.append(
-            {
-                "reward": outcome.reward[..., None].copy(), "done": done[:, None].copy(),
-                "reward_terms": vec.task.terms.copy(), "success": success[:, None].copy(),
-                "failure": failure[:, None].copy(), "diverged": diverged[:, None].copy(),
-            }
-        )  # fmt: skip
 
     def _learn(self) -> tuple[float, float]:
         """Follow the gradient of the flights in the window once; return their loss and the gradient's norm."""
@@ -171,23 +151,3 @@ class DiffMpcRollouts:
         by_step = [array for array in tape if not any(array is other for other in by_env)]
         for array in (*by_step, *self._flight.weights, self._observed):
             array[:-every] = array[every:].copy()
-
-    def get_state(self) -> dict[str, torch.Tensor]:
-        """See `Rollouts.get_state`."""
-        self._start()
-        return self.env.get_state()
-
-    def set_state(self, saved: dict[str, Any]) -> None:
-        """See `Rollouts.set_state`."""
-        self.env.set_state(saved)
-        self._started = True
-
-    def close(self, at_once: bool = False) -> None:
-        """Do nothing: there is no other process."""
-
-    def _start(self) -> None:
-        if not self._started:
-            vec = self.env.vec
-            vec.reset(seed=vec.config.seed)
-            vec.stagger(self._total)
-            self._started = True

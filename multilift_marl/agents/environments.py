@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from multilift_marl.agents.dagger import DaggerRollouts, check_dagger
 from multilift_marl.agents.diffmpc import DiffMpcRollouts, check_diffmpc
+from multilift_marl.agents.learning_rollouts import LearningRollouts
 from multilift_marl.agents.mappo import Learner, StochasticPolicy, check_communication
 from multilift_marl.agents.rigs import check_rigs, divide_rigs
 from multilift_marl.agents.rollouts import RigRollouts, Rollouts
@@ -54,7 +55,7 @@ def make_envs(environment: Config, purpose: int = TRAINING) -> list[MultiliftEnv
 
 def make_rollouts(
     environment: Config, envs: list[MultiliftEnv], learner: Learner
-) -> Rollouts | RigRollouts | Workers | DiffMpcRollouts | DaggerRollouts:
+) -> Rollouts | RigRollouts | Workers | LearningRollouts:
     """Return the rollouts of a learner's policy in what `make_envs` returned."""
     train, total = environment.train, environment.env.num_envs
     if train.algorithm == "diffmpc":

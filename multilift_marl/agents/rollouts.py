@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from multilift_marl.agents.mappo import StochasticPolicy
-from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 
 Batches = list[TensorDictBase]
@@ -141,12 +140,3 @@ class RigRollouts:
 
     def close(self, at_once: bool = False) -> None:
         """Do nothing: there is no other process."""
-
-
-def join_steps(rows: list[dict[str, np.ndarray]], vec: MultiliftVec) -> TensorDict:
-    """Return steps as a batch [E, T], as of TorchRL's collector."""
-    joined = {name: torch.from_numpy(np.stack([row[name] for row in rows], axis=1)) for name in rows[0]}
-    size = [vec.num_envs, len(rows)]
-    info = TensorDict({name: joined[name] for name in ("reward_terms", "success", "failure", "diverged")}, size)
-    agents = TensorDict({"reward": joined["reward"]}, size)
-    return TensorDict({"next": TensorDict({"agents": agents, "done": joined["done"], "info": info}, size)}, size)

@@ -25,12 +25,11 @@ from multilift_marl.agents.checkpoint import (
     unlock_run,
 )
 from multilift_marl.agents.curriculum import Curriculum
-from multilift_marl.agents.dagger import DaggerRollouts
-from multilift_marl.agents.diffmpc import DiffMpcRollouts
 from multilift_marl.agents.environments import make_envs, make_rollouts
 from multilift_marl.agents.episodes import EpisodeStatistics
 from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.initial import find_initial
+from multilift_marl.agents.learning_rollouts import LearningRollouts
 from multilift_marl.agents.loggers import check_logger, hyperparameters
 from multilift_marl.agents.logging import RunLog, describe_evaluation, quietly, say, write_versions
 from multilift_marl.agents.mappo import adapted_rate, check_batch, make_learner, update
@@ -243,7 +242,7 @@ class Trainer:
             actor["lr"] = 0.0
         batches = self.rollouts.collect(self.iteration)
         sampling = time.perf_counter() - start
-        if isinstance(self.rollouts, DiffMpcRollouts | DaggerRollouts):  # it has learned on the way
+        if isinstance(self.rollouts, LearningRollouts):  # it has learned on the way
             values = dict(self.rollouts.values)
             sampling -= values["learning_seconds"]
         else:

@@ -1,8 +1,8 @@
 """A potential field by each drone's own senses, `policy=formation_repelled`: slots moved away from what is near.
 
 Each drone moves its slot against the nearest points of obstacles that it observes, within a distance and in proportion
-to how much nearer they are, and is drawn back by nothing else than the target's motion. Numbers: most successes on
-training maps of `navigate_senses`, `results/tune_repelled.py`.
+to how much nearer they are. Numbers: most successes on training maps of `navigate_senses`
+(`results/tune_repelled.py maps=24`).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import heading
+from multilift_marl.policies.slot_offsets import offset_actions
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -27,7 +28,7 @@ class FormationRepelled:
     Class attributes:
         DISTANCE: from a drone within which an obstacle moves its slot [m].
         GAIN: by which, over how much nearer it is [-].
-        SWAY: share of that across the way alone, in which the target's velocity points [-].
+        SWAY: share of that along the target's velocity which is left out [-].
     """
 
     INTERFACE: ClassVar[str] = "reference"
@@ -68,8 +69,5 @@ class FormationRepelled:
         speed = np.linalg.norm(goal.velocity[:, :2], axis=1)[:, None]
         way = np.where(speed > 1e-6, goal.velocity[:, :2] / np.maximum(speed, 1e-6), 0.0)[:, None]
         world -= self.SWAY * (world * way).sum(axis=-1, keepdims=True) * way
-        c, s = goal.slot_frame[..., 0], goal.slot_frame[..., 1]
-        action = np.zeros((e, n, 4))
-        action[..., 0] = c * world[..., 0] + s * world[..., 1]
-        action[..., 1] = c * world[..., 1] - s * world[..., 0]
-        return np.clip(action / vec.config.control.max_offset, -1.0, 1.0)
+        beside = np.concatenate([world, np.zeros((e, n, 1))], axis=-1)
+        return offset_actions(beside, goal, vec.config.control.max_offset)

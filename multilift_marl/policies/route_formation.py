@@ -16,6 +16,7 @@ from multilift_marl.math3d import heading
 from multilift_marl.navigation.planner import RouteSettings
 from multilift_marl.planning.route import Route
 from multilift_marl.policies.route_search import RouteSearch
+from multilift_marl.policies.slot_offsets import offset_actions
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -58,12 +59,7 @@ class RouteFormation(RouteSearch):
         cables = system.cable_length[:, None] * forces / np.linalg.norm(forces, axis=-1, keepdims=True)
         drones = places[:, None] + np.einsum("eij,enj->eni", turned, system.anchors + cables)
         beside = drones - goal.slots - self._lead * goal.velocity[:, None]
-        c, s = goal.slot_frame[..., 0], goal.slot_frame[..., 1]
-        action = np.zeros((*beside.shape[:2], 4))
-        action[..., 0] = c * beside[..., 0] + s * beside[..., 1]
-        action[..., 1] = c * beside[..., 1] - s * beside[..., 0]
-        action[..., 2] = beside[..., 2]
-        return np.clip(action / vec.config.control.max_offset, -1.0, 1.0)
+        return offset_actions(beside, goal, vec.config.control.max_offset)
 
     def make_route(self, e: int, start: np.ndarray, settings: RouteSettings, departure: np.ndarray | None) -> Route:
         """See `RouteSearch.make_route`."""

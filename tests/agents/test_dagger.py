@@ -110,10 +110,8 @@ def test_a_teacher_with_the_truth_flies_as_if_nothing_disturbed_its_senses():
         ({"train.gru": 8}, "dagger has no train.gru"),
         ({"train.dagger.teacher": "formation_rout"}, "formation_route"),
         ({"train.dagger.teacher": "hold_ctbr"}, "control.action=ctbr"),
-        (
-            {"train.dagger.teacher": "formation_route"},
-            "navigate",
-        ),
+        ({"train.dagger.teacher": "formation_route"}, "navigate"),
+        ({"train.dagger.capacity": 10**12, "train.frames": 10**12}, "lower train.dagger.capacity"),
     ],
 )
 def test_what_cannot_be_learned_is_refused_in_a_sentence(own, message):

@@ -58,7 +58,7 @@ def save_policy(folder, change):
         *sections, key = dotted.split(".")
         place = build
         for section in sections:
-            place = place[section]
+            place = place.setdefault(section, {})
         place[key] = value
     save_checkpoint(folder / "policy.pt", content)
     return folder / "policy.pt"
@@ -177,11 +177,12 @@ def train_again(run, capsys):
     return capsys.readouterr().out
 
 
-def test_a_class_that_is_not_the_users_is_not_called_though_it_is_imported(stranger):
-    policy = save_policy(stranger, {"train.residual": "os:system"})
+@pytest.mark.parametrize("key, own", [("train.residual", {}), ("train.dagger.teacher", {"train.algorithm": "dagger"})])
+def test_a_class_that_is_not_the_users_is_not_called_though_it_is_imported(stranger, key, own):
+    policy = save_policy(stranger, own | {key: "os:system"})
     config = ml.load_policy(policy).config
     message = refusal(lambda: new_run(config, "mine", stranger))
-    assert message.startswith(f"{policy} has train.residual=os:system, which was not run")
+    assert message.startswith(f"{policy} has {key}=os:system, which was not run")
 
 
 @pytest.mark.parametrize("base", [False, True])
