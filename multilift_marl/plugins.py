@@ -22,6 +22,7 @@ registers: list[Callable[[Any], object]] = []  # what takes the tasks of entry p
 _imported: dict[str, ModuleType] = {}  # by the last part of their name
 named: set[str] = set()
 """Modules, see `identify`, and clusters that the user has named or trusts; others that files name wait (`trust.py`)."""
+STORED = "train.residual", "train.dagger.teacher"  # keys by which a run names a class
 refused: dict[str, str] = {}
 """Classes and clusters that only a file names, with the sentence that says so."""
 
@@ -84,7 +85,7 @@ def find_callable(reference: str, key: str) -> Callable[..., Any]:
     Raises:
         ConfigError: see `import_module`; the module holds no such class; or only a file names it, see `trust.review`.
     """
-    if key == "train.residual" and reference in refused:
+    if key in STORED and reference in refused:
         raise ConfigError(refused[reference])
     place, _, name = reference.rpartition(":")
     if not place or not name:

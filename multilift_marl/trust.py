@@ -54,7 +54,7 @@ def review(values: Any, source: object) -> None:
                 raise ConfigError(explain_refusal("import", reference, reference, source))
     dagger = train.get("dagger")
     teacher = dagger.get("teacher") if isinstance(dagger, Mapping) else None
-    for key, name in (("train.residual", train.get("residual")), ("train.dagger.teacher", teacher)):
+    for key, name in zip(plugins.STORED, (train.get("residual"), teacher), strict=True):
         if isinstance(name, str) and ":" in name:
             module = name.rpartition(":")[0]
             if _may_run(module):

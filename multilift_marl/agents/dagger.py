@@ -19,9 +19,11 @@ import torch
 from multilift_marl.agents.learning_rollouts import LearningRollouts, join_steps, list_step
 from multilift_marl.agents.mappo import Learner
 from multilift_marl.agents.rollouts import Batches
+from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
 from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.policy import OwnPolicy, Policy
 from multilift_marl.policies.truth import with_truth
 from multilift_marl.schema.training import TrainConfig
 
@@ -33,6 +35,11 @@ def check_dagger(train: TrainConfig) -> None:
     for key in ("gru", "workers", "rigs", "stages"):
         if getattr(train, key):
             raise ConfigError(f"train.algorithm=dagger has no train.{key}; leave it out, or take mappo")
+
+
+def make_teacher(name: str, vec: MultiliftVec) -> Policy:
+    """Return the teacher of a name, a baseline or one's own module:Class, for environments."""
+    return OwnPolicy(name, vec, "train.dagger.teacher") if ":" in name else make_scripted(name, vec)
 
 
 class DaggerRollouts(LearningRollouts):
@@ -50,7 +57,7 @@ class DaggerRollouts(LearningRollouts):
         super().__init__(env, learner, total)
         vec, train = env.vec, learner.config
         self._train, self._settings = train, train.dagger
-        self._teacher = make_scripted(self._settings.teacher, with_truth(vec) if self._settings.truth else vec)
+        self._teacher = make_teacher(self._settings.teacher, with_truth(vec) if self._settings.truth else vec)
         size, n = min(self._settings.capacity, train.frames + vec.num_envs * train.horizon), vec.num_drones
         needed = 4 * size * n * (vec.observation_size + vec.action_size)
         if needed > (there := os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")):
