@@ -8,7 +8,7 @@ import multilift_marl as ml
 from multilift_marl.deploy.px4.flight import check_config
 from multilift_marl.deploy.px4.launch import rig_parameters
 from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
-from multilift_marl.sensing.sensors import Sensor, SensorSuite
+from multilift_marl.sensing.suite import Sensor, SensorSuite
 from multilift_marl.sim import World
 
 DT = 0.004

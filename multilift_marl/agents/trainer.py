@@ -76,10 +76,8 @@ class Trainer:
         environment = self.curriculum.environment
         if initial is not None:
             initial.check(divide_rigs(environment))
-        envs = make_envs(environment, self.curriculum.purpose)
-        self.env = envs[0]
-        num_envs = environment.env.num_envs
-        self.frames_per_batch = num_envs * config.train.horizon
+        envs, num_envs = make_envs(environment, self.curriculum.purpose), environment.env.num_envs
+        self.env, self.frames_per_batch = envs[0], num_envs * config.train.horizon
         check_batch(config.train, self.env.vec, num_envs, len(envs))
         self.learner = make_learner(config.train, self.env)
         self.taken_over = "" if initial is None else initial.take_over(self.learner, config)

@@ -15,10 +15,10 @@ from multilift_marl.envs.commander import COMMANDERS, Commander, find_commander
 from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.envs.pipeline import Pipeline, StageContext, describe_stages, join_pipelines
-from multilift_marl.envs.step_kernels import ENDED, TAKEN, Outcome, end_step, take_actions
+from multilift_marl.envs.refusals import check_action, refuse_action, refuse_step
+from multilift_marl.envs.step_kernels import TAKEN, Outcome, end_step, take_actions
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import bind
-from multilift_marl.mdp.failures import FIRST_OWN
 from multilift_marl.mdp.observations import observation_names
 from multilift_marl.rig.resolve import whole_ratio
 from multilift_marl.sensing.estimator import StateEstimator
@@ -182,7 +182,7 @@ class MultiliftVec:
         self.world.check_warnings()
         out_of_time, bad = self._end_step()
         if bad >= 0:
-            self._refuse_step(bad)
+            refuse_step(bad, self.outcome, len(self.failure_causes), self.task.name, self.reward_terms)
         # The task is asked at a time limit only: who fails has terminated before, and is no success.
         if out_of_time:
             truncated = self.outcome.flags[1]
@@ -315,18 +315,6 @@ class MultiliftVec:
                 self._checked = True
             self._stacked[e] = np.tile(self.task.observation[e], self.config.env.history)
 
-    def _refuse_step(self, env: int) -> None:
-        """Name the cause of failure that is none, or the reward term that is not finite, by a ConfigError."""
-        cause, most = int(self.outcome.cause[env]), len(self.failure_causes) - 1
-        if not 0 <= cause <= most:
-            raise ConfigError(
-                f"task {self.task.name} wrote {cause} as the cause of a failure in environment {env}; causes are 1 to "
-                f"{most}: those of failures.CAUSES, then its own FAILURES from failures.FIRST_OWN = {FIRST_OWN} on"
-            )
-        bad = ~np.isfinite(self.outcome.terms[env])
-        name = self.reward_terms[int(bad.argmax())] if bad.any() else "the sum"
-        raise ConfigError(f"reward term {name} is not finite in environment {env}; mend what computes it")
-
     def use_controller(self, controller: Controller, report: Callable[[SystemState], None] | None = None) -> None:
         """Let another controller of this world fly the drones from the next reset on.
 
@@ -358,28 +346,13 @@ class MultiliftVec:
 
     def _set_action(self, action: np.ndarray, ended: np.ndarray) -> None:
         """Take actions (E, N, A) unless an environment in `ended` (E,) cannot go on, or one of them cannot be."""
-        action = np.asarray(action)
-        if action.shape != self.task.action.shape:
-            raise ValueError(
-                f"action has shape {action.shape}, expected {self.task.action.shape} (environments, drones, numbers)"
-            )
-        if action.dtype.kind != "f":
-            raise ValueError(f"action has dtype {action.dtype}, expected floating point numbers in [-1, 1]")
+        action = check_action(action, self.task.action.shape)
         # Kernels are bound to this array, so actions of any float type are copied into it.
         np.copyto(self._given, action)
         self._halted[:] = ended
         taken = self._take_actions()
-        if taken == TAKEN:
-            return
-        if taken == ENDED:
-            raise RuntimeError(
-                f"environment {int(np.argmax(ended))} has ended or was never reset: call reset(mask=...) first"
-            )
-        e, n, k = np.argwhere(~np.isfinite(action))[0]
-        raise ValueError(
-            f"action of drone_{n} in environment {e} is not finite ({self.action_names[k]}={action[e, n, k]}); "
-            "look for NaN in the policy"
-        )
+        if taken != TAKEN:
+            refuse_action(taken, action, ended, self.action_names)
 
     def _info(self, success: np.ndarray, failure: np.ndarray, diverged: np.ndarray) -> dict[str, Any]:
         """Return info of the last step with these flags (E,), of which those of failures are of that step or none."""

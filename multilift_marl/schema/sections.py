@@ -41,9 +41,7 @@ class EnvConfig(Section):
     num_threads: Annotated[Int, Between(0, 1024)] = Field(
         0, ge=0, description="threads that step them; 0: one for each CPU"
     )
-    episode_seconds: Annotated[Float, Between(0, 1e6, "s")] = Field(
-        8.0, gt=0, description="[s] time limit of an episode"
-    )
+    episode_seconds: Annotated[Float, Between(0, 1e6, "s")] = Field(8.0, gt=0, description="[s] of an episode, at most")
     policy_hz: Annotated[Float, Between(1, 1e5, "Hz")] = Field(
         50.0, gt=0, description="[Hz] rate of actions and observations"
     )

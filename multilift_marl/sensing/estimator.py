@@ -34,7 +34,8 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.physical import GRAVITY
-from multilift_marl.sensing.sensors import Sensor, Sensors, SensorSuite, white
+from multilift_marl.sensing.sensors import Sensors
+from multilift_marl.sensing.suite import Sensor, SensorSuite, white
 from multilift_marl.sim.earth import Site
 from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World

@@ -33,7 +33,7 @@ from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.messages import NAMES, ODOMETRY, Topic, pose_stamped, setpoint_topics
 from multilift_marl.deploy.ros.types import read_pose
-from multilift_marl.sensing.sensors import Sensor
+from multilift_marl.sensing.suite import Sensor
 
 DOMAIN = 170 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 

@@ -9,7 +9,7 @@ from conftest import make
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.sensing import estimator
 from multilift_marl.sensing.estimator import StateEstimator, make_gains, steady_gain
-from multilift_marl.sensing.sensors import Sensor, SensorSuite
+from multilift_marl.sensing.suite import Sensor, SensorSuite
 
 DT = 0.004
 

@@ -7,7 +7,8 @@ import pytest
 from conftest import GRAVITY, hover_thrust, load, make_system
 
 from multilift_marl.errors import ConfigError
-from multilift_marl.sensing.sensors import SIZES, Sensor, Sensors, SensorSuite, random_walk, white
+from multilift_marl.sensing.sensors import SIZES, Sensors
+from multilift_marl.sensing.suite import Sensor, SensorSuite, random_walk, white
 from multilift_marl.sim import World
 from multilift_marl.sim.earth import (
     Site,

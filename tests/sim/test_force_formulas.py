@@ -13,7 +13,7 @@ from test_snatch import exact_peak
 from multilift_marl.control import disturbance
 from multilift_marl.control.disturbance import Disturbance, Rejection
 from multilift_marl.sensing import estimator
-from multilift_marl.sensing.sensors import SensorSuite
+from multilift_marl.sensing.suite import SensorSuite
 from multilift_marl.sim.cables import massless
 from multilift_marl.sim.cables.common import Cables
 from multilift_marl.sim.gusts import gust_factor

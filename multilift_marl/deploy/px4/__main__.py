@@ -144,7 +144,7 @@ def _fly_and_report(config: Config, bind: Maker | None, options: Options, build:
     """
     from multilift_marl.deploy.px4.flight import Flight
     from multilift_marl.deploy.px4.team import AutopilotTeam, Settings
-    from multilift_marl.sensing.sensors import SensorSuite
+    from multilift_marl.sensing.suite import SensorSuite
 
     suite = SensorSuite()
     suite = replace(suite, position=suite.position.scaled(options.position_errors))

@@ -24,7 +24,8 @@ from multilift_marl.errors import FlightError
 from multilift_marl.math3d import heading
 from multilift_marl.realtime import RealTime
 from multilift_marl.rig.system import System
-from multilift_marl.sensing.sensors import Sensors, SensorSuite
+from multilift_marl.sensing.sensors import Sensors
+from multilift_marl.sensing.suite import SensorSuite
 from multilift_marl.sim.earth import Site, project_local, swap_attitude, swap_enu_ned, swap_flu_frd, swap_yaw
 from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
