@@ -259,28 +259,33 @@ def run(command, folder, monkeypatch):
 
 
 def of_documents():
-    """Commands that follow one another in a folder, trainings first, and those that stand alone."""
-    first, alone = [], []
+    """Commands that train, those that follow one another after a training, and those that stand alone."""
+    train, follow, alone = [], [], []
     for command in sorted(set(commands())):
         script = shorter(command)[0]
         if (script.endswith(".py") or script in MAINS) and script != "results/reproduce.py":  # which tests compare
-            follows = script in ("train.py", "multilift_marl.export") or "=latest" in command or "runs/" in command
-            (first if follows else alone).append(command)
-    return sorted(first, key=lambda command: ("train.py" not in command, "resume" in command, command)), alone
+            follows = script == "multilift_marl.export" or "=latest" in command or "runs/" in command
+            (train if script == "train.py" and not follows else follow if follows else alone).append(command)
+    return train, sorted(follow, key=lambda command: ("resume" in command, "export " not in command, command)), alone
 
 
 @pytest.mark.slow
-def test_commands_that_train_and_what_follows_them_run(tmp_path, monkeypatch, registries):
+@pytest.mark.parametrize("command", of_documents()[0])
+def test_commands_that_train_run(command, tmp_path, monkeypatch, registries):
     (tmp_path / "results").symlink_to(ROOT / "results")  # whose scripts some recipes correct
-    seen = of_documents()[0]
-    assert sum("train.py" in command for command in seen) > 4
-    assert any("run=latest" in command for command in seen)
-    for command in seen:
+    run(command, tmp_path, monkeypatch)
+
+
+@pytest.mark.slow
+def test_commands_that_follow_a_training_run(tmp_path, monkeypatch, registries):
+    following = of_documents()[1]
+    assert any("run=latest" in command for command in following)
+    for command in ("python train.py config=hover", *following):
         run(command, tmp_path, monkeypatch)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", of_documents()[1])
+@pytest.mark.parametrize("command", of_documents()[2])
 def test_commands_of_documents_run(command, tmp_path, monkeypatch, registries):
     (tmp_path / "results").symlink_to(ROOT / "results")
     monkeypatch.setattr(plots, "_save", lambda *arguments: None)  # most of the time; see test_evaluation.py
