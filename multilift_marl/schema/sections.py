@@ -41,7 +41,9 @@ class EnvConfig(Section):
     num_threads: Annotated[Int, Between(0, 1024)] = Field(
         0, ge=0, description="threads that step them; 0: one for each CPU"
     )
-    episode_seconds: Annotated[Float, Between(0, 1e6, "s")] = Field(8.0, gt=0, description="[s] of an episode, at most")
+    episode_seconds: Annotated[Float, Between(0, 1e6, "s")] = Field(
+        8.0, gt=0, description="[s] time limit of an episode"
+    )
     policy_hz: Annotated[Float, Between(1, 1e5, "Hz")] = Field(
         50.0, gt=0, description="[Hz] rate of actions and observations"
     )
@@ -359,8 +361,7 @@ class RewardTerm(Section):
 
     weight: Annotated[Float, Between(-1e6, 1e6)] | None = Field(None, description="[-] None: the task's own")
     margin: tuple[Annotated[Float, Between(1e-6, 1e6)], ...] | None = Field(
-        None,
-        description="errors, one or a list, that halve its value, in the term's units; None: the task's own",
+        None, description="errors, one or a list, that halve its value, in the term's units; None: the task's own"
     )
 
     @model_validator(mode="before")
