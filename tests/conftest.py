@@ -3,7 +3,8 @@
 A test that takes `task` runs for every task, one that takes `num_drones` for every N, and one that takes `cables`, the
 configuration of a cable model, for both models. Of these, tasks that are not in `COMMON`, and for tasks other than
 `hover` all but two drones on massless cables, are marked `slow`; with the mark `few_tasks`, all but `hover`. Tests so
-marked are left out unless asked for by `-m slow`; each task has default tests of its own in `tests/tasks`.
+marked are left out unless asked for by `-m slow`; each task has default tests of its own in `tests/tasks`. Not all
+combinations are flown, see `is_redundant`.
 """
 
 from __future__ import annotations
@@ -75,6 +76,33 @@ SMALL = {
 }  # fmt: skip
 
 
+def asked_of(item: pytest.Item) -> dict:
+    """Return the parameters of a test."""
+    return item.callspec.params if hasattr(item, "callspec") else {}
+
+
+def own_parameters(item: pytest.Item) -> set[str]:
+    """Return the names of the parameters whose values the test gives itself."""
+    return {name for mark in item.iter_markers("parametrize") for name in _names(mark.args[0])}
+
+
+def is_redundant(item: pytest.Item) -> bool:
+    """Return whether others stand for a test: each task goes with each N and each cable model, not with each of both.
+
+    With `hover` all are combined. A test without N takes one cable model for each task that is not in `COMMON`, another
+    one for the next task and in the next test.
+    """
+    asked = {name: value for name, value in asked_of(item).items() if name not in own_parameters(item)}
+    if not {"task", "cables"} <= asked.keys() or asked["task"] == "hover":
+        return False
+    chosen = TASKS.index(asked["task"]) + list(CABLES.values()).index(asked["cables"])
+    if "num_drones" in asked:
+        if (asked["num_drones"], asked["cables"]) == (2, CABLES["massless"]):  # what default tests fly
+            return False
+        return (chosen + NUM_DRONES.index(asked["num_drones"])) % 2 == 1
+    return asked["task"] not in COMMON and (chosen + len(item.originalname)) % 2 == 1
+
+
 def pytest_generate_tests(metafunc):
     own = {name for mark in metafunc.definition.iter_markers("parametrize") for name in _names(mark.args[0])}
     for name, values, ids in (
@@ -87,13 +115,16 @@ def pytest_generate_tests(metafunc):
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
+    redundant = {item for item in items if is_redundant(item)}
+    config.hook.pytest_deselected(items=list(redundant))
+    items[:] = [item for item in items if item not in redundant]
     for item in items:
-        asked = item.callspec.params if hasattr(item, "callspec") else {}
+        asked = asked_of(item)
         task = asked.get("task", "hover")
         if task == "hover":
             continue
-        own = {name for mark in item.iter_markers("parametrize") for name in _names(mark.args[0])}
+        own = own_parameters(item)
         if "task" not in own and (task not in COMMON or item.get_closest_marker("few_tasks")):
             item.add_marker(pytest.mark.slow)
         if not {"num_drones", "cables"} & asked.keys():
