@@ -3,14 +3,12 @@
 The network flies, and learns what the teacher would have commanded at each step in the teacher's place; at first the
 teacher flies most episodes itself. The teacher may know the true states (`train.dagger.truth`) and read what no
 drone observes: what the network makes of it rests on each drone's own observation alone. All steps are kept, up to
-`train.dagger.capacity`, and learned from again and again; a running mean of the weights flies, which is steadier than
-any of them (Polyak & Juditsky 1992). Steps are not saved, nor is what a teacher plans: a training that is resumed
-begins new episodes, and collects anew.
+`train.dagger.capacity`, and learned from again and again. They are not saved, nor is what a teacher plans: a training
+that is resumed begins new episodes, and collects anew.
 """
 
 from __future__ import annotations
 
-import copy
 import os
 import time
 from typing import Any
@@ -67,11 +65,6 @@ class DaggerRollouts(LearningRollouts):
                 f"{size} steps take {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
                 "train.dagger.capacity"
             )
-        # What learns is a copy: the learner's actor is the mean of its weights.
-        self._student = copy.deepcopy(learner.actor)
-        self._student.normalizer = learner.actor.normalizer
-        learner.optimizer.param_groups[0]["params"] = list(self._student.parameters())
-        self._updates = 0
         self.observed = torch.zeros(size, n, vec.observation_size)
         self.taught = torch.zeros(size, n, vec.action_size)
         self.count = 0
@@ -117,8 +110,6 @@ class DaggerRollouts(LearningRollouts):
     def _learn(self, fresh: int) -> float:
         """Fit the policy to what is kept, `epochs` times as many steps as there are `fresh` ones; return the loss."""
         learner, train, kept = self._learner, self._train, min(self.count, len(self.observed))
-        if self._updates == 0:  # of a training that is resumed the weights come after all else
-            self._student.load_state_dict(learner.actor.state_dict())
         recent = torch.arange(max(self.count - fresh, 0), self.count) % len(self.observed)
         learner.actor.normalizer.update(self.observed[recent])
         size = max(fresh // train.minibatches, 1)
@@ -126,17 +117,12 @@ class DaggerRollouts(LearningRollouts):
         for _ in range(train.epochs * train.minibatches):
             chosen = torch.randint(kept, (size,))
             learner.optimizer.zero_grad(set_to_none=True)
-            answer = self._student(self.observed[chosen])[0]
-            loss = (answer - self.taught[chosen]).square().mean()
+            mean = learner.actor(self.observed[chosen])[0]
+            loss = (mean - self.taught[chosen]).square().mean()
             loss.backward()
-            parameters = [each for each in self._student.parameters() if each.grad is not None]
+            parameters = [each for each in learner.actor.parameters() if each.grad is not None]
             torch.nn.utils.clip_grad_norm_(parameters, train.max_grad_norm)
             learner.optimizer.step()
-            self._updates += 1
-            keep = min(self._settings.average, self._updates / (1 + self._updates))
-            with torch.no_grad():
-                for mean, own in zip(learner.actor.parameters(), self._student.parameters(), strict=True):
-                    mean.lerp_(own, 1 - keep)
             losses.append(loss.detach())
         return float(torch.stack(losses).mean())
 

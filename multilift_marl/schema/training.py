@@ -99,12 +99,6 @@ class DaggerConfig(Section):
     truth: bool = Field(True, description="whether it knows the true states of team and payload")
     capacity: Int = Field(500_000, ge=1, description="environment steps that are kept, the latest")
     handover: Int = Field(200_000, ge=0, description="environment steps within which the learner takes over from it")
-    average: Float = Field(
-        0.999,
-        ge=0,
-        lt=1,
-        description="[-] what the mean of the weights, which flies, keeps of itself at an update, at most",
-    )
     teacher_share: Float = Field(0.1, ge=0, le=1, description="[-] of episodes that it flies itself, at least")
 
 
