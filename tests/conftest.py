@@ -92,7 +92,8 @@ def is_redundant(item: pytest.Item) -> bool:
     With `hover` all are combined. A test without N takes one cable model for each task that is not in `COMMON`, another
     one for the next task and in the next test.
     """
-    asked = {name: value for name, value in asked_of(item).items() if name not in own_parameters(item)}
+    own = own_parameters(item)
+    asked = {name: value for name, value in asked_of(item).items() if name not in own}
     if not {"task", "cables"} <= asked.keys() or asked["task"] == "hover":
         return False
     chosen = TASKS.index(asked["task"]) + list(CABLES.values()).index(asked["cables"])
@@ -104,7 +105,7 @@ def is_redundant(item: pytest.Item) -> bool:
 
 
 def pytest_generate_tests(metafunc):
-    own = {name for mark in metafunc.definition.iter_markers("parametrize") for name in _names(mark.args[0])}
+    own = own_parameters(metafunc.definition)
     for name, values, ids in (
         ("task", TASKS, None),
         ("num_drones", NUM_DRONES, None),
@@ -154,11 +155,11 @@ def registries(tmp_path):
 @pytest.fixture(autouse=True)
 def _enough_drones(request):
     """Skip a task's tests with fewer drones than it makes sense with."""
-    asked = getattr(request.node, "callspec", None)
-    if asked is not None and {"task", "num_drones"} <= asked.params.keys():
-        least = find_task(asked.params["task"]).MIN_DRONES
-        if asked.params["num_drones"] < least:
-            pytest.skip(f"{asked.params['task']} needs {least} drones")
+    asked = asked_of(request.node)
+    if {"task", "num_drones"} <= asked.keys():
+        least = find_task(asked["task"]).MIN_DRONES
+        if asked["num_drones"] < least:
+            pytest.skip(f"{asked['task']} needs {least} drones")
 
 
 def _names(argument: str | tuple[str, ...]) -> list[str]:

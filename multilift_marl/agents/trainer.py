@@ -76,10 +76,10 @@ class Trainer:
         environment = self.curriculum.environment
         if initial is not None:
             initial.check(divide_rigs(environment))
-        envs, num_envs = make_envs(environment, self.curriculum.purpose), environment.env.num_envs
-        self.env, self.frames_per_batch = envs[0], num_envs * config.train.horizon
-        check_batch(config.train, self.env.vec, num_envs, len(envs))
-        self.learner = make_learner(config.train, self.env)
+        envs = make_envs(environment, self.curriculum.purpose)
+        self.frames_per_batch = environment.env.num_envs * config.train.horizon
+        check_batch(config.train, envs[0].vec, environment.env.num_envs, len(envs))
+        self.learner = make_learner(config.train, envs[0])
         self.taken_over = "" if initial is None else initial.take_over(self.learner, config)
         self._simulate(envs)
         # Rounded up: the last batch is a whole one, too.

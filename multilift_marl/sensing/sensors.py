@@ -41,7 +41,7 @@ from multilift_marl.math3d import (
 )
 from multilift_marl.physical import GRAVITY
 from multilift_marl.rng import normal_pair
-from multilift_marl.sensing.suite import SensorSuite
+from multilift_marl.sensing.suite import Sensor, SensorSuite, random_walk, white  # noqa: F401 (they were here)
 from multilift_marl.sim.earth import LAPSE, PRESSURE_EXPONENT, SEA_PRESSURE, SEA_TEMPERATURE, Site
 from multilift_marl.sim.state import SystemState
 

@@ -265,7 +265,8 @@ def of_documents():
         script = shorter(command)[0]
         if (script.endswith(".py") or script in MAINS) and script != "results/reproduce.py":  # which tests compare
             follows = script == "multilift_marl.export" or "=latest" in command or "runs/" in command
-            (train if script == "train.py" and not follows else follow if follows else alone).append(command)
+            kind = follow if follows else train if script == "train.py" else alone
+            kind.append(command)
     return train, sorted(follow, key=lambda command: ("resume" in command, "export " not in command, command)), alone
 
 
@@ -278,7 +279,8 @@ def test_commands_that_train_run(command, tmp_path, monkeypatch, registries):
 
 @pytest.mark.slow
 def test_commands_that_follow_a_training_run(tmp_path, monkeypatch, registries):
-    following = of_documents()[1]
+    trainings, following, _ = of_documents()
+    assert len(trainings) > 4
     assert any("run=latest" in command for command in following)
     for command in ("python train.py config=hover", *following):
         run(command, tmp_path, monkeypatch)

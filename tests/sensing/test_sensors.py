@@ -7,6 +7,7 @@ import pytest
 from conftest import GRAVITY, hover_thrust, load, make_system
 
 from multilift_marl.errors import ConfigError
+from multilift_marl.sensing import sensors, suite
 from multilift_marl.sensing.sensors import SIZES, Sensors
 from multilift_marl.sensing.suite import Sensor, SensorSuite, random_walk, white
 from multilift_marl.sim import World
@@ -291,3 +292,8 @@ def test_a_scaled_sensor_has_as_many_times_the_errors():
         )
     assert (twice.rate, twice.delay, twice.drift_time) == (usual.rate, usual.delay, usual.drift_time)
     assert not np.any(usual.scaled(0.0).noise)
+
+
+@pytest.mark.parametrize("name", ["Sensor", "SensorSuite", "random_walk", "white"])
+def test_what_sensors_are_made_of_is_found_where_it_was(name):
+    assert getattr(sensors, name) is getattr(suite, name)
