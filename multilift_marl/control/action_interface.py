@@ -83,6 +83,8 @@ class ControlContext(NamedTuple):
     thrust: np.ndarray
     """(E, N, 4) rotor thrusts, written [N]."""
     gains: Gains
+    obstacles: np.ndarray | None = None
+    """(E, N, k, 3) points of obstacles that the drones see, world frame [m]; None: they see none."""
 
 
 class Interface:

@@ -25,7 +25,9 @@ from multilift_marl.control.formation import Reference, Smoothing, smooth, smoot
 from multilift_marl.control.full_state import FullStateAction
 from multilift_marl.control.gains import drone_gains
 from multilift_marl.control.geometric import fly, fly_rates, hook_moment
+from multilift_marl.control.obstacle_margin import keep_clear
 from multilift_marl.control.setpoints import smooth_velocity, track_own_state, track_own_state_to_yaw
+from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, vec
 from multilift_marl.physical import GRAVITY
@@ -68,7 +70,7 @@ class ReferenceAction(Interface):
     def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
         smoothed = bind(smooth, lo, hi, team.reference, self._smoothing)
-        return smoothed, *super().control_step(lo, hi, team)
+        return *self._keep_clear(lo, hi, team), smoothed, *super().control_step(lo, hi, team)
 
     def control_step_moving_goal(
         self, lo: int, hi: int, plan: Call, set_action: Call, team: ControlContext
@@ -77,7 +79,19 @@ class ReferenceAction(Interface):
         before = Reference.zeros(*team.reference.yaw.shape)
         relative = bind(to_goal_frame, lo, hi, team.reference, team.goal, before)
         smoothed = bind(smooth_moving, lo, hi, team.reference, team.goal, before, self._smoothing)
-        return relative, plan, set_action, smoothed, *super().control_step(lo, hi, team)
+        kept = self._keep_clear(lo, hi, team)
+        return relative, plan, set_action, *kept, smoothed, *super().control_step(lo, hi, team)
+
+    def _keep_clear(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
+        margin = self.settings.obstacle_margin
+        if margin == 0.0:
+            return ()
+        if team.obstacles is None or team.obstacles.shape[2] == 0:
+            raise ConfigError(
+                f"control.obstacle_margin={margin:g} needs drones that see points of obstacles; set "
+                "env.obstacle_sensing=local, or leave it out"
+            )
+        return (bind(keep_clear, lo, hi, team, margin, self._smoothing),)
 
 
 class VelocityAction(Interface):

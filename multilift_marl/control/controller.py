@@ -6,7 +6,7 @@ import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.control.action_interface import Call, ControlContext
-from multilift_marl.control.actions import ACTIONS, AccRatesAction, PlannerWeightsAction
+from multilift_marl.control.actions import ACTIONS, AccRatesAction, PlannerWeightsAction, ReferenceAction
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
 from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.gains import make_gains
@@ -35,7 +35,7 @@ class Controller:
         disturbance: what `control.disturbance` remembers, None without.
 
     Raises:
-        ConfigError: an interface and a rejection that do not go together.
+        ConfigError: an interface and a rejection, or a margin, that do not go together.
     """
 
     def __init__(self, config: Config, world: World, state: SystemState | None = None):
@@ -47,6 +47,11 @@ class Controller:
         self.command_size = len(self.action_names)
         if isinstance(self.interface, PlannerWeightsAction):
             self.command_size = len(AccRatesAction.numbers)
+        if settings.obstacle_margin and not isinstance(self.interface, ReferenceAction):
+            raise ConfigError(
+                f"control.obstacle_margin={settings.obstacle_margin:g} keeps set-points of control.action=reference "
+                f"clear, not those of {settings.action}; take that one, or leave it out"
+            )
         self.reference = Reference.zeros(e, n)
         self.disturbance: Disturbance | None = None
         self._setpoint = Setpoint.zeros(e, n)
@@ -64,8 +69,9 @@ class Controller:
             self._rejection = make_rejection(settings, world.system, self.gains, dt)
 
     def bind(
-        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
-    ) -> tuple[Call, tuple[Call, ...]]:
+        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None,
+        obstacles: np.ndarray | None = None,
+    ) -> tuple[Call, tuple[Call, ...]]:  # fmt: skip
         """Return what environments lo to hi call once for each policy step, and in turn at each control step.
 
         Args:
@@ -73,13 +79,14 @@ class Controller:
             action: (E, N, A), live array.
             goal: of the task.
             plan: moves the goals on by one control step; None if they stay.
+            obstacles: see `ControlContext`.
         """
         state, thrust, g = self.state, self.world.thrust, self.gains
         rejection = self.disturbance
         # The same arrays in every step: kernels are bound to them.
         nominal = self._setpoint.cable_force if self.interface.commands_force else goal.cable_force
         cable_force = nominal if rejection is None else rejection.cable_force
-        team = ControlContext(state, goal, self.reference, self._setpoint, cable_force, thrust, g)
+        team = ControlContext(state, goal, self.reference, self._setpoint, cable_force, thrust, g, obstacles)
         set_action = self.interface.set_action(lo, hi, action, team)
         control_step = (
             self.interface.control_step(lo, hi, team)

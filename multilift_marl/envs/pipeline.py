@@ -59,7 +59,8 @@ def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[St
     own, every = task.numpy, (0, world.num_envs)
     before = [Stage("goals (NumPy)", partial(own.plan_goals, *every), is_whole=True)] if own.plans else []
     plan = on_shard.get("plan")
-    set_action, control = controller.bind(lo, hi, arriving, task.planned, plan)
+    seen = None if sensing.obstacles is None else sensing.obstacles.readings.placed
+    set_action, control = controller.bind(lo, hi, arriving, task.planned, plan, seen)
     if sensing.delays_action:
         before.append(Stage("delay action", partial(sensing.bind_send(commands), lo, hi)))
     before.append(Stage("set action", set_action))

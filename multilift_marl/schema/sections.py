@@ -243,6 +243,9 @@ class ControlConfig(Section):
     reference_speed: Annotated[Float, Between(1e-3, 50, "m/s")] = Field(
         1.0, gt=0, description="[m/s] speed limit of the smoothed reference"
     )
+    obstacle_margin: Annotated[Float, Between(0, 10, "m")] = Field(
+        0.0, description="[m] that set-points of `reference` keep from obstacles the drone sees; 0: none"
+    )
     position_frequency: Annotated[Float | None, Between(0.01, 1000, "rad/s")] = Field(
         4.0, gt=0, description="[rad/s] of the position loop; at most 1/5 of attitude's; None: that"
     )

@@ -123,7 +123,9 @@ class Sensing:
         self.load = self._load_sensing.load if self._load_sensing else true_load(self.state)
         self.measures = has_noise or estimator is not None
         self.errors = Errors.zeros(e, self.load.position.shape[1]) if self.measures else None
-        self.obstacles = None if config.env.obstacle_sensing == "none" else ObstacleSensing(config, world)
+        self.obstacles: ObstacleSensing | None = None
+        if config.env.obstacle_sensing != "none":
+            self.obstacles = ObstacleSensing(config, world, self.state if estimator is None else estimator.state)
         self.enabled = self.measures or self.delays_observation or self.delays_action or self.obstacles is not None
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:

@@ -25,6 +25,7 @@ from multilift_marl.rig.resolve import whole_ratio
 from multilift_marl.rng import normal_pair, normal_vector
 from multilift_marl.sim.obstacle_distance import point_distance, ray_distance
 from multilift_marl.sim.obstacles import NONE, Obstacles, make_hulls
+from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
 
@@ -60,6 +61,8 @@ class ObstacleReadings(NamedTuple):
     """(E, K, N, P) the last ones of the last policy steps, at their number modulo K [m]."""
     observed: np.ndarray
     """(E, N, P) what drones observe [m]."""
+    placed: np.ndarray
+    """(E, N, k, 3) world frame: the points that they observe, from where they take themselves to be [m]."""
 
 
 class ObstacleSensing:
@@ -68,6 +71,7 @@ class ObstacleSensing:
     Args:
         config: `env.obstacle_sensing`, not none, and `env.obstacles`.
         world: the teams and obstacles.
+        own: what the drones know of themselves.
 
     Attributes:
         readings: ObstacleReadings; live.
@@ -77,7 +81,7 @@ class ObstacleSensing:
         ConfigError: a rate that does not divide `env.policy_hz`.
     """
 
-    def __init__(self, config: Config, world: World):
+    def __init__(self, config: Config, world: World, own: SystemState):
         mode, given, rate = config.env.obstacle_sensing, config.env.obstacles, config.env.policy_hz
         period = 1 if given.rate is None else whole_ratio(rate, given.rate, "env.obstacles.rate", "env.policy_hz")
         azimuth = 2 * pi * np.arange(given.beams) / given.beams
@@ -91,14 +95,14 @@ class ObstacleSensing:
         e, n = world.num_envs, world.num_drones
         shape = e, n, count_readings(config.env)
         held = np.zeros((e, sensor.delay + 1, *shape[1:]))
-        self.readings = ObstacleReadings(
-            np.zeros(e, np.uint64), np.zeros(e, np.int64), np.zeros(shape), held, np.zeros(shape)
-        )
+        drawn, placed = np.zeros(e, np.uint64), np.zeros((e, n, sensor.points, 3))
+        self.readings = ObstacleReadings(drawn, np.zeros(e, np.int64), np.zeros(shape), held, np.zeros(shape), placed)
         distances = np.zeros((e, n, max(sensor.points, 1)))
         drones = world.state.drone_position, world.state.drone_rotation
+        known = own.drone_position, own.drone_rotation
         obstacles = _needed(world.obstacles), make_hulls(world.system.scenery)
         self.sense: Callable[[int, int], None] = prebind(
-            sense_obstacles, *drones, *obstacles, sensor, self.readings, distances
+            sense_obstacles, *drones, *known, *obstacles, sensor, self.readings, distances
         )
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:
@@ -115,12 +119,15 @@ def _needed(obstacles: Obstacles) -> Obstacles:
 
 
 @kernel
-def sense_obstacles(lo, hi, position, rotation, obstacles, hulls, sensor, readings, distances):
+def sense_obstacles(
+    lo, hi, position, rotation, own_position, own_rotation, obstacles, hulls, sensor, readings, distances
+):
     """Measure in environments lo to hi where it is time, and observe what was measured `delay` steps ago.
 
     Args:
         lo, hi: the environments.
         position, rotation: of the drones, true (E, N, 3) [m], (E, N, 3, 3).
+        own_position, own_rotation: as they know them.
         obstacles, hulls: see `sim.obstacle_distance`.
         sensor: ObstacleSensor.
         readings: ObstacleReadings, written.
@@ -144,6 +151,12 @@ def sense_obstacles(lo, hi, position, rotation, obstacles, hulls, sensor, readin
             for k in range(latest.shape[0]):
                 readings.held[e, now % count, n, k] = latest[k]
                 readings.observed[e, n, k] = readings.held[e, then % count, n, k]
+            yaw = heading(mat(own_rotation, e, n))
+            c, s = cos(yaw), sin(yaw)
+            for j in range(sensor.points):
+                observed = readings.observed[e, n, 3 * j : 3 * j + 3]
+                point = (observed[0], observed[1], observed[2])
+                put(readings.placed[e, n, j], add(vec(own_position, e, n), turn(c, s, point)))
         readings.steps[e] = now + 1
 
 

@@ -28,10 +28,11 @@ class ForwardedSetpoints(TopicAutopilots):
         self._team = team
 
     def bind(
-        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
-    ) -> tuple[Call, tuple[Call, ...]]:
+        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None,
+        obstacles: np.ndarray | None = None,
+    ) -> tuple[Call, tuple[Call, ...]]:  # fmt: skip
         """See `Controller.bind`; the autopilots fly in place of the last call."""
-        hear, steps = super().bind(lo, hi, action, goal, plan)
+        hear, steps = super().bind(lo, hi, action, goal, plan, obstacles)
         return hear, (*steps[:-1], self._tick)
 
     def _tick(self) -> None:

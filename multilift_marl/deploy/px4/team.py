@@ -320,10 +320,11 @@ class AutopilotController(Controller):
         self._team, self._action = team, config.control.action
 
     def bind(
-        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
-    ) -> tuple[Call, tuple[Call, ...]]:
+        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None,
+        obstacles: np.ndarray | None = None,
+    ) -> tuple[Call, tuple[Call, ...]]:  # fmt: skip
         """See `Controller.bind`; the autopilots fly in place of the last call."""
-        set_action, steps = super().bind(lo, hi, action, goal, plan)
+        set_action, steps = super().bind(lo, hi, action, goal, plan, obstacles)
 
         def send(i: int) -> None:
             own = self.reference

@@ -1,0 +1,118 @@
+"""Set-points that keep clear of what a drone sees: where they are put, and what that spares a team."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import multilift_marl as ml
+from multilift_marl.control.formation import Goal, Reference, Smoothing
+from multilift_marl.control.obstacle_margin import LAG, keep_clear
+from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
+
+SMOOTHING = Smoothing(6.0, 1.0, 0.004)
+ALONE = {
+    "scene.reserved": 0, "task_options.level": "given", "task_options.start": [-4, 0, 1.5],
+    "task_options.goal": [4, 0, 1.5], "task_options.start_radius": 0.0, "env.num_envs": 1, "env.num_threads": 1,
+}  # fmt: skip
+AHEAD = 0.56  # [m] beside the line: about where the front left drone flies
+
+
+def make(**keys) -> MultiliftVec:
+    pillar = {"shape": "cylinder", "size": [0.3, 6], "position": [0, AHEAD, 3]}
+    return ml.make_vec("navigate_senses", **ALONE, **{"scene.obstacles": [pillar]}, **keys)
+
+
+def keep(place, command, points, margin, velocity=(0.0, 0.0, 0.0)):
+    """Return where the command (3,) of one drone is put."""
+    goal, reference = Goal.zeros(1, 1), Reference.zeros(1, 1)
+    goal.velocity[0], reference.command[0, 0] = velocity, command
+    state = SimpleNamespace(drone_position=np.array(place, float).reshape(1, 1, 3))
+    team = SimpleNamespace(
+        goal=goal, reference=reference, state=state, obstacles=np.array(points, float).reshape(1, 1, -1, 3)
+    )
+    keep_clear.py_func(0, 1, team, margin, SMOOTHING)
+    return reference.command[0, 0].copy()
+
+
+def test_a_set_point_within_the_margin_is_put_on_its_edge():
+    assert keep((0, 0, 0), (2, 0.5, 0.1), [(1, 0, 0)], 0.4) == pytest.approx((0.6, 0.5, 0.1))
+
+
+def test_a_drone_within_the_margin_is_sent_out_of_it():
+    assert keep((0, 0, 0), (0, 0, 0), [(0.25, 0, 0)], 0.4) == pytest.approx((-0.15, 0, 0))
+
+
+def test_set_points_beyond_the_margin_stay():
+    for command in ((0.5, 3, 1), (-7, 0, 0)):
+        assert keep((0, 0, 0), command, [(1, 0, 0)], 0.4) == pytest.approx(command, abs=0)
+
+
+def test_where_the_goal_moves_the_reference_comes_to_rest_in_the_world_at_the_edge():
+    """A command that stays in the world retreats beside a goal that moves: its filter lags by that times LAG/ω."""
+    speed = 0.8
+    kept = keep((0, 0, 0), (2, 0, 0), [(1, 0, 0)], 0.4, (speed, 0, 0))
+    assert kept == pytest.approx((0.6 - LAG / SMOOTHING.frequency * speed, 0, 0))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_among_several_obstacles_it_is_in_no_margin(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (4, 3))
+    points *= rng.uniform(0.55, 2.0, (4, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    kept = keep((0, 0, 0), rng.uniform(-4, 4, 3), points, 0.5)
+    far = np.linalg.norm(points, axis=1)
+    assert (((points - kept) * points).sum(axis=1) / far > 0.4).all()
+
+
+def test_a_drone_that_touches_a_point_is_not_sent_to_nan():
+    assert np.isfinite(keep((0, 0, 0), (1, 0, 0), [(0, 0, 0)], 0.4)).all()
+
+
+@pytest.mark.parametrize(("margin", "touches"), [(0.0, True), (0.35, False)])
+def test_a_drone_that_is_led_into_a_pillar_stops_before_it(margin, touches):
+    vec = make(**{"control.obstacle_margin": margin, "control.max_offset": 4.0})
+    vec.reset(seed=0)
+    front = int(np.argmax(vec.task.goal.slots[0] @ [1, 1, 0]))
+    least, ended = np.inf, False
+    while not ended and vec.task.time[0] < 8.3:
+        _, _, terminated, _, _ = vec.step(np.zeros((1, 4, 4)))
+        ended = bool(terminated[0])
+        least = min(least, np.linalg.norm(vec.world.state.drone_position[0, front, :2] - [0, AHEAD]) - 0.15)
+    assert ended == touches
+    if not touches:
+        assert least > 0.2
+
+
+def test_it_knows_what_drones_observe_where_they_take_themselves_to_be():
+    vec = make(**{
+        "control.obstacle_margin": 0.35, "env.sensing": "onboard", "env.obstacles.noise": 0.05,
+        "env.obstacles.delay": 2, "train.observe": None,
+    })  # fmt: skip
+    vec.reset(seed=0)
+    for _ in range(150):
+        vec.step(np.zeros((1, 4, 4)))
+    readings, own = vec.task.view.obstacle_readings, vec.task.view.estimated
+    rotation = own.drone_rotation[0]
+    yaw = np.arctan2(-rotation[:, 0, 1], rotation[:, 1, 1])
+    c, s, points = np.cos(yaw)[:, None], np.sin(yaw)[:, None], readings[0].reshape(4, -1, 3)
+    turned = np.stack(
+        [c * points[..., 0] - s * points[..., 1], s * points[..., 0] + c * points[..., 1], points[..., 2]]
+    )
+    placed = vec._sensing.obstacles.readings.placed[0]
+    assert placed == pytest.approx(own.drone_position[0][:, None] + np.moveaxis(turned, 0, -1))
+    assert np.abs(own.drone_position[0] - vec.world.state.drone_position[0]).max() > 1e-4
+
+
+def test_it_needs_points_and_positions():
+    with pytest.raises(
+        ConfigError, match=r"obstacle_margin=0\.3 needs drones that see points .*obstacle_sensing=local"
+    ):
+        ml.make_vec("hover", **{"control.obstacle_margin": 0.3})
+    with pytest.raises(ConfigError, match=r"obstacle_margin=0\.3 .*ranges|obstacle_margin=0\.3 needs"):
+        ml.make_vec("navigate_senses", **{"control.obstacle_margin": 0.3, "env.obstacle_sensing": "ranges"})
+    with pytest.raises(ConfigError, match=r"control\.action=reference clear, not those of velocity"):
+        ml.make_vec("navigate_senses", **{"control.obstacle_margin": 0.3, "control.action": "velocity"})
