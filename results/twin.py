@@ -1,8 +1,9 @@
-"""Compare a learned team with its linear twin: `python results/twin.py policy=<run> [episodes=200] [others=a,b]`.
+"""Compare learned teams with their linear twins: `python results/twin.py policy=<run>[,<run>] [others=a,b]`.
 
 The twin is the linear map of the same observation, with a constant, that fits the learned team's actions best: by least
 squares over the steps of `rounds=4` batches of flights, the first flown by the learned team, the others by the twin so
-far, with what the learned team would have done. Both, and other baselines by name, fly the same evaluation episodes.
+far, with what the learned team would have done. All, and other baselines by name, fly the same `episodes=200`.
+Of several training seeds, differences are to their mean in each episode.
 `table=<file>` is a CSV file that the rows go to; further arguments change the configuration.
 """
 
@@ -35,6 +36,11 @@ class Linear:
 
     def __init__(self, matrix: np.ndarray):
         self.matrix = matrix
+
+    @classmethod
+    def bind(cls, matrix: np.ndarray, vec: MultiliftVec) -> Linear:
+        """Return one that flies environments."""
+        return cls(matrix)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return actions (E, N, A)."""
@@ -88,25 +94,28 @@ def main(arguments: list[str]) -> None:
     values: dict[str, Any] = parse_overrides(arguments)
     own = {"episodes": 200, "rounds": 4, "others": "", "table": None}
     own = {key: values.pop(key, default) for key, default in own.items()}
-    name, episodes = values.pop("policy"), int(own["episodes"])
-    policy = load_policy(name)
-    config = build_config(policy.config.model_dump(), values)
-    matrix = fit(config, policy.bind, int(own["rounds"]))
-    teams: dict[str, Callable[[MultiliftVec], Policy]] = {"learned": policy.bind}
-    teams["linear twin"] = lambda vec: Linear(matrix)
+    names, episodes = values.pop("policy").split(","), int(own["episodes"])
+    policies = [load_policy(name) for name in names]
+    config = build_config(policies[0].config.model_dump(), values)
+    seeds = [f" of seed {policy.config.seed}" if len(policies) > 1 else "" for policy in policies]
+    teams: dict[str, Callable[[MultiliftVec], Policy]] = {}
+    for seed, policy in zip(seeds, policies, strict=True):
+        matrix = fit(config, policy.bind, int(own["rounds"]))
+        teams |= {f"learned{seed}": policy.bind, f"linear twin{seed}": partial(Linear.bind, matrix)}
     for other in filter(None, own["others"].split(",")):
         teams[other] = partial(make_scripted, other)
     flown = {
         who: run_episodes(config, make, episodes, EVALUATION)["success_rate"].astype(float)
         for who, make in teams.items()
     }
+    learned = np.mean([flown[f"learned{seed}"] for seed in seeds], axis=0)
     rows = []
     for who, success in flown.items():
         low, high = (100 * each for each in wilson(int(success.sum()), episodes))
         row = {"team": who, "episodes": episodes, "success_percent": f"{100 * success.mean():.1f}"}
         row |= {"ci95": f"{low:.1f}-{high:.1f}"}
-        if who != "learned":
-            low, high = (100 * each for each in bootstrap(flown["learned"] - success))
+        if not who.startswith("learned"):
+            low, high = (100 * each for each in bootstrap(learned - success))
             row["learned_minus_this"] = f"{low:.1f} to {high:.1f}"
         rows.append(row)
         print(*(f"{key}={value}" for key, value in row.items()))

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from multilift_marl.agents.learning_rollouts import LearningRollouts, join_steps, list_step
 from multilift_marl.agents.mappo import Learner
@@ -27,6 +28,8 @@ from multilift_marl.policies.policy import OwnPolicy, Policy
 from multilift_marl.policies.truth import with_truth
 from multilift_marl.schema.training import TrainConfig
 
+SMALL = 0.05
+"""[-] differences of actions below which they are squared: above it the network takes sides, and no mean."""
 TEACHER = 4  # purpose of seeds, beside those of `envs/core.py` and `rollouts.NOISE`
 
 
@@ -118,7 +121,7 @@ class DaggerRollouts(LearningRollouts):
             chosen = torch.randint(kept, (size,))
             learner.optimizer.zero_grad(set_to_none=True)
             mean = learner.actor(self.observed[chosen])[0]
-            loss = (mean - self.taught[chosen]).square().mean()
+            loss = functional.smooth_l1_loss(mean, self.taught[chosen], beta=SMALL)
             loss.backward()
             parameters = [each for each in learner.actor.parameters() if each.grad is not None]
             torch.nn.utils.clip_grad_norm_(parameters, train.max_grad_norm)

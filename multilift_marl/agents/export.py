@@ -25,6 +25,7 @@ from multilift_marl.control.action_interface import THRUST, ControlContext
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.gains import make_gains
+from multilift_marl.control.obstacle_margin import Margins
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.errors import CheckpointError, ConfigError
 from multilift_marl.mdp.env_data import INTEGRAL_LIMIT
@@ -241,7 +242,9 @@ def _describe_action(policy: LearnedPolicy) -> dict[str, Any]:
         low, zero, high = next(thrusts) if full is None else (-full, 0.0, full)
         scale = {"at_minus_one": low, "at_zero": zero, "at_one": high}
         numbers.append({"name": name, "frame": frame, "unit": unit, "meaning": meaning, **scale})
-    return {
+    margins = Margins.of(control)
+    kept = {"margins": margins._asdict()} if any(margins) else {}
+    return kept | {
         "interface": control.action,
         "shape": ["batch", "drones", len(numbers)],
         "dtype": "float32",

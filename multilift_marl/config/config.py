@@ -10,9 +10,10 @@ from pydantic import AfterValidator, Field
 from multilift_marl.config.units import scale_control
 from multilift_marl.rig.resolve import resolve_system
 from multilift_marl.rig.system import System
+from multilift_marl.schema.control import ControlConfig
 from multilift_marl.schema.files import pin_options
 from multilift_marl.schema.planner import PlannerConfig
-from multilift_marl.schema.sections import ControlConfig, RewardTerm, SystemConfig
+from multilift_marl.schema.sections import RewardTerm, SystemConfig
 from multilift_marl.schema.training import EvalConfig, TrainConfig
 
 

@@ -13,7 +13,7 @@ from math import sqrt
 import numpy as np
 
 from multilift_marl.rig.system import System
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 
 _POWERS = {  # of length and time in each unit
     "m": (1, 0), "m/s": (1, -1), "m/s²": (1, -2), "m/s³": (1, -3), "m s": (1, 1), "s": (0, 1), "rad/s": (0, -1),

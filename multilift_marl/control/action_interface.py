@@ -18,10 +18,11 @@ import numpy as np
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.gains import Gains
 from multilift_marl.control.geometric import fly
+from multilift_marl.control.obstacle_margin import Surroundings
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import turn
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 from multilift_marl.sim.state import SystemState
 
 Call = Callable[[], None]
@@ -83,8 +84,8 @@ class ControlContext(NamedTuple):
     thrust: np.ndarray
     """(E, N, 4) rotor thrusts, written [N]."""
     gains: Gains
-    obstacles: np.ndarray | None = None
-    """(E, N, k, 3) points of obstacles that the drones see, world frame [m]; None: they see none."""
+    around: Surroundings | None = None
+    """What drones know of it; None where no set-point is kept clear."""
 
 
 class Interface:

@@ -25,13 +25,12 @@ from multilift_marl.control.formation import Reference, Smoothing, smooth, smoot
 from multilift_marl.control.full_state import FullStateAction
 from multilift_marl.control.gains import drone_gains
 from multilift_marl.control.geometric import fly, fly_rates, hook_moment
-from multilift_marl.control.obstacle_margin import keep_clear
+from multilift_marl.control.obstacle_margin import Margins, keep_clear
 from multilift_marl.control.setpoints import smooth_velocity, track_own_state, track_own_state_to_yaw
-from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, vec
 from multilift_marl.physical import GRAVITY
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 
 PLANNER_WEIGHTS = {
     "position": "the payload's horizontal position",
@@ -83,15 +82,8 @@ class ReferenceAction(Interface):
         return relative, plan, set_action, *kept, smoothed, *super().control_step(lo, hi, team)
 
     def _keep_clear(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
-        margin = self.settings.obstacle_margin
-        if margin == 0.0:
-            return ()
-        if team.obstacles is None or team.obstacles.shape[2] == 0:
-            raise ConfigError(
-                f"control.obstacle_margin={margin:g} needs drones that see points of obstacles; set "
-                "env.obstacle_sensing=local, or leave it out"
-            )
-        return (bind(keep_clear, lo, hi, team, margin, self._smoothing),)
+        margins = Margins.of(self.settings)
+        return (bind(keep_clear, lo, hi, team, margins, self._smoothing),) if any(margins) else ()
 
 
 class VelocityAction(Interface):

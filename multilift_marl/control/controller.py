@@ -6,10 +6,11 @@ import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.control.action_interface import Call, ControlContext
-from multilift_marl.control.actions import ACTIONS, AccRatesAction, PlannerWeightsAction, ReferenceAction
+from multilift_marl.control.actions import ACTIONS, AccRatesAction, PlannerWeightsAction
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
 from multilift_marl.control.formation import Goal, Reference, start_reference
 from multilift_marl.control.gains import make_gains
+from multilift_marl.control.obstacle_margin import Surroundings, check_margins
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import bind
@@ -47,11 +48,7 @@ class Controller:
         self.command_size = len(self.action_names)
         if isinstance(self.interface, PlannerWeightsAction):
             self.command_size = len(AccRatesAction.numbers)
-        if settings.obstacle_margin and not isinstance(self.interface, ReferenceAction):
-            raise ConfigError(
-                f"control.obstacle_margin={settings.obstacle_margin:g} keeps set-points of control.action=reference "
-                f"clear, not those of {settings.action}; take that one, or leave it out"
-            )
+        check_margins(config)
         self.reference = Reference.zeros(e, n)
         self.disturbance: Disturbance | None = None
         self._setpoint = Setpoint.zeros(e, n)
@@ -70,7 +67,7 @@ class Controller:
 
     def bind(
         self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None,
-        obstacles: np.ndarray | None = None,
+        around: Surroundings | None = None,
     ) -> tuple[Call, tuple[Call, ...]]:  # fmt: skip
         """Return what environments lo to hi call once for each policy step, and in turn at each control step.
 
@@ -79,14 +76,14 @@ class Controller:
             action: (E, N, A), live array.
             goal: of the task.
             plan: moves the goals on by one control step; None if they stay.
-            obstacles: see `ControlContext`.
+            around: see `ControlContext`.
         """
         state, thrust, g = self.state, self.world.thrust, self.gains
         rejection = self.disturbance
         # The same arrays in every step: kernels are bound to them.
         nominal = self._setpoint.cable_force if self.interface.commands_force else goal.cable_force
         cable_force = nominal if rejection is None else rejection.cable_force
-        team = ControlContext(state, goal, self.reference, self._setpoint, cable_force, thrust, g, obstacles)
+        team = ControlContext(state, goal, self.reference, self._setpoint, cable_force, thrust, g, around)
         set_action = self.interface.set_action(lo, hi, action, team)
         control_step = (
             self.interface.control_step(lo, hi, team)

@@ -16,7 +16,7 @@ from multilift_marl.math3d import add, column, limit, mat, mul, norm, put, scale
 from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.constants import make_rig
 from multilift_marl.rig.system import System
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 
 # Bandwidth over ω_p m/(m + m_L), at most: ω_p of the position loop, m and m_L the masses of a drone and of its load.
 # The share m_L/(m + m_L) of a thrust comes back through the cable, which slows any loop around the drone. Faster,

@@ -20,7 +20,7 @@ from multilift_marl.control.action_interface import (
 )
 from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import add, norm, put, row, scale, turn, vec
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 
 
 class FullStateAction(Interface):

@@ -12,7 +12,7 @@ from multilift_marl.math3d import row
 from multilift_marl.physical import GRAVITY
 from multilift_marl.rig.constants import make_rig
 from multilift_marl.rig.system import System
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 
 POSITION_RATIO = 5.0  # attitude's natural frequency over position's, at least
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.control.controller import Controller
+from multilift_marl.control.obstacle_margin import Surroundings, sector_planes
 from multilift_marl.kernels.jit import bind, kernel_name
 from multilift_marl.mdp.observation_kernels import stack
 from multilift_marl.sensing.estimator import StateEstimator
@@ -59,8 +60,10 @@ def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[St
     own, every = task.numpy, (0, world.num_envs)
     before = [Stage("goals (NumPy)", partial(own.plan_goals, *every), is_whole=True)] if own.plans else []
     plan = on_shard.get("plan")
-    seen = None if sensing.obstacles is None else sensing.obstacles.readings.placed
-    set_action, control = controller.bind(lo, hi, arriving, task.planned, plan, seen)
+    seen, load = sensing.obstacles, sensing.load
+    points = np.zeros((world.num_envs, world.num_drones, 0, 3)) if seen is None else seen.readings.placed
+    around = Surroundings(points, load.position, load.rotation, sector_planes(world.system.slot_azimuth))
+    set_action, control = controller.bind(lo, hi, arriving, task.planned, plan, around)
     if sensing.delays_action:
         before.append(Stage("delay action", partial(sensing.bind_send(commands), lo, hi)))
     before.append(Stage("set action", set_action))

@@ -16,7 +16,7 @@ from multilift_marl.mdp.failures import MAX_DISTANCE, Limits
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.trajectory import attitude_of
 from multilift_marl.rig.system import System
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 
 MAX_LEAP = MAX_DISTANCE - 0.25  # [m] from a target to the next one: nearer than what counts as failure
 CLEARANCE = 0.1  # [m] of the payload from the ground at a target

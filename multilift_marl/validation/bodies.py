@@ -12,7 +12,7 @@ from multilift_marl.control.geometric import fly
 from multilift_marl.math3d import axis_angle, quat_to_mat
 from multilift_marl.physical import AIR_DENSITY, GRAVITY
 from multilift_marl.rig.presets import PRESETS
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.world import World
 from multilift_marl.validation.cables import hanging_load

@@ -12,7 +12,7 @@ import multilift_marl as ml
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.math3d import heading
 from multilift_marl.policies.baselines import make_scripted
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 
 OTHERS = [name for name in ACTIONS if name != "reference"]
 CALM = {

@@ -15,7 +15,7 @@ from multilift_marl.control.geometric import attitude_torque, desired_rates
 from multilift_marl.math3d import axis_angle, thrust_frame
 from multilift_marl.rig.presets import PRESETS
 from multilift_marl.rig.vehicle import Vehicle
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 from multilift_marl.sim import World
 
 FALCON = PRESETS["falcon"]

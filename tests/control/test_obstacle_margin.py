@@ -9,7 +9,7 @@ import pytest
 
 import multilift_marl as ml
 from multilift_marl.control.formation import Goal, Reference, Smoothing
-from multilift_marl.control.obstacle_margin import LAG, keep_clear
+from multilift_marl.control.obstacle_margin import LAG, Margins, Surroundings, keep_clear, sector_planes
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
 
@@ -18,6 +18,7 @@ ALONE = {
     "scene.reserved": 0, "task_options.level": "given", "task_options.start": [-4, 0, 1.5],
     "task_options.goal": [4, 0, 1.5], "task_options.start_radius": 0.0, "env.num_envs": 1, "env.num_threads": 1,
 }  # fmt: skip
+AZIMUTHS = np.radians([40.0, 140.0, 220.0, 320.0])
 AHEAD = 0.56  # [m] beside the line: about where the front left drone flies
 
 
@@ -26,15 +27,19 @@ def make(**keys) -> MultiliftVec:
     return ml.make_vec("navigate_senses", **ALONE, **{"scene.obstacles": [pillar]}, **keys)
 
 
-def keep(place, command, points, margin, velocity=(0.0, 0.0, 0.0)):
-    """Return where the command (3,) of one drone is put."""
-    goal, reference = Goal.zeros(1, 1), Reference.zeros(1, 1)
+def keep(place, command, points=(), margin=0.0, velocity=(0.0, 0.0, 0.0), payload=((0.0, 0.0, -1.0), 0.0), **margins):
+    """Return where the command (3,) of the first of four drones is put; `payload`: position and heading."""
+    goal, reference, (position, yaw) = Goal.zeros(1, 1), Reference.zeros(1, 1), payload
     goal.velocity[0], reference.command[0, 0] = velocity, command
     state = SimpleNamespace(drone_position=np.array(place, float).reshape(1, 1, 3))
-    team = SimpleNamespace(
-        goal=goal, reference=reference, state=state, obstacles=np.array(points, float).reshape(1, 1, -1, 3)
-    )
-    keep_clear.py_func(0, 1, team, margin, SMOOTHING)
+    c, s = np.cos(yaw), np.sin(yaw)
+    around = Surroundings(
+        np.array(points, float).reshape(1, 1, -1, 3), np.array(position, float).reshape(1, 1, 3),
+        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).reshape(1, 1, 3, 3), sector_planes(AZIMUTHS),
+    )  # fmt: skip
+    team = SimpleNamespace(goal=goal, reference=reference, state=state, around=around)
+    kept = Margins(margin, margins.get("load", 0.0), margins.get("sector", 0.0))
+    keep_clear.py_func(0, 1, team, kept, SMOOTHING)
     return reference.command[0, 0].copy()
 
 
@@ -66,6 +71,37 @@ def test_among_several_obstacles_it_is_in_no_margin(seed):
     kept = keep((0, 0, 0), rng.uniform(-4, 4, 3), points, 0.5)
     far = np.linalg.norm(points, axis=1)
     assert (((points - kept) * points).sum(axis=1) / far > 0.4).all()
+
+
+def test_the_payload_is_kept_from_what_the_drone_sees_as_it_moves_along():
+    payload = (0.2, 0.1, -1.0), 0.0
+    point = np.array([1.2, 0.1, 0.3])  # 1 m before the payload
+    kept = keep((0.5, 0.5, 0), (2.0, 0.7, 0.2), [point], load=0.4, payload=payload)
+    assert kept == pytest.approx((0.5 + 0.6, 0.7, 0.2))
+
+
+def test_what_is_not_seen_is_over_the_drone_and_moves_no_payload():
+    kept = keep((0.3, 0, 0), (0.1, 0, 0), [(0.3, 0, 2.5)], load=0.4)
+    assert kept == pytest.approx((0.1, 0, 0), abs=0)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.5, -2.0])
+def test_a_drone_stays_in_its_sector_beside_the_payload(yaw):
+    """Slots at 40 and 140 degrees are divided at 90, those at 40 and 320 at 0: the first drone has a quadrant."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    center = np.array([3.0, -2.0, 1.0])
+    for command, expected in (((-0.4, -0.3), (0.1, 0.1)), ((0.7, -0.3), (0.7, 0.1)), ((0.05, 0.5), (0.1, 0.5))):
+        asked, wanted = (center + turn @ [*each, 1.0] for each in (command, expected))
+        place = center + turn @ [0.5, 0.5, 1.0]
+        assert keep(place, asked, sector=0.1, payload=(center, yaw)) == pytest.approx(wanted)
+
+
+def test_sectors_of_two_are_halves_and_of_one_all():
+    assert sector_planes(np.array([0.3, 0.3 + np.pi])) == pytest.approx(
+        np.array([[[np.cos(0.3), np.sin(0.3)]] * 2, [[-np.cos(0.3), -np.sin(0.3)]] * 2])
+    )
+    assert (sector_planes(np.array([0.3])) == 0).all() and (sector_planes(np.array([0.3, 0.3])) == 0).all()
 
 
 def test_a_drone_that_touches_a_point_is_not_sent_to_nan():
@@ -107,12 +143,12 @@ def test_it_knows_what_drones_observe_where_they_take_themselves_to_be():
     assert np.abs(own.drone_position[0] - vec.world.state.drone_position[0]).max() > 1e-4
 
 
-def test_it_needs_points_and_positions():
-    with pytest.raises(
-        ConfigError, match=r"obstacle_margin=0\.3 needs drones that see points .*obstacle_sensing=local"
-    ):
-        ml.make_vec("hover", **{"control.obstacle_margin": 0.3})
-    with pytest.raises(ConfigError, match=r"obstacle_margin=0\.3 .*ranges|obstacle_margin=0\.3 needs"):
-        ml.make_vec("navigate_senses", **{"control.obstacle_margin": 0.3, "env.obstacle_sensing": "ranges"})
-    with pytest.raises(ConfigError, match=r"control\.action=reference clear, not those of velocity"):
-        ml.make_vec("navigate_senses", **{"control.obstacle_margin": 0.3, "control.action": "velocity"})
+@pytest.mark.parametrize("key", ["obstacle_margin", "payload_margin", "sector_margin"])
+def test_margins_that_keep_nothing_are_refused(key):
+    given = {f"control.{key}": 0.3}
+    if key != "sector_margin":
+        for seen in ("none", "ranges"):
+            with pytest.raises(ConfigError, match=rf"{key}=0\.3 needs .*not env\.obstacle_sensing={seen}"):
+                ml.make_vec("navigate_senses", **given, **{"env.obstacle_sensing": seen})
+    with pytest.raises(ConfigError, match=rf"{key}=0\.3 .*control\.action=reference clear, not those of velocity"):
+        ml.make_vec("navigate_senses", **given, **{"control.action": "velocity"})

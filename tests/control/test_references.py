@@ -12,7 +12,7 @@ from multilift_marl.control.formation import Reference, Smoothing, smooth, start
 from multilift_marl.control.gains import make_gains
 from multilift_marl.control.geometric import fly
 from multilift_marl.math3d import heading
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 from multilift_marl.sim import World
 
 # The smoothed reference

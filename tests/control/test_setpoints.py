@@ -12,7 +12,7 @@ from multilift_marl.control.gains import Gains, make_gains
 from multilift_marl.control.geometric import attitude_torque, fly, fly_rates, rate_torque
 from multilift_marl.control.setpoints import Setpoint, smooth_velocity, track_own_state
 from multilift_marl.math3d import axis_angle
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 from multilift_marl.sim import World
 
 DT = 1e-3

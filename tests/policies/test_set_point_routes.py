@@ -13,7 +13,7 @@ from multilift_marl.policies.baselines import fitting_scripts, make_scripted
 ALONE = {
     "scene.reserved": 0, "task_options.level": "given", "task_options.start": [-4, 0, 1.5],
     "task_options.goal": [4, 0, 1.5],
-    "task_options.start_radius": 0.0, "env.num_envs": 1, "env.num_threads": 1, "seed": 3,
+    "task_options.start_radius": 0.0, "env.num_envs": 1, "env.num_threads": 1, "env.policy_hz": 50, "seed": 3,
 }  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from multilift_marl.control.geometric import fly_rates, hook_moment
 from multilift_marl.control.setpoints import Setpoint
 from multilift_marl.math3d import axis_angle, rot_z
 from multilift_marl.rig.constants import make_rig
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 from multilift_marl.sim import World
 from multilift_marl.sim.state import hook_position
 

@@ -14,7 +14,7 @@ from multilift_marl.control.gains import make_gains
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.rig.balance import formation_forces
 from multilift_marl.rig.presets import PRESETS
-from multilift_marl.schema.sections import ControlConfig
+from multilift_marl.schema.control import ControlConfig
 from multilift_marl.sim import World
 from multilift_marl.sim.air import make_air, wash_at
 from multilift_marl.sim.contact import drone_half_size

@@ -14,7 +14,8 @@ from multilift_marl.config.load import build_config, config_dir
 from multilift_marl.control.gains import make_gains
 from multilift_marl.errors import warn_once
 from multilift_marl.rig.linearised import divergence_rate, warn_of_instability
-from multilift_marl.schema.sections import ControlConfig, RandomizationConfig
+from multilift_marl.schema.control import ControlConfig
+from multilift_marl.schema.sections import RandomizationConfig
 
 FIXED = RandomizationConfig()
 HALF = 0.3  # [m] of the height of a box

@@ -18,7 +18,8 @@ from multilift_marl.control.geometric import attitude_torque
 from multilift_marl.math3d import axis_angle
 from multilift_marl.rig.presets import PRESETS
 from multilift_marl.rig.vehicles import resolve_vehicles
-from multilift_marl.schema.sections import ControlConfig, VehicleConfig
+from multilift_marl.schema.control import ControlConfig
+from multilift_marl.schema.sections import VehicleConfig
 
 NAMES = sorted(PRESETS)
 LEVEL = floats(np.eye(3))

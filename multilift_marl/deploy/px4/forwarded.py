@@ -9,6 +9,7 @@ import numpy as np
 from multilift_marl.config.config import Config
 from multilift_marl.control.action_interface import Call
 from multilift_marl.control.formation import Goal
+from multilift_marl.control.obstacle_margin import Surroundings
 from multilift_marl.deploy.px4.team import AutopilotTeam
 from multilift_marl.deploy.ros.answers import Take, Waiting
 from multilift_marl.deploy.ros.autopilots import TopicAutopilots
@@ -29,10 +30,10 @@ class ForwardedSetpoints(TopicAutopilots):
 
     def bind(
         self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None,
-        obstacles: np.ndarray | None = None,
+        around: Surroundings | None = None,
     ) -> tuple[Call, tuple[Call, ...]]:  # fmt: skip
         """See `Controller.bind`; the autopilots fly in place of the last call."""
-        hear, steps = super().bind(lo, hi, action, goal, plan, obstacles)
+        hear, steps = super().bind(lo, hi, action, goal, plan, around)
         return hear, (*steps[:-1], self._tick)
 
     def _tick(self) -> None:

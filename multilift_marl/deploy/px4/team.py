@@ -17,6 +17,7 @@ from multilift_marl.control.action_interface import Call
 from multilift_marl.control.autopilot import LoadFeedforward
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.formation import Goal
+from multilift_marl.control.obstacle_margin import Surroundings
 from multilift_marl.deploy.px4.launch import Autopilots, rig_parameters
 from multilift_marl.deploy.px4.link import SimulatorLink
 from multilift_marl.deploy.px4.offboard import OFFBOARD, OffboardLink
@@ -321,10 +322,10 @@ class AutopilotController(Controller):
 
     def bind(
         self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None,
-        obstacles: np.ndarray | None = None,
+        around: Surroundings | None = None,
     ) -> tuple[Call, tuple[Call, ...]]:  # fmt: skip
         """See `Controller.bind`; the autopilots fly in place of the last call."""
-        set_action, steps = super().bind(lo, hi, action, goal, plan, obstacles)
+        set_action, steps = super().bind(lo, hi, action, goal, plan, around)
 
         def send(i: int) -> None:
             own = self.reference

@@ -13,6 +13,7 @@ from multilift_marl.control.action_interface import Call
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.geometric import fly, fly_rates
+from multilift_marl.control.obstacle_margin import Surroundings
 from multilift_marl.deploy.ros.answers import Answers, Take, Waiting
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, is_landing, sink
@@ -119,8 +120,9 @@ class TopicAutopilots(Controller):
         self._dt, self._step = 1.0 / config.sim.control_hz, 1.0 / config.env.policy_hz
 
     def bind(
-        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None
-    ) -> tuple[Call, tuple[Call, ...]]:
+        self, lo: int, hi: int, action: np.ndarray, goal: Goal, plan: Call | None = None,
+        around: Surroundings | None = None,
+    ) -> tuple[Call, tuple[Call, ...]]:  # fmt: skip
         """See `Controller.bind`; actions do not count."""
         self._cable_force = goal.cable_force
         state, none, thrust = self.world.state, np.zeros_like(goal.cable_force), self.world.thrust
