@@ -110,7 +110,8 @@ def test_a_drone_that_touches_a_point_is_not_sent_to_nan():
 
 @pytest.mark.parametrize(("margin", "touches"), [(0.0, True), (0.35, False)])
 def test_a_drone_that_is_led_into_a_pillar_stops_before_it(margin, touches):
-    vec = make(**{"control.obstacle_margin": margin, "control.max_offset": 4.0})
+    alone = {"control.payload_margin": 0.0, "control.sector_margin": 0.0}
+    vec = make(**alone, **{"control.obstacle_margin": margin, "control.max_offset": 4.0})
     vec.reset(seed=0)
     front = int(np.argmax(vec.task.goal.slots[0] @ [1, 1, 0]))
     least, ended = np.inf, False
@@ -149,6 +150,6 @@ def test_margins_that_keep_nothing_are_refused(key):
     if key != "sector_margin":
         for seen in ("none", "ranges"):
             with pytest.raises(ConfigError, match=rf"{key}=0\.3 needs .*not env\.obstacle_sensing={seen}"):
-                ml.make_vec("navigate_senses", **given, **{"env.obstacle_sensing": seen})
+                ml.make_vec("navigate", **given, **{"env.obstacle_sensing": seen})
     with pytest.raises(ConfigError, match=rf"{key}=0\.3 .*control\.action=reference clear, not those of velocity"):
-        ml.make_vec("navigate_senses", **given, **{"control.action": "velocity"})
+        ml.make_vec("navigate", **given, **{"control.action": "velocity"})

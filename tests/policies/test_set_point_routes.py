@@ -14,6 +14,7 @@ ALONE = {
     "scene.reserved": 0, "task_options.level": "given", "task_options.start": [-4, 0, 1.5],
     "task_options.goal": [4, 0, 1.5],
     "task_options.start_radius": 0.0, "env.num_envs": 1, "env.num_threads": 1, "env.policy_hz": 50, "seed": 3,
+    "control.obstacle_margin": 0, "control.payload_margin": 0, "control.sector_margin": 0,
 }  # fmt: skip
 
 

@@ -222,7 +222,7 @@ SHORTER = {  # of each script: keys that go, and what is added
         "minutes=0.001 env.num_envs=2 env.episode_seconds=2.0",
     ),
     "results/shifts.py": ([], "episodes=2"),
-    "results/twin.py": ([], "episodes=2 rounds=1 env.episode_seconds=0.4"),
+    "results/twin.py": (["episodes"], "episodes=2 rounds=1 env.episode_seconds=0.4"),
     "results/curves.py": ([], "."),  # folder
     "examples/cleanrl_ppo.py": ([], "1"),  # iteration
     "examples/fly_exported.py": ([], "1"),
