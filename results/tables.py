@@ -15,7 +15,7 @@ import numpy as np
 from flights import FLIGHTS, HERE, PLANNED_EPISODES, ROOT, error_metric
 
 from multilift_marl.config.load import load_config
-from multilift_marl.evaluation.metrics import bootstrap
+from multilift_marl.evaluation.metrics import bootstrap_seeds
 from multilift_marl.policies.baselines import SCRIPTED
 
 BASELINES = (*(name for name, script in SCRIPTED.items() if script.INTERFACE == "reference"), "searched")
@@ -116,7 +116,7 @@ def as_often(own: np.ndarray, other: np.ndarray) -> bool:
 def compare(flight: str) -> tuple[str, str] | None:
     """Return the gain of learned policies over the best baseline, and the verdict; None where one of both is missing.
 
-    Of several training seeds each episode counts by its mean. Errors are compared in episodes of the same outcome.
+    Intervals are over episodes and training seeds. Errors are compared in episodes of the same outcome.
     """
     differences = paired(flight)
     if differences is None:
@@ -124,9 +124,9 @@ def compare(flight: str) -> tuple[str, str] | None:
     success, error = differences
     parts = []
     for values, unit, digits in ((success, "points", 1), (error, "cm", 2)):
-        if values.size and values.any():
-            low, high = (_signed(bound, digits) for bound in bootstrap(values))
-            mean = _signed(values.mean(), digits)
+        if values.size and np.nan_to_num(values).any():
+            low, high = (_signed(bound, digits) for bound in bootstrap_seeds(values))
+            mean = _signed(_mean(values), digits)
             parts.append(f"{mean} {unit}" if low == mean == high else f"{mean} ({low}, {high}) {unit}")
         elif values.size:
             parts.append(f"0 {unit}")
@@ -134,17 +134,21 @@ def compare(flight: str) -> tuple[str, str] | None:
 
 
 def paired(flight: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return learned minus best baseline: success [points] by episode, error [cm] of episodes of the same outcome."""
+    """Return learned minus best baseline, a row for each training seed, a column for each episode.
+
+    Success [points]; error [cm], NaN where one alone succeeds, without the training seeds that have no other episodes.
+    """
     learned = [np.load(HERE / flight / f"{policy}.npz") for policy in learned_policies(flight)]
     best = best_baseline(flight)
     if not learned or not best:
         return None
     baseline = np.load(HERE / flight / f"{best}.npz")
     success, error = (
-        100 * (np.mean([each[key].astype(float) for each in learned], axis=0) - baseline[key].astype(float))
+        100 * np.array([each[key].astype(float) - baseline[key].astype(float) for each in learned])
         for key in ("success", "error")
     )
-    return success, error[success == 0]
+    alike = success == 0
+    return success, np.where(alike, error, np.nan)[alike.any(axis=1)]
 
 
 def judge(success: np.ndarray, error: np.ndarray) -> str:
@@ -152,27 +156,32 @@ def judge(success: np.ndarray, error: np.ndarray) -> str:
 
     A difference counts if its 95 % interval leaves out zero and it is at least a point of success or a millimetre of
     error. Success decides; error does where no difference of success counts, and none in the opposite direction is
-    significant.
+    significant, be it over episodes alone.
 
     Args:
-        success: (n,) learned minus baseline, in points.
-        error: (m,) the same of errors, in cm.
+        success: (S, n) learned minus baseline, in points; see `paired`.
+        error: (S', n) the same of errors, in cm.
     """
     names = {1: "better", 0: "no significant difference", -1: "worse"}
     often = _direction(success)
-    if often and abs(success.mean()) >= POINT:
+    if often and abs(_mean(success)) >= POINT:
         return names[often]
-    exact = -_direction(error)
-    if exact and abs(error.mean()) >= MILLIMETRE and exact != -often:
+    exact, of_these = -_direction(error), _direction(success.mean(axis=0, keepdims=True))
+    if exact and abs(_mean(error)) >= MILLIMETRE and exact != -of_these:
         return names[exact]
     return names[0]
+
+
+def _mean(values: np.ndarray) -> float:
+    """Return the mean over training seeds of the means over episodes."""
+    return float(np.nanmean(values, axis=1).mean()) if values.size else 0.0
 
 
 def _direction(values: np.ndarray) -> int:
     """Return the sign of the mean where its 95 % interval leaves out zero, else 0."""
     if not values.size:
         return 0
-    low, high = bootstrap(values)
+    low, high = bootstrap_seeds(values)
     return int(low > 0) - int(high < 0)
 
 

@@ -3,7 +3,7 @@
 The twin is the linear map of the same observation, with a constant, that fits the learned team's actions best: by least
 squares over the steps of `rounds=4` batches of flights, the first flown by the learned team, the others by the twin so
 far, with what the learned team would have done. All, and other baselines by name, fly the same `episodes=200`.
-Of several training seeds, differences are to their mean in each episode.
+Of several training seeds, differences are to their mean, with intervals over seeds and episodes.
 `table=<file>` is a CSV file that the rows go to; further arguments change the configuration.
 """
 
@@ -21,7 +21,7 @@ from multilift_marl.agents.policy import load_policy
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, parse_overrides
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.evaluation.metrics import bootstrap, wilson
+from multilift_marl.evaluation.metrics import bootstrap_seeds, wilson
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
@@ -108,14 +108,14 @@ def main(arguments: list[str]) -> None:
         who: run_episodes(config, make, episodes, EVALUATION)["success_rate"].astype(float)
         for who, make in teams.items()
     }
-    learned = np.mean([flown[f"learned{seed}"] for seed in seeds], axis=0)
+    learned = np.array([flown[f"learned{seed}"] for seed in seeds])
     rows = []
     for who, success in flown.items():
         low, high = (100 * each for each in wilson(int(success.sum()), episodes))
         row = {"team": who, "episodes": episodes, "success_percent": f"{100 * success.mean():.1f}"}
         row |= {"ci95": f"{low:.1f}-{high:.1f}"}
         if not who.startswith("learned"):
-            low, high = (100 * each for each in bootstrap(learned - success))
+            low, high = (100 * each for each in bootstrap_seeds(learned - success))
             row["learned_minus_this"] = f"{low:.1f} to {high:.1f}"
         rows.append(row)
         print(*(f"{key}={value}" for key, value in row.items()))

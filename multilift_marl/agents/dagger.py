@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from multilift_marl.agents.learning_rollouts import LearningRollouts, join_steps, list_step
 from multilift_marl.agents.mappo import Learner
-from multilift_marl.agents.rollouts import Batches
+from multilift_marl.agents.rollouts import Batches, RigRollouts
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
@@ -35,7 +35,7 @@ TEACHER = 4  # purpose of seeds, beside those of `envs/core.py` and `rollouts.NO
 
 def check_dagger(train: TrainConfig) -> None:
     """Refuse, by a ConfigError, what cannot be learned from a teacher."""
-    for key in ("gru", "workers", "rigs", "stages"):
+    for key in ("gru", "workers", "stages"):
         if getattr(train, key):
             raise ConfigError(f"train.algorithm=dagger has no train.{key}; leave it out, or take mappo")
 
@@ -45,46 +45,46 @@ def make_teacher(name: str, vec: MultiliftVec) -> Policy:
     return OwnPolicy(name, vec, "train.dagger.teacher") if ":" in name else make_scripted(name, vec)
 
 
-class DaggerRollouts(LearningRollouts):
-    """Flights whose steps the policy is fitted to the teacher's commands of; see `LearningRollouts`.
+class TaughtFlights(LearningRollouts):
+    """Flights of one rig, whose steps are kept with the teacher's commands in them; see `LearningRollouts`.
+
+    Args:
+        capacity: S, steps that are kept.
 
     Attributes:
         observed, taught: (S, N, D), (S, N, A) steps that are kept, and the teacher's commands in them.
         count: of steps so far; those beyond S have overwritten the oldest.
 
     Raises:
-        ConfigError: a teacher that cannot fly these environments, or more steps than this machine's memory holds.
+        ConfigError: a teacher that cannot fly these environments.
     """
 
-    def __init__(self, env: MultiliftEnv, learner: Learner, total: int):
+    def __init__(self, env: MultiliftEnv, learner: Learner, total: int, capacity: int):
         super().__init__(env, learner, total)
-        vec, train = env.vec, learner.config
-        self._train, self._settings = train, train.dagger
-        self._teacher = make_teacher(self._settings.teacher, with_truth(vec) if self._settings.truth else vec)
-        size, n = min(self._settings.capacity, train.frames + vec.num_envs * train.horizon), vec.num_drones
-        needed = 4 * size * n * (vec.observation_size + vec.action_size)
-        if needed > (there := os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")):
-            raise ConfigError(
-                f"{size} steps take {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
-                "train.dagger.capacity"
-            )
-        self.observed = torch.zeros(size, n, vec.observation_size)
-        self.taught = torch.zeros(size, n, vec.action_size)
+        vec, settings = env.vec, learner.config.dagger
+        self._settings, self._horizon = settings, learner.config.horizon
+        self._teacher = make_teacher(settings.teacher, with_truth(vec) if settings.truth else vec)
+        self.observed = torch.zeros(capacity, vec.num_drones, vec.observation_size)
+        self.taught = torch.zeros(capacity, vec.num_drones, vec.action_size)
         self.count = 0
         self._by_teacher: np.ndarray | None = None  # which episodes it flies
 
+    def share(self, iteration: int) -> float:
+        """Return the share of episodes that the teacher flies if they begin in an iteration."""
+        steps = iteration * self._total * self._horizon
+        return max(1.0 - steps / max(self._settings.handover, 1), self._settings.teacher_share)
+
     def collect(self, iteration: int) -> Batches:
-        """See `LearningRollouts.collect`."""
+        """Fly the next steps of all environments, keep them, and return them as one batch of size [E, T]."""
         self.start()
-        vec, train = self.env.vec, self._train
-        share = max(0.0, 1.0 - iteration * vec.num_envs * train.horizon / max(self._settings.handover, 1))
-        share = max(share, self._settings.teacher_share)
-        rng = np.random.default_rng(np.random.SeedSequence(vec.config.seed, spawn_key=(TEACHER, iteration)))
+        vec, share = self.env.vec, self.share(iteration)
+        seed = np.random.SeedSequence([vec.config.seed, vec.first_env], spawn_key=(TEACHER, iteration))
+        rng = np.random.default_rng(seed)
         if self._by_teacher is None:
             self._by_teacher = rng.uniform(size=vec.num_envs) < share
         rows: list[dict[str, np.ndarray]] = []
         observation, _ = vec.current()
-        for _ in range(train.horizon):
+        for _ in range(self._horizon):
             began = vec.ended
             taught = self._teacher.act(observation)
             self._keep(observation, taught, ~began)
@@ -95,11 +95,6 @@ class DaggerRollouts(LearningRollouts):
                 self._by_teacher[began] = rng.uniform(size=int(began.sum())) < share
             observation = outcome.observation.copy()
             rows.append(list_step(outcome, vec))
-        begin = time.perf_counter()
-        torch.set_num_threads(train.threads)
-        loss = self._learn(vec.num_envs * train.horizon)
-        torch.set_num_threads(1)
-        self.values = {"loss": loss, "teacher_share": share, "learning_seconds": time.perf_counter() - begin}
         return [join_steps(rows, vec)]
 
     def _keep(self, observation: np.ndarray, taught: np.ndarray, mask: np.ndarray) -> None:
@@ -110,26 +105,91 @@ class DaggerRollouts(LearningRollouts):
         self.taught[at] = torch.from_numpy(taught[mask].astype(np.float32))
         self.count += count
 
-    def _learn(self, fresh: int) -> float:
-        """Fit the policy to what is kept, `epochs` times as many steps as there are `fresh` ones; return the loss."""
-        learner, train, kept = self._learner, self._train, min(self.count, len(self.observed))
-        recent = torch.arange(max(self.count - fresh, 0), self.count) % len(self.observed)
-        learner.actor.normalizer.update(self.observed[recent])
-        size = max(fresh // train.minibatches, 1)
-        losses = []
-        for _ in range(train.epochs * train.minibatches):
-            chosen = torch.randint(kept, (size,))
-            learner.optimizer.zero_grad(set_to_none=True)
-            mean = learner.actor(self.observed[chosen])[0]
-            loss = functional.smooth_l1_loss(mean, self.taught[chosen], beta=SMALL)
-            loss.backward()
-            parameters = [each for each in learner.actor.parameters() if each.grad is not None]
-            torch.nn.utils.clip_grad_norm_(parameters, train.max_grad_norm)
-            learner.optimizer.step()
-            losses.append(loss.detach())
-        return float(torch.stack(losses).mean())
+    @property
+    def fresh(self) -> int:
+        """Steps of all environments in a batch."""
+        return self.env.vec.num_envs * self._horizon
+
+    def newest(self) -> torch.Tensor:
+        """Return what drones observed in the last steps that were kept, as many as a batch has."""
+        recent = torch.arange(max(self.count - self.fresh, 0), self.count) % len(self.observed)
+        return self.observed[recent]
+
+    def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return observations (size, N, D) and the teacher's commands (size, N, A) of steps that are kept, drawn."""
+        chosen = torch.randint(min(self.count, len(self.observed)), (size,))
+        return self.observed[chosen], self.taught[chosen]
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Go on in the episodes after those that were under way."""
         super().set_state(saved)
         self.env.vec.reset()
+
+
+class DaggerRollouts(LearningRollouts):
+    """Flights of all rigs, on which one policy is fitted to the teacher's commands; see `LearningRollouts`.
+
+    Args:
+        envs: of each rig.
+
+    Attributes:
+        flights: of each rig; each keeps as many steps.
+
+    Raises:
+        ConfigError: a teacher that cannot fly these environments, or more steps than this machine's memory holds.
+    """
+
+    def __init__(self, envs: list[MultiliftEnv], learner: Learner, total: int):
+        super().__init__(envs[0], learner, total)
+        self._train = train = learner.config
+        capacity = min(train.dagger.capacity, train.frames + total * train.horizon) // len(envs)
+        vecs = [env.vec for env in envs]
+        needed = 4 * capacity * sum(vec.num_drones * (vec.observation_size + vec.action_size) for vec in vecs)
+        if needed > (there := os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")):
+            raise ConfigError(
+                f"{capacity * len(envs)} steps take {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; "
+                "lower train.dagger.capacity"
+            )
+        self.flights = [TaughtFlights(env, learner, total, max(capacity, 1)) for env in envs]
+        self._all = RigRollouts(self.flights)
+
+    def collect(self, iteration: int) -> Batches:
+        """See `LearningRollouts.collect`; a batch for each rig."""
+        batches = self._all.collect(iteration)
+        begin = time.perf_counter()
+        torch.set_num_threads(self._train.threads)
+        loss = self._learn()
+        torch.set_num_threads(1)
+        share = self.flights[0].share(iteration)
+        self.values = {"loss": loss, "teacher_share": share, "learning_seconds": time.perf_counter() - begin}
+        return batches
+
+    def _learn(self) -> float:
+        """Fit the policy to what is kept, `epochs` times as many steps as a batch has; return the loss."""
+        learner, train = self._learner, self._train
+        for flights in self.flights:
+            learner.actor.normalizer.update(flights.newest())
+        losses = []
+        for _ in range(train.epochs * train.minibatches):
+            learner.optimizer.zero_grad(set_to_none=True)
+            parts = [self._fit(*flights.draw(max(flights.fresh // train.minibatches, 1))) for flights in self.flights]
+            parameters = [each for each in learner.actor.parameters() if each.grad is not None]
+            torch.nn.utils.clip_grad_norm_(parameters, train.max_grad_norm)
+            learner.optimizer.step()
+            losses.append(torch.stack(parts).sum())
+        return float(torch.stack(losses).mean())
+
+    def _fit(self, observed: torch.Tensor, taught: torch.Tensor) -> torch.Tensor:
+        """Add the gradient of a rig's share of the loss; return that share."""
+        mean = self._learner.actor(observed)[0]
+        loss = functional.smooth_l1_loss(mean, taught, beta=SMALL) / len(self.flights)
+        loss.backward()
+        return loss.detach()
+
+    def get_state(self) -> dict[str, torch.Tensor]:
+        """See `RigRollouts.get_state`."""
+        return self._all.get_state()
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """See `RigRollouts.set_state`."""
+        self._all.set_state(saved)

@@ -61,7 +61,7 @@ def make_rollouts(
     if train.algorithm == "diffmpc":
         return DiffMpcRollouts(envs[0], learner, total)
     if train.algorithm == "dagger":
-        return DaggerRollouts(envs[0], learner, total)
+        return DaggerRollouts(envs, learner, total)
     if train.workers:
         return Workers(environment, learner.actor, envs[0].vec.purpose)
     policies = [learner.policy, *(StochasticPolicy(learner.actor) for _ in envs[1:])]

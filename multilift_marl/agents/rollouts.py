@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -109,6 +109,19 @@ class Rollouts:
             vec.stagger(self._total)
 
 
+class Part(Protocol):
+    """Rollouts of one rig, see `Rollouts`."""
+
+    def collect(self, iteration: int) -> Batches:
+        """See `Rollouts.collect`."""
+
+    def get_state(self) -> dict[str, torch.Tensor]:
+        """See `Rollouts.get_state`."""
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """See `Rollouts.set_state`."""
+
+
 class RigRollouts:
     """The rollouts of teams with different rigs, one after the other, with the interface of `Rollouts`.
 
@@ -116,7 +129,7 @@ class RigRollouts:
         parts: of each rig.
     """
 
-    def __init__(self, parts: list[Rollouts]):
+    def __init__(self, parts: Sequence[Part]):
         self._parts = parts
 
     def collect(self, iteration: int) -> Batches:

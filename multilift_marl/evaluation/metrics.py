@@ -63,6 +63,26 @@ def bootstrap(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def bootstrap_seeds(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """Return the 95 % percentile bootstrap interval of the mean of several training seeds in the same episodes.
+
+    Training seeds and episodes are both drawn anew, with replacement (the pigeonhole bootstrap; Owen, Annals of Applied
+    Statistics 2007). Of few training seeds the interval is too narrow, though wider than that of episodes alone.
+
+    Args:
+        values: (S, n) of S training seeds in n episodes; NaN where there is none. A training seed counts by its mean.
+        seed: of the draws.
+    """
+    rng, (count, episodes) = np.random.default_rng(seed), values.shape
+    drawn = rng.multinomial(episodes, np.full(episodes, 1 / episodes), _RESAMPLES).astype(float)
+    there = np.isfinite(values)
+    sums, counts = drawn @ np.where(there, values, 0.0).T, drawn @ there.T.astype(float)
+    means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
+    means = np.nanmean(np.take_along_axis(means, rng.integers(0, count, (_RESAMPLES, count)), axis=1), axis=1)
+    low, high = np.nanquantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
 def summarize(episodes: dict[str, np.ndarray], causes: Sequence[str] = CAUSES) -> dict[str, dict[str, Any]]:
     """Return {metric: {"mean", "ci95": [low, high]}} of what `run_episodes` measured.
 

@@ -11,6 +11,7 @@ import torch
 import multilift_marl as ml
 from multilift_marl.agents.dagger import DaggerRollouts
 from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.agents.trainer import Trainer, new_run, resume_run
 from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.rollout import run_episodes
@@ -61,8 +62,8 @@ def test_steps_are_kept_as_they_were_flown_and_the_oldest_make_room():
     """Of a step that only resets nothing is kept."""
     small = {"train.dagger.capacity": 150, "train.dagger.teacher_share": 1.0, "env.episode_seconds": 0.5}
     trainer = Trainer(config(**small), Path("unused"))
-    rollouts = trainer.rollouts
-    assert isinstance(rollouts, DaggerRollouts)
+    assert isinstance(trainer.rollouts, DaggerRollouts)
+    (rollouts,) = trainer.rollouts.flights
     trainer.step()
     # 25 steps of 4 environments whose staggered episodes of 25 steps have begun anew, but for the last step's
     assert rollouts.count == 97
@@ -72,6 +73,24 @@ def test_steps_are_kept_as_they_were_flown_and_the_oldest_make_room():
     assert len(rollouts.observed) == 150
     assert torch.equal(rollouts.observed[90], first)
     assert not torch.equal(rollouts.observed[193 - 150 - 1], torch.zeros_like(first))
+
+
+RIGS = ({"env.num_drones": 3}, {"env.num_drones": 4, "payload.mass": 1.2})
+
+
+def test_one_network_learns_of_teams_that_differ():
+    """Each team flies better by what was learned of all than by what the training began with."""
+    trainer = Trainer(config(**{"train.rigs": RIGS, "env.num_envs": 8, "train.frames": 8000}), Path("unused"))
+    before = policy_of(trainer)
+    assert isinstance(trainer.rollouts, DaggerRollouts)
+    errors = [error_of(rig, before.bind) for rig in evaluated_rigs(trainer.config)]
+    for _ in range(trainer.iterations):
+        trainer.step()
+    assert [flights.observed.shape[1] for flights in trainer.rollouts.flights] == [3, 4]
+    assert [flights.count > 3000 for flights in trainer.rollouts.flights] == [True, True]
+    for rig, error in zip(evaluated_rigs(trainer.config), errors, strict=True):
+        taught = error_of(rig, lambda vec: make_scripted("payload_geometric", vec))
+        assert abs(error_of(rig, policy_of(trainer).bind) - taught) < 0.4 * abs(error - taught)
 
 
 def test_a_resumed_training_goes_on_with_its_networks(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 from multilift_marl.evaluation.metrics import (
     _ROWS,
     bootstrap,
+    bootstrap_seeds,
     compare,
     format_table,
     is_better,
@@ -44,6 +45,29 @@ def test_a_means_interval_is_that_of_resampled_means():
     assert low == pytest.approx(values.mean() - half, abs=0.15 * half)
     assert high == pytest.approx(values.mean() + half, abs=0.15 * half)
     assert bootstrap(values) == (low, high) != bootstrap(values, seed=1)
+
+
+def test_an_interval_over_training_seeds_has_the_variances_of_seeds_and_of_episodes():
+    rng, half = np.random.default_rng(5), {}
+    seeds, episodes = rng.normal(0, 0.5, (40, 1)), rng.normal(0, 2.0, (1, 500))
+    for name, values in (
+        ("seeds", seeds + 0 * episodes),
+        ("episodes", 0 * seeds + episodes),
+        ("both", seeds + episodes),
+    ):
+        low, high = bootstrap_seeds(values)
+        assert low < values.mean() < high
+        half[name] = 0.5 * (high - low)
+    assert half["seeds"] == pytest.approx(1.959964 * seeds.std() / np.sqrt(40), rel=0.1)
+    assert half["episodes"] == pytest.approx(1.959964 * episodes.std() / np.sqrt(500), rel=0.1)
+    assert half["both"] == pytest.approx(np.hypot(half["seeds"], half["episodes"]), rel=0.1)
+
+
+def test_of_one_training_seed_the_interval_is_that_of_episodes_and_gaps_do_not_count():
+    values = np.random.default_rng(3).exponential(2.0, 400)
+    assert bootstrap_seeds(values[None]) == pytest.approx(bootstrap(values), rel=0.02)
+    gaps = np.concatenate([values, np.full(400, np.nan)])
+    assert bootstrap_seeds(gaps[None]) == pytest.approx(bootstrap(values), rel=0.03)
 
 
 def test_a_summary_has_each_metric_over_all_over_those_that_held_and_over_successes():

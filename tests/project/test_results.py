@@ -119,12 +119,16 @@ def test_the_gain_of_learning_is_paired_with_the_best_baseline(tmp_path, monkeyp
     write_episodes(folder, "seed0", [True] * 100, error - 0.01)
     write_episodes(folder, "seed1", [True] * 100, error - 0.003)
     assert tables.best_baseline("gate") == "formation_lead"
-    assert tables.compare("gate") == ("0 points, −0.65 cm", "better")
+    assert tables.compare("gate") == ("0 points, −0.65 (−1.00, −0.30) cm", "better")
     write_episodes(folder, "seed0", [True] * 90 + [False] * 10, error - 0.01)
     gain, verdict = tables.compare("gate")
-    assert gain.startswith("−5.0 (") and verdict == "worse"
+    assert gain.startswith("−5.0 (") and verdict == "no significant difference"
+    write_episodes(folder, "seed1", [True] * 90 + [False] * 10, error - 0.01)
+    gain, verdict = tables.compare("gate")
+    assert gain.startswith("−10.0 (") and verdict == "worse"
     write_episodes(folder, "formation_lead", [False] * 100, error)
-    write_episodes(folder, "seed0", [True] * 100, error + 1)
+    for seed in ("seed0", "seed1"):
+        write_episodes(folder, seed, [True] * 100, error + 1)
     gain, verdict = tables.compare("gate")
     assert gain.startswith("+50.0 (") and verdict == "better"
 
@@ -145,7 +149,16 @@ def test_the_gain_of_learning_is_paired_with_the_best_baseline(tmp_path, monkeyp
     ],
 )
 def test_a_verdict_is_one_of_three(points, centimetres, verdict):
-    assert tables.judge(np.array(points, float), np.array(centimetres, float)) == verdict
+    error = np.array([centimetres] if centimetres else [], float)
+    assert tables.judge(np.array([points], float), error) == verdict
+
+
+def test_a_gain_that_training_seeds_disagree_about_is_none():
+    """Of one training seed alone each of these would be significant."""
+    error = np.repeat([[-1.0], [0.9], [-0.8]], 1000, axis=1)
+    assert tables.judge(np.zeros((3, 1000)), error) == "no significant difference"
+    for one, verdict in zip(error, ("better", "worse", "better"), strict=True):
+        assert tables.judge(np.zeros((1, 1000)), one[None]) == verdict
 
 
 def test_the_best_baseline_is_the_most_exact_of_those_that_succeed_as_often_within_noise(tmp_path, monkeypatch):
