@@ -62,7 +62,12 @@ class ObstacleReadings(NamedTuple):
     observed: np.ndarray
     """(E, N, P) what drones observe [m]."""
     placed: np.ndarray
-    """(E, N, k, 3) world frame: the points that they observe, from where they take themselves to be [m]."""
+    """(E, N, k, 3) world frame: the points that they observe, from where they took themselves to be when they measured
+    [m]."""
+    latest_placed: np.ndarray
+    """(E, N, k, 3) as `placed`, of the last measurement."""
+    held_placed: np.ndarray
+    """(E, K, N, k, 3) as `placed`, held as `held`."""
 
 
 class ObstacleSensing:
@@ -95,8 +100,11 @@ class ObstacleSensing:
         e, n = world.num_envs, world.num_drones
         shape = e, n, count_readings(config.env)
         held = np.zeros((e, sensor.delay + 1, *shape[1:]))
-        drawn, placed = np.zeros(e, np.uint64), np.zeros((e, n, sensor.points, 3))
-        self.readings = ObstacleReadings(drawn, np.zeros(e, np.int64), np.zeros(shape), held, np.zeros(shape), placed)
+        placed = e, n, sensor.points, 3
+        self.readings = ObstacleReadings(
+            np.zeros(e, np.uint64), np.zeros(e, np.int64), np.zeros(shape), held, np.zeros(shape),
+            np.zeros(placed), np.zeros(placed), np.zeros((e, sensor.delay + 1, *placed[1:])),
+        )  # fmt: skip
         distances = np.zeros((e, n, max(sensor.points, 1)))
         drones = world.state.drone_position, world.state.drone_rotation
         known = own.drone_position, own.drone_rotation
@@ -144,6 +152,7 @@ def sense_obstacles(
                 if sensor.points > 0:
                     _find_points(e, drone, yaw, obstacles, hulls, sensor, latest, distances[e, n])
                     _blur_points(e, sensor, readings, latest, distances[e, n])
+                    _place_points(e, n, own_position, own_rotation, readings)
                 else:
                     _measure_ranges(e, drone, yaw, obstacles, hulls, sensor, latest)
                     _blur_ranges(e, sensor, readings, latest)
@@ -151,13 +160,21 @@ def sense_obstacles(
             for k in range(latest.shape[0]):
                 readings.held[e, now % count, n, k] = latest[k]
                 readings.observed[e, n, k] = readings.held[e, then % count, n, k]
-            yaw = heading(mat(own_rotation, e, n))
-            c, s = cos(yaw), sin(yaw)
             for j in range(sensor.points):
-                observed = readings.observed[e, n, 3 * j : 3 * j + 3]
-                point = (observed[0], observed[1], observed[2])
-                put(readings.placed[e, n, j], add(vec(own_position, e, n), turn(c, s, point)))
+                put(readings.held_placed[e, now % count, n, j], vec(readings.latest_placed[e], n, j))
+                put(readings.placed[e, n, j], vec(readings.held_placed[e, then % count], n, j))
         readings.steps[e] = now + 1
+
+
+@kernel
+def _place_points(e, n, own_position, own_rotation, readings):
+    """Write where the points of the last measurement are in the world, as the drone knows itself."""
+    yaw = heading(mat(own_rotation, e, n))
+    c, s = cos(yaw), sin(yaw)
+    for j in range(readings.latest_placed.shape[2]):
+        measured = readings.latest[e, n, 3 * j : 3 * j + 3]
+        point = turn(c, s, (measured[0], measured[1], measured[2]))
+        put(readings.latest_placed[e, n, j], add(vec(own_position, e, n), point))
 
 
 @kernel

@@ -124,23 +124,26 @@ def test_a_drone_that_is_led_into_a_pillar_stops_before_it(margin, touches):
         assert least > 0.2
 
 
-def test_it_knows_what_drones_observe_where_they_take_themselves_to_be():
+def test_it_knows_what_drones_observe_from_where_they_took_themselves_to_be_when_they_measured():
+    """Two steps and more ago, at a rate."""
     vec = make(**{
         "control.obstacle_margin": 0.35, "env.sensing": "onboard", "env.obstacles.noise": 0.05,
-        "env.obstacles.delay": 2, "train.observe": None,
+        "env.obstacles.delay": 2, "env.obstacles.rate": 12.5, "train.observe": None,
     })  # fmt: skip
     vec.reset(seed=0)
+    own, were = vec.task.view.estimated, []
     for _ in range(150):
+        were.append((own.drone_position[0].copy(), own.drone_rotation[0].copy()))
         vec.step(np.zeros((1, 4, 4)))
-    readings, own = vec.task.view.obstacle_readings, vec.task.view.estimated
-    rotation = own.drone_rotation[0]
+    position, rotation = were[148]
     yaw = np.arctan2(-rotation[:, 0, 1], rotation[:, 1, 1])
-    c, s, points = np.cos(yaw)[:, None], np.sin(yaw)[:, None], readings[0].reshape(4, -1, 3)
+    c, s, points = np.cos(yaw)[:, None], np.sin(yaw)[:, None], vec.task.view.obstacle_readings[0].reshape(4, -1, 3)
     turned = np.stack(
         [c * points[..., 0] - s * points[..., 1], s * points[..., 0] + c * points[..., 1], points[..., 2]]
     )
     placed = vec._sensing.obstacles.readings.placed[0]
-    assert placed == pytest.approx(own.drone_position[0][:, None] + np.moveaxis(turned, 0, -1))
+    assert placed == pytest.approx(position[:, None] + np.moveaxis(turned, 0, -1))
+    assert np.abs(own.drone_position[0] - position).max() > 0.05
     assert np.abs(own.drone_position[0] - vec.world.state.drone_position[0]).max() > 1e-4
 
 
