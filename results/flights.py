@@ -115,6 +115,13 @@ FLIGHTS: dict[str, Flight] = {
         "gate, three walls, gaps of 0.8 to 1.2 m",
         scripts=("formation_narrow", "searched"),
     ),
+    "navigate_senses": Flight(
+        "navigate_senses",
+        {},
+        "navigate_senses",
+        "navigate, unknown obstacles, each drone by its own late senses",
+        scripts=("formation", "formation_repelled"),
+    ),
     "recover": Flight("recover", {}, "recover", "recover"),
     "recover_realistic": Flight("recover_realistic", {}, "recover_realistic", "recover, realistic", scripts=FOLLOWING),
     "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),

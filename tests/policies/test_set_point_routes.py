@@ -15,6 +15,7 @@ ALONE = {
     "task_options.goal": [4, 0, 1.5],
     "task_options.start_radius": 0.0, "env.num_envs": 1, "env.num_threads": 1, "env.policy_hz": 50, "seed": 3,
     "control.obstacle_margin": 0, "control.payload_margin": 0, "control.sector_margin": 0,
+    "env.obstacles.rate": None, "env.obstacles.delay": 0, "env.obstacles.noise": 0,
 }  # fmt: skip
 
 
