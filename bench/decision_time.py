@@ -1,6 +1,6 @@
 """How long a decision takes: of an exported network for one drone, and of baselines for a team, on one core.
 
-    python bench/decision_time.py policy=results/navigate_senses.pt others=formation_route seconds=20
+    python bench/decision_time.py policy=navigate_senses others=formation_route seconds=20
 
 The network runs by ONNX Runtime as a drone would run it, one observation at a time. A baseline's time is that of a
 step of its team over the number of drones; both along the same episodes, which the learned team flies.

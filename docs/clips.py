@@ -40,7 +40,9 @@ class Clip(NamedTuple):
 
 
 CLIPS = {
-    "gate": Clip("gate", "gate", 2, 0.5, 8.0, {}, "chase", 1.6, 600, 338, 12, 1_500_000),
+    "navigate_senses": Clip(
+        "navigate_senses", "navigate_senses", 3, 0.5, 15.0, {}, "chase", 2.0, 600, 338, 10, 1_700_000
+    ),
     "clip_gate": Clip("gate_two", "formation_narrow", 0, 2.0, 8.0, {}, "chase", 2.0),
     "clip_hover": Clip("hover", "hover", 3, 0.0, 3.0),
     "clip_land": Clip("land", "land", 0, 2.0, 10.0, {}, "side", 2.5),

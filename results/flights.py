@@ -122,6 +122,13 @@ FLIGHTS: dict[str, Flight] = {
         "navigate, unknown obstacles, each drone by its own late senses",
         scripts=("formation", "formation_repelled"),
     ),
+    "navigate_senses_exact": Flight(
+        "navigate_senses",
+        {"env.obstacles.rate": None, "env.obstacles.delay": 0, "env.obstacles.noise": 0.0},
+        "navigate_senses",
+        "navigate, unknown obstacles, each drone by its own senses, which are neither late nor noisy",
+        scripts=("formation", "formation_repelled"),
+    ),
     "recover": Flight("recover", {}, "recover", "recover"),
     "recover_realistic": Flight("recover_realistic", {}, "recover_realistic", "recover, realistic", scripts=FOLLOWING),
     "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),

@@ -1,10 +1,12 @@
 """Compare learned teams with their linear twins: `python results/twin.py policy=<run>[,<run>] [others=a,b]`.
 
 The twin is the linear map of the same observation, with a constant, that fits the learned team's actions best: by least
-squares over the steps of `rounds=4` batches of flights, the first flown by the learned team, the others by the twin so
-far, with what the learned team would have done. All, and other baselines by name, fly the same `episodes=200`.
-Of several training seeds, differences are to their mean, with intervals over seeds and episodes.
-`table=<file>` is a CSV file that the rows go to; further arguments change the configuration.
+squares over the steps of `rounds=4` batches of flights (0: no twin), the first flown by the learned team, the others by
+the twin so far, with what the learned team would have done. All, and other baselines by name, fly the same
+`episodes=200`. Of several training seeds, differences are to their mean, with intervals over seeds and episodes.
+
+Further arguments change the configuration. `table=<file>` is a CSV file that the rows go to; those that it has of the
+same changes are replaced.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import csv
 import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -100,8 +103,10 @@ def main(arguments: list[str]) -> None:
     seeds = [f" of seed {policy.config.seed}" if len(policies) > 1 else "" for policy in policies]
     teams: dict[str, Callable[[MultiliftVec], Policy]] = {}
     for seed, policy in zip(seeds, policies, strict=True):
-        matrix = fit(config, policy.bind, int(own["rounds"]))
-        teams |= {f"learned{seed}": policy.bind, f"linear twin{seed}": partial(Linear.bind, matrix)}
+        teams[f"learned{seed}"] = policy.bind
+        if int(own["rounds"]):
+            matrix = fit(config, policy.bind, int(own["rounds"]))
+            teams[f"linear twin{seed}"] = partial(Linear.bind, matrix)
     for other in filter(None, own["others"].split(",")):
         teams[other] = partial(make_scripted, other)
     flown = {
@@ -120,10 +125,19 @@ def main(arguments: list[str]) -> None:
         rows.append(row)
         print(*(f"{key}={value}" for key, value in row.items()))
     if own["table"]:
-        with open(own["table"], "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(rows[-1]), lineterminator="\n", restval="")
-            writer.writeheader()
-            writer.writerows(rows)
+        keep(Path(own["table"]), " ".join(f"{key}={value}" for key, value in values.items()), rows)
+
+
+def keep(path: Path, changes: str, rows: list[dict[str, Any]]) -> None:
+    """Put rows into a table, in place of those of the same changes."""
+    rows = [{"changes": changes, **row} for row in rows]
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.DictReader(file) if row["changes"] != changes] + rows
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[-1]), lineterminator="\n", restval="")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 if __name__ == "__main__":

@@ -117,7 +117,7 @@ def test_links_have_titles_as_their_texts(site):
 def test_the_readme_is_one_page_with_an_animation():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 120
-    assert "](docs/images/gate.gif)" in text
+    assert "](docs/images/navigate_senses.gif)" in text
 
 
 def test_animations_are_small_and_of_the_script():
