@@ -4,9 +4,10 @@
 - `local`: the same within the range and the field of view of a sensor with a rate, a delay and noise.
 - `ranges`: lengths of horizontal beams about the drone until they meet an obstacle, of such a sensor.
 
-Vectors and beams are in the drone's heading frame at the moment of the measurement. Sensors see obstacles alone,
-neither ground nor team; points are seen through other obstacles, and a point outside the field of view is not replaced
-by another of the same obstacle. Attitudes and places are true: `env.sensing` and its noise do not count here.
+Points are observed in the drone's heading frame as it is now: where it measured them, as it knows its own way since,
+as if obstacles stood still. Ranges stay those of the measurement, which sees from the true pose. Sensors see obstacles
+alone, neither ground nor team; points are seen through other obstacles, and a point outside the field of view is not
+replaced by another of the same obstacle.
 """
 
 from __future__ import annotations
@@ -163,6 +164,8 @@ def sense_obstacles(
             for j in range(sensor.points):
                 put(readings.held_placed[e, now % count, n, j], vec(readings.latest_placed[e], n, j))
                 put(readings.placed[e, n, j], vec(readings.held_placed[e, then % count], n, j))
+            if sensor.delay > 0 or sensor.period > 1:
+                _move_points(e, n, own_position, own_rotation, sensor, readings)
         readings.steps[e] = now + 1
 
 
@@ -175,6 +178,17 @@ def _place_points(e, n, own_position, own_rotation, readings):
         measured = readings.latest[e, n, 3 * j : 3 * j + 3]
         point = turn(c, s, (measured[0], measured[1], measured[2]))
         put(readings.latest_placed[e, n, j], add(vec(own_position, e, n), point))
+
+
+@kernel
+def _move_points(e, n, own_position, own_rotation, sensor, readings):
+    """Observe points where they are now, seen from where the drone knows itself to be, if they do not move."""
+    yaw = heading(mat(own_rotation, e, n))
+    c, s = cos(yaw), sin(yaw)
+    for j in range(readings.placed.shape[2]):
+        observed = readings.observed[e, n, 3 * j : 3 * j + 3]
+        if observed[0] != 0.0 or observed[1] != 0.0 or observed[2] != sensor.range:  # something is seen
+            put(observed, turn(c, -s, sub(vec(readings.placed[e], n, j), vec(own_position, e, n))))
 
 
 @kernel

@@ -200,6 +200,7 @@ def commands_of(block):
 
 
 SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 train.diffmpc.window=4 eval.episodes=2"  # one iteration
+MORE = {"config=navigate_senses": "env.num_envs=5 train.frames=40"}  # one environment of each of its rigs
 SHORTER = {  # of each script: keys that go, and what is added
     "train.py": (re.findall(r"(\S+)=", SHORT), SHORT),
     "evaluate.py": (["episodes"], "episodes=1 env.episode_seconds=0.4"),
@@ -222,7 +223,7 @@ SHORTER = {  # of each script: keys that go, and what is added
         "minutes=0.001 env.num_envs=2 env.episode_seconds=2.0",
     ),
     "results/shifts.py": ([], "episodes=2"),
-    "results/twin.py": (["episodes"], "episodes=2 rounds=1 env.episode_seconds=0.4"),
+    "results/twin.py": (["episodes", "rounds"], "episodes=2 rounds=1 env.episode_seconds=0.4"),
     "results/curves.py": ([], "."),  # folder
     "examples/cleanrl_ppo.py": ([], "1"),  # iteration
     "examples/fly_exported.py": ([], "1"),
@@ -243,6 +244,8 @@ def shorter(command):
     dropped, more = SHORTER.get(script, ([], ""))
     kept = [part for part in arguments if part.split("=")[0] not in dropped or "resume" in command]
     kept = [part.replace("=examples/", f"={ROOT}/examples/") for part in kept]
+    if script == "train.py":
+        more = " ".join([more, *(MORE[part] for part in arguments if part in MORE)])
     return script, kept + ("" if "resume" in command else more).split()
 
 

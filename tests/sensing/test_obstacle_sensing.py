@@ -12,9 +12,9 @@ SPHERES = [(2.0, 0.5, 1.6), (-1.8, 1.0, 2.2), (0.5, -3.0, 1.0), (4.5, 1.0, 2.0),
 RADIUS = 0.3
 
 
-def among(sensing: str, num_envs: int = 2, spheres=SPHERES, num_threads: int = 1, **given):
-    """Return environments with spheres of 0.3 m radius; `given` are keys of `env.obstacles`, or of other sections."""
-    scene = [{"shape": "sphere", "size": [2 * RADIUS], "position": list(place)} for place in spheres]
+def among(sensing: str, num_envs: int = 2, spheres=SPHERES, num_threads: int = 1, radius: float = RADIUS, **given):
+    """Return environments with spheres; `given` are keys of `env.obstacles`, or of other sections."""
+    scene = [{"shape": "sphere", "size": [2 * radius], "position": list(place)} for place in spheres]
     keys = {key if "." in key else f"env.obstacles.{key}": value for key, value in given.items()}
     overrides = {"scene.obstacles": scene, "env.obstacle_sensing": sensing, "env.policy_hz": 50.0} | keys
     return make("hover", num_envs=num_envs, num_threads=num_threads, num_drones=3, **overrides)
@@ -45,6 +45,18 @@ def nearest_by_hand(vec, count: int, most: float = np.inf, view: float = 360.0) 
             order = np.flatnonzero(seen)[np.argsort(length[seen, 0])][:count]
             found[e, n, : len(order)] = points[order]
     return found.reshape(vec.num_envs, vec.num_drones, -1)
+
+
+def in_world(vec, points: np.ndarray) -> np.ndarray:
+    """Return points (E, N, 3 count) of the drones' heading frames where they are now, (E, N, count, 3)."""
+    state, placed = vec.world.state, points.reshape(vec.num_envs, vec.num_drones, -1, 3).copy()
+    for e, n in np.ndindex(placed.shape[:2]):
+        yaw = np.arctan2(-state.drone_rotation[e, n, 0, 1], state.drone_rotation[e, n, 1, 1])
+        turned = placed[e, n, :, 0] * np.cos(yaw) - placed[e, n, :, 1] * np.sin(yaw)
+        placed[e, n, :, 1] = placed[e, n, :, 0] * np.sin(yaw) + placed[e, n, :, 1] * np.cos(yaw)
+        placed[e, n, :, 0] = turned
+        placed[e, n] += state.drone_position[e, n]
+    return placed
 
 
 def fly(vec, steps: int, seed: int = 3):
@@ -98,14 +110,35 @@ def test_beams_are_as_long_as_the_way_to_the_spheres():
 
 @pytest.mark.parametrize("rate, delay", [(None, 3), (10.0, 0), (10.0, 2), (25.0, 5)])
 def test_measurements_come_at_the_rate_and_after_the_delay(rate, delay):
-    """At step s, what was measured at the last multiple of the period up to s - delay; at first the first."""
+    """At step s, the points measured at the last multiple of the period up to s - delay; at first the first.
+
+    They are observed where they are from the drone as it is now.
+    """
     vec = among("local", points=2, range=20.0, rate=rate, delay=delay)
     place, period, seen = columns(vec, "obstacle_points"), 1 if rate is None else round(50 / rate), []
+    places = []
     for step, observation in enumerate(fly(vec, 20)):
         seen.append(nearest_by_hand(vec, 2, 20.0))
-        taken = max(step - delay, 0) // period * period
-        assert observation[:, :, place] == pytest.approx(seen[taken], abs=1e-5)
+        places.append(in_world(vec, seen[-1]))
+        taken = places[max(step - delay, 0) // period * period]
+        state = vec.world.state
+        for e, n in np.ndindex(2, 3):
+            expected = in_heading_frame(state.drone_rotation[e, n], taken[e, n] - state.drone_position[e, n])
+            assert observation[e, n, place] == pytest.approx(expected.ravel(), abs=1e-5)
     assert np.abs(seen[0] - seen[-1]).max() > 0.01
+
+
+def test_what_is_seen_late_is_observed_where_it_is_if_it_is_small():
+    """The nearest point of a ball of 1 mm stays where it is however the drone moves: late or not, it looks the same."""
+    given = {"points": 5, "range": 20.0, "radius": 1e-3}
+    late, exact = among("local", rate=12.5, delay=6, **given), among("local", **given)
+    place, moved = columns(late, "obstacle_points"), []
+    for one, other in zip(fly(late, 60), fly(exact, 60), strict=True):
+        # Their order is that of the measurement.
+        one, other = (np.sort(each[:, :, place].reshape(2, 3, 5, 3), axis=2) for each in (one, other))
+        assert one == pytest.approx(other, abs=3e-3)
+        moved.append(other)
+    assert np.abs(moved[10] - moved[0]).max() > 0.1
 
 
 @pytest.mark.parametrize("mode, name", [("local", "obstacle_points"), ("ranges", "obstacle_ranges")])
