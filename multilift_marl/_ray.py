@@ -54,6 +54,7 @@ def connect(address: str, workers: int, key: str) -> bool:
     late = address != "local" and not use_token()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read by Ray when it is imported
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_worker_niceness", "0")  # of a local cluster; else 15: the caller waits for its workers
     try:
         import ray
     except ModuleNotFoundError as error:

@@ -125,6 +125,14 @@ def test_the_first_batch_of_workers_is_that_of_one_process(tmp_path, local_ray):
     three.rollouts.close()
 
 
+@pytest.mark.slow
+def test_workers_have_the_priority_of_their_caller(local_ray):
+    """By Ray's own choice all other programs would come first: ten times slower on a busy machine."""
+    import ray
+
+    assert ray.get(ray.remote(os.nice).remote(0)) == os.nice(0)
+
+
 def test_noise_is_of_environment_and_iteration_alone():
     whole, part = (exploration_noise(5, envs, 3, (7, 2, 4)) for envs in (range(6), range(2, 4)))
     assert whole.shape == (7, 6, 2, 4) and torch.equal(whole[:, 2:4], part)

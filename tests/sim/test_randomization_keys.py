@@ -1,9 +1,9 @@
-"""Every key of `randomization`, alone, in pairs, and among others in every task: episodes start and fly."""
+"""Every key of `randomization`, alone, with and without every other one, and in every task: episodes start and fly."""
 
 from __future__ import annotations
 
 from functools import cache
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -28,10 +28,16 @@ KINDS = {
 
 
 @cache
-def one_of_each() -> list[str]:
-    """Return a configuration of each task with each of its action interfaces."""
-    loaded = {name: ml.load_config(name) for name in list_configs()}
-    return list({(each.task, each.control.action): name for name, each in loaded.items()}.values())
+def chosen() -> list[str]:
+    """Return configurations in which each task and each action interface occurs."""
+    tasks, actions, found = set(), set(), []
+    for name in list_configs():
+        config = ml.load_config(name)
+        if config.task not in tasks or config.control.action not in actions:
+            found.append(name)
+            tasks.add(config.task)
+            actions.add(config.control.action)
+    return found
 
 
 def keys(config: str) -> list[str]:
@@ -40,6 +46,17 @@ def keys(config: str) -> list[str]:
     without = EXTENT if settings.payload.shape == "point" else ()
     without += NOISE if settings.env.sensing != "ideal" else ()
     return [key for key in WIDTHS if key not in without]
+
+
+def sets(names: list[str]) -> list[tuple[str, ...]]:
+    """Return eight sets of up to 35 names: of any two names, one set has both, one neither, and one each alone.
+
+    Each name is in four sets, the first among them, and no two names in the same four (Katona 1973).
+    """
+    members = combinations(range(8), 4)
+    of = {name: next(members) for name in names}
+    assert all(0 in each for each in of.values())
+    return [tuple(name for name in names if number in of[name]) for number in range(8)]
 
 
 def fly(config: str, varied: tuple[str, ...], **overrides) -> None:
@@ -57,23 +74,26 @@ def fly(config: str, varied: tuple[str, ...], **overrides) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("config", one_of_each())
-def test_half_of_the_keys_in_every_task(config):
-    """Each set is compiled anew, in half a minute: so half of the keys go together, others in each task."""
-    order = np.random.default_rng(one_of_each().index(config)).permutation(keys(config))
-    fly(config, tuple(map(str, order[: len(order) // 2])))
+@pytest.mark.parametrize("config", chosen())
+def test_keys_in_every_task_and_with_every_action(config):
+    """Each set is compiled anew, in half a minute: another one in each configuration."""
+    fly(config, sets(keys(config))[chosen().index(config) % 8])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_key_alone(kind):
-    config, overrides = KINDS[kind]
+def test_every_key_alone():
+    config, overrides = KINDS["massless"]
     for key in keys(config):
         fly(config, (key,), **overrides)
 
 
 @pytest.mark.slow
-def test_every_pair_of_keys():
-    config, overrides = KINDS["massless"]
-    for pair in combinations(keys(config), 2):
-        fly(config, pair, **overrides)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_key_with_and_without_every_other(kind):
+    config, overrides = KINDS[kind]
+    names = keys(config)
+    flown = sets(names)
+    for one, other in combinations(names, 2):
+        assert {(one in each, other in each) for each in flown} == set(product((False, True), repeat=2))
+    for each in flown:
+        fly(config, each, **overrides)
