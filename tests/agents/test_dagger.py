@@ -106,17 +106,17 @@ def test_a_resumed_training_goes_on_with_its_networks(tmp_path):
     assert loss < 0.7 * losses[0], (loss, losses)
 
 
-def test_a_teacher_with_the_truth_flies_as_if_nothing_disturbed_its_senses():
+RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
+
+
+@pytest.mark.parametrize(
+    ("teacher", "keys"), [("payload_geometric", {}), pytest.param("mpc", RATES, marks=pytest.mark.slow)]
+)
+def test_a_teacher_with_the_truth_flies_as_if_nothing_disturbed_its_senses(teacher, keys):
     """Bit for bit: noise, sensors and what they cost are drawn apart from what moves the team."""
-    keys = {
-        "control.action": "acc_rates",
-        "control.max_acceleration": 25.0,
-        "control.max_tilt_rate": 15.0,
-        "num_envs": 2,
-    }
-    ideal = ml.make_vec("track", seed=3, **keys)
-    seen = ml.make_vec("track", seed=3, **keys, **{"randomization.observation_noise": 1.0})
-    first, second = make_scripted("mpc", ideal), make_scripted("mpc", with_truth(seen))
+    ideal = ml.make_vec("track", seed=3, num_envs=2, **keys)
+    seen = ml.make_vec("track", seed=3, num_envs=2, **keys, **{"randomization.observation_noise": 1.0})
+    first, second = make_scripted(teacher, ideal), make_scripted(teacher, with_truth(seen))
     one, two = ideal.reset(seed=3)[0], seen.reset(seed=3)[0]
     for _ in range(40):
         one, two = ideal.step(first.act(one))[0], seen.step(second.act(two))[0]

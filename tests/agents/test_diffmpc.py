@@ -14,6 +14,8 @@ from multilift_marl.agents.policy import load_policy
 from multilift_marl.agents.trainer import Trainer, new_run, resume_run
 from multilift_marl.errors import ConfigError
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 SMALL = {
     "env.num_drones": 3, "env.num_envs": 2, "env.num_threads": 1, "train.horizon": 45, "train.overrides": {},
     "train.hidden": [16], "eval.episodes": 2, "eval.every": 100, "env.episode_seconds": 2.0,

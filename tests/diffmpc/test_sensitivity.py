@@ -14,6 +14,8 @@ from multilift_marl.planning.expert import TeamExpert
 from multilift_marl.planning.riccati import IterationWork, Problem, find_gains, take_step
 from multilift_marl.planning.team_model import ModelWork, state_size, step_state
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 STEPS, STEP, DT = 20, 0.05, 0.02
 
 

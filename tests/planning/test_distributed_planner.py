@@ -15,6 +15,8 @@ from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.schema.planner import PlannerConfig
 from multilift_marl.sensing.communication import Links
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 N, STEP = 3, 0.05
 Q = 6 + 2 * N
 LOAD = np.array([0.5, -0.3, 0.2, 0.02, -0.01, 0.03, 0.2])

@@ -11,6 +11,8 @@ from multilift_marl.planning.expert import TeamExpert
 from multilift_marl.planning.goals import path_goal, pose_goal, sampled_goal
 from multilift_marl.planning.paths import CIRCLE, FILE, RAMP, Path
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 N = 3
 HOME = np.array([0.0, 0.0, 1.0])
 

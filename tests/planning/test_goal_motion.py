@@ -38,7 +38,13 @@ def slope(seen: list, value) -> np.ndarray:
     return np.tensordot(weights, np.array([value(each) for each in seen]), axes=1) / STEP
 
 
-@pytest.mark.parametrize("name, time", [(name, time) for name, (_, times) in TASKS.items() for time in times])
+def marked(name: str, *values):
+    """Return parameters; those of a task other than `track`, each compiled for itself, are left to `-m slow`."""
+    marks = () if name.startswith("track") else (pytest.mark.slow,)
+    return pytest.param(name, *values, marks=marks)
+
+
+@pytest.mark.parametrize("name, time", [marked(name, time) for name, (_, times) in TASKS.items() for time in times])
 def test_goals_state_the_derivatives_of_their_places(name, time):
     seen = moments(name, time)
     now = seen[3]
@@ -56,7 +62,7 @@ def test_goals_state_the_derivatives_of_their_places(name, time):
     np.testing.assert_allclose(change, now["slot_acceleration"], atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["takeoff", "land", "gate", "track circle"])
+@pytest.mark.parametrize("name", [marked(name) for name in ("takeoff", "land", "gate", "track circle")])
 def test_goals_do_move_in_these_moments(name):
     middle = [moments(name, time)[3] for time in TASKS[name][1]]
     assert max(np.linalg.norm(each["velocity"]) for each in middle) > 0.2

@@ -14,6 +14,8 @@ from multilift_marl.planning.hard_planner import HardPlanner
 from multilift_marl.planning.team_model import ModelWork, step_state
 from multilift_marl.policies.baselines import make_scripted
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 HOME = np.array([0.0, 0.0, 1.0])
 N = 3
 
@@ -117,7 +119,6 @@ def test_few_iterations_stop_and_say_so():
     assert set(plans.status_names) <= set(STATUS[1:3]) and (plans.iterations == 2).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 4, 6])
 def test_plans_from_cold_starts_cost_what_ipopt_finds(n):
     """Where the costs differ both are local minima: IPOPT, started from the plan, stays there."""
@@ -137,7 +138,6 @@ def test_plans_from_cold_starts_cost_what_ipopt_finds(n):
         assert ok and cost == pytest.approx(costs[e], rel=1e-4)
 
 
-@pytest.mark.slow
 def test_flights_with_hard_limits_are_as_accurate():
     acting = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
     fast = {"task_options.speed": 2.0, "task_options.acceleration": 4.0, "task_options.rmse_from": 3.0}

@@ -14,6 +14,8 @@ from multilift_marl.planning.newton import Multipliers, NewtonWork, Trajectory, 
 from multilift_marl.planning.riccati import IterationWork, Problem, linearise, pull_back
 from multilift_marl.planning.team_model import ModelWork, step_state
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 N, STEPS, STEP = 3, 4, 0.05
 SIZE, Q, NU = 12 + 7 * N, 6 + 2 * N, 3 * N
 LOAD = np.array([0.1, 0.2, -0.3, 0.01, 0.0, -0.01, 0.1])

@@ -10,6 +10,8 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.mpc_distributed import others_of
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 BY_RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
 LOSSY = {"env.sensing": "onboard", "env.communication": "all", "env.communication_loss": 0.1}
 
@@ -19,7 +21,7 @@ def fly(policy, config, overrides, episodes=3, seconds=6.0):
     return run_episodes(loaded, lambda vec: make_scripted(policy, vec), episodes, 77)
 
 
-@pytest.mark.parametrize("drones", [2, 4, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 6, 8))])
+@pytest.mark.parametrize("drones", [2, 3, 4, 6, 8])
 def test_paths_are_kept_to_within_half_a_millimetre(drones):
     """Of two drones 2 mm: they do not hold the payload's angle about the line between them."""
     result = fly("mpc_distributed", "track", {"env.num_drones": drones})
@@ -33,14 +35,12 @@ def test_unknown_masses_and_forces_are_held():
     assert result["success_rate"].all() and (result["payload_position_error_m"] < 0.003).all()
 
 
-@pytest.mark.slow
 def test_sensors_on_board_and_lossy_late_messages_cost_little():
     apart, central = (fly(policy, "track", LOSSY, 8, 8.0) for policy in ("mpc_distributed", "mpc"))
     assert not apart["failure_cause"].any()
     assert apart["payload_rmse_m"].mean() < 1.3 * central["payload_rmse_m"].mean()
 
 
-@pytest.mark.slow
 def test_without_any_message_it_is_worse():
     """The messages matter: lost altogether, drones take the others to fly as at first, and the payload is far off."""
     heard, lost = (
@@ -49,7 +49,6 @@ def test_without_any_message_it_is_worse():
     assert lost["payload_rmse_m"].mean() > 1.2 * heard["payload_rmse_m"].mean()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("overrides", [{}, LOSSY])
 def test_forests_are_passed(overrides):
     result = fly("mpc_route_distributed", "navigate_dense", overrides, episodes=4, seconds=24.0)

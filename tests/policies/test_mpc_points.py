@@ -11,6 +11,8 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.mpc import ENOUGH, TeamMpc
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 WIDE = {f"control.{key}": wide for scales in ENOUGH.values() for key, (_, wide) in scales.items()}
 BASE = {"payload.shape": "point", "control.action": "acc_rates"} | WIDE
 

@@ -12,6 +12,8 @@ from multilift_marl.planning.team_weights import TeamWeights
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.planner_weights import weight_map
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 WIDE = {"control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0, "env.num_threads": 1, "env.num_drones": 3}
 WEIGHTS = WIDE | {"control.action": "planner_weights"}
 
