@@ -127,7 +127,7 @@ def _compose(name: str, source: str, functions: tuple[tuple[str, Callable[..., A
     digests = [sources_digest(module) for module in ours]
     named = [f"{key} {each.__module__}.{each.__qualname__}" for key, each in functions]
     function._sources = "\0".join([source, *digests, *named])  # read by the cache
-    return _compile(function, makes_arrays=len(ours) < len(modules))
+    return _compile(function, makes_arrays=not {*ours, "math"}.issuperset(modules))
 
 
 def _compiled(kernel: Any, types: tuple[Any, ...]) -> Callable[..., Any]:

@@ -9,6 +9,7 @@ import pytest
 from conftest import load_script, make, refusal, same, zeros
 
 from multilift_marl.config.load import build_config, load_config
+from multilift_marl.kernels import jit
 from multilift_marl.kernels.jit import compose, inlined, kernel
 from multilift_marl.mdp.observations import Component, own_velocity
 from multilift_marl.mdp.rewards import Term
@@ -161,6 +162,21 @@ def doubled_sum(values):
 @kernel
 def doubled(values):
     return values + values
+
+
+def test_kernels_composed_of_the_package_s_own_count_no_references(task, monkeypatch):
+    """Where they do, each call that is handed a view counts those of all of its arrays: three times the compilation."""
+    counted, compile_one = {}, jit._compile
+
+    def note(function, makes_arrays=None, **options):
+        counted[function.__name__] = makes_arrays
+        return compile_one(function, makes_arrays, **options)
+
+    monkeypatch.setattr(jit, "_compile", note)
+    jit._compose.cache_clear()
+    make(task, num_envs=1)
+    assert {"observe", "observe_state", "reward"} <= counted.keys()
+    assert [name for name, counts in counted.items() if counts] == []
 
 
 def test_kernels_from_outside_the_package_may_make_arrays():
