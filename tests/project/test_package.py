@@ -200,7 +200,9 @@ def commands_of(block):
 
 
 SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 train.diffmpc.window=4 eval.episodes=2"  # one iteration
-MORE = {"config=navigate_senses": "env.num_envs=5 train.frames=40"}  # one environment of each of its rigs
+FIVE = SHORT.replace("num_envs=4", "num_envs=5").replace(
+    "frames=32", "frames=40"
+)  # one environment of each of five rigs
 SHORTER = {  # of each script: keys that go, and what is added
     "train.py": (re.findall(r"(\S+)=", SHORT), SHORT),
     "evaluate.py": (["episodes"], "episodes=1 env.episode_seconds=0.4"),
@@ -244,8 +246,8 @@ def shorter(command):
     dropped, more = SHORTER.get(script, ([], ""))
     kept = [part for part in arguments if part.split("=")[0] not in dropped or "resume" in command]
     kept = [part.replace("=examples/", f"={ROOT}/examples/") for part in kept]
-    if script == "train.py":
-        more = " ".join([more, *(MORE[part] for part in arguments if part in MORE)])
+    if "config=navigate_senses" in arguments and more == SHORT:
+        more = FIVE
     return script, kept + ("" if "resume" in command else more).split()
 
 
