@@ -124,6 +124,15 @@ def test_a_drone_that_is_led_into_a_pillar_stops_before_it(margin, touches):
         assert least > 0.2
 
 
+def turned(rotation, points):
+    """Return points (N, k, 3) of heading frames in the world's axes."""
+    yaw = np.arctan2(-rotation[:, 0, 1], rotation[:, 1, 1])
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    return np.stack(
+        [c * points[..., 0] - s * points[..., 1], s * points[..., 0] + c * points[..., 1], points[..., 2]], -1
+    )
+
+
 def test_it_knows_what_drones_observe_from_where_they_took_themselves_to_be_when_they_measured():
     """Two steps and more ago, at a rate."""
     vec = make(**{
@@ -135,14 +144,14 @@ def test_it_knows_what_drones_observe_from_where_they_took_themselves_to_be_when
     for _ in range(150):
         were.append((own.drone_position[0].copy(), own.drone_rotation[0].copy()))
         vec.step(np.zeros((1, 4, 4)))
-    position, rotation = were[148]
-    yaw = np.arctan2(-rotation[:, 0, 1], rotation[:, 1, 1])
-    c, s, points = np.cos(yaw)[:, None], np.sin(yaw)[:, None], vec.task.view.obstacle_readings[0].reshape(4, -1, 3)
-    turned = np.stack(
-        [c * points[..., 0] - s * points[..., 1], s * points[..., 0] + c * points[..., 1], points[..., 2]]
-    )
-    placed = vec._sensing.obstacles.readings.placed[0]
-    assert placed == pytest.approx(position[:, None] + np.moveaxis(turned, 0, -1))
+    readings, (position, rotation) = vec._sensing.obstacles.readings, were[148]
+    measured = readings.held[0, 148 % 3].reshape(4, -1, 3)  # at the step before the last but one
+    placed, observed = readings.placed[0], vec.task.view.obstacle_readings[0].reshape(4, -1, 3)
+    assert placed == pytest.approx(position[:, None] + turned(rotation, measured))
+    seen = (observed != [0.0, 0.0, vec.config.env.obstacles.range]).any(axis=2)
+    assert 0 < seen.sum() < seen.size
+    now = own.drone_position[0][:, None] + turned(own.drone_rotation[0], observed)
+    assert placed[seen] == pytest.approx(now[seen])
     assert np.abs(own.drone_position[0] - position).max() > 0.05
     assert np.abs(own.drone_position[0] - vec.world.state.drone_position[0]).max() > 1e-4
 
