@@ -122,13 +122,6 @@ FLIGHTS: dict[str, Flight] = {
         "navigate, unknown obstacles, own late senses",
         scripts=("formation", "formation_repelled"),
     ),
-    "navigate_senses_exact": Flight(
-        "navigate_senses",
-        {"env.obstacles.rate": None, "env.obstacles.delay": 0, "env.obstacles.noise": 0.0},
-        "navigate_senses",
-        "navigate, unknown obstacles, own exact senses",
-        scripts=("formation", "formation_repelled"),
-    ),
     "recover": Flight("recover", {}, "recover", "recover"),
     "recover_realistic": Flight("recover_realistic", {}, "recover_realistic", "recover, realistic", scripts=FOLLOWING),
     "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),
