@@ -134,8 +134,9 @@ def keep(path: Path, changes: str, rows: list[dict[str, Any]]) -> None:
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:
             rows = [row for row in csv.DictReader(file) if row["changes"] != changes] + rows
+    columns = dict.fromkeys(name for row in rows for name in row)  # learned teams alone have no difference
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[-1]), lineterminator="\n", restval="")
+        writer = csv.DictWriter(file, list(columns), lineterminator="\n", restval="")
         writer.writeheader()
         writer.writerows(rows)
 

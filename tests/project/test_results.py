@@ -19,6 +19,7 @@ sys.path.insert(0, str(ROOT / "results"))
 import reproduce  # noqa: E402
 import shifts  # noqa: E402
 import tables  # noqa: E402
+import twin  # noqa: E402
 
 
 @pytest.mark.slow
@@ -71,6 +72,14 @@ def test_tables_beside_pages_have_the_same_columns_in_every_row(path):
     with open(path, newline="", encoding="utf-8") as file:
         head, *rows = csv.reader(file)
     assert rows and all(len(row) == len(head) for row in rows) and len(set(head)) == len(head)
+
+
+def test_a_table_of_twins_keeps_rows_of_other_changes_and_of_other_columns(tmp_path):
+    table, keep = tmp_path / "twins.csv", twin.keep
+    keep(table, "", [{"team": "learned", "success": "90"}, {"team": "twin", "success": "20", "minus": "60 to 80"}])
+    keep(table, "late", [{"team": "learned", "success": "80"}])
+    keep(table, "late", [{"team": "learned", "success": "81"}])
+    assert table.read_text() == ("changes,team,success,minus\n,learned,90,\n,twin,20,60 to 80\nlate,learned,81,\n")
 
 
 def test_a_cell_holds_mean_and_range_of_what_is_there(tmp_path):
