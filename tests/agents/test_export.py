@@ -330,5 +330,5 @@ def test_a_missing_extra_is_named(monkeypatch, capsys):
 
 def test_a_contract_says_what_margins_the_drones_keep_beside_the_network():
     told = make_contract(policy("navigate_senses", **{"train.observe": None}))["action"]
-    assert told["margins"] == {"drone": 0.35, "payload": 0.4, "sector": 0.1}
+    assert told["margins"] == {"drone": 0.4, "payload": 0.5, "sector": 0.1}
     assert "margins" not in make_contract(policy())["action"]
