@@ -130,7 +130,7 @@ def test_workers_have_the_priority_of_their_caller(local_ray):
     """By Ray's own choice all other programs would come first: ten times slower on a busy machine."""
     import ray
 
-    assert ray.get(ray.remote(os.nice).remote(0)) == os.nice(0)
+    assert ray.get(ray.remote(lambda: os.nice(0)).remote()) == os.nice(0)
 
 
 def test_noise_is_of_environment_and_iteration_alone():
