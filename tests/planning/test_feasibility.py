@@ -126,8 +126,8 @@ def test_the_limits_are_where_flights_begin_to_fail(seconds, flies, monkeypatch)
     assert bool(flown["success_rate"][0] and flown["payload_rmse_m"][0] < 0.01) == flies
 
 
-@pytest.mark.parametrize("num_drones", [pytest.param(3, marks=pytest.mark.slow), 4])
 @pytest.mark.slow
+@pytest.mark.parametrize("num_drones", [3, 4])
 def test_a_flight_needs_what_was_planned(num_drones):
     """Tensions and rotor thrusts of a team under policy=mpc, which keeps to the path within millimetres."""
     places = [[0, 0, 1.5], [3, 1, 2, 0.5], [4, -2, 1.2, 1.0], [0, 0, 1.5]]
