@@ -200,9 +200,8 @@ def commands_of(block):
 
 
 SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 train.diffmpc.window=4 eval.episodes=2"  # one iteration
-FIVE = SHORT.replace("num_envs=4", "num_envs=5").replace(
-    "frames=32", "frames=40"
-)  # one environment of each of five rigs
+# One environment of each of five rigs.
+FIVE = SHORT.replace("num_envs=4", "num_envs=5").replace("frames=32", "frames=40")
 SHORTER = {  # of each script: keys that go, and what is added
     "train.py": (re.findall(r"(\S+)=", SHORT), SHORT),
     "evaluate.py": (["episodes"], "episodes=1 env.episode_seconds=0.4"),
