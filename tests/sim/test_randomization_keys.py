@@ -51,7 +51,7 @@ def keys(config: str) -> list[str]:
 def sets(names: list[str]) -> list[tuple[str, ...]]:
     """Return eight sets of up to 35 names: of any two names, one set has both, one neither, and one each alone.
 
-    Each name is in four sets, the first among them, and no two names in the same four: these share a set, and leave one out.
+    Each name is in four sets, the first among them, and no two in the same four: any two share a set and leave one out.
     """
     members = combinations(range(8), 4)
     of = {name: next(members) for name in names}
