@@ -3,7 +3,8 @@
 Each of these keeps a set-point in half-spaces, by projections in turn, as buffered Voronoi cells do (Zhou et al., IEEE
 RA-L 2017). They turn as the team moves, so that drones slide along obstacles.
 
-- Obstacles: a point that is seen forbids what is nearer to it, along the line from it to the drone.
+- Obstacles: a point that is seen forbids what is nearer to it, along the line from it to the drone; in the horizontal
+  plane if the point is beside the drone, so that its noise does not drive the drone up and down.
 - Payload: moved as the set-point is, it stays clear of the same points, in the horizontal plane.
 - Sector: the drone stays between the vertical planes through the payload that divide it from its neighbours' slots.
 """
@@ -26,6 +27,8 @@ LAG = 3.0
 """Of references behind a command that moves at a speed, times the speed over their frequency, see `smooth`."""
 ALIKE = 1e-6
 """[rad] between slots that nothing divides."""
+BESIDE = 0.5
+"""Sine of the elevation, up or down, below which a point is beside the drone."""
 STEEP = 0.9
 """Sine of the elevation above which a point is over the drone, and not beside its payload."""
 
@@ -117,7 +120,8 @@ def keep_clear(lo, hi, team, margins, smoothing):
                     away = sub(place, point)
                     distance = norm(away)
                     if margins.drone > 0.0:
-                        way = _stay_beyond(way, away, margins.drone)
+                        level = abs(away[2]) < BESIDE * distance
+                        way = _stay_beyond(way, (away[0], away[1], 0.0) if level else away, margins.drone)
                     if margins.payload > 0.0 and -away[2] < STEEP * distance:
                         beside = sub(payload, point)
                         way = _stay_beyond(way, (beside[0], beside[1], 0.0), margins.payload)

@@ -9,7 +9,7 @@ import pytest
 
 import multilift_marl as ml
 from multilift_marl.control.formation import Goal, Reference, Smoothing
-from multilift_marl.control.obstacle_margin import LAG, Margins, Surroundings, keep_clear, sector_planes
+from multilift_marl.control.obstacle_margin import BESIDE, LAG, Margins, Surroundings, keep_clear, sector_planes
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
 
@@ -69,8 +69,18 @@ def test_among_several_obstacles_it_is_in_no_margin(seed):
     points = rng.uniform(-1, 1, (4, 3))
     points *= rng.uniform(0.55, 2.0, (4, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
     kept = keep((0, 0, 0), rng.uniform(-4, 4, 3), points, 0.5)
-    far = np.linalg.norm(points, axis=1)
-    assert (((points - kept) * points).sum(axis=1) / far > 0.4).all()
+    beside = np.abs(points[:, 2]) < BESIDE * np.linalg.norm(points, axis=1)
+    lines = points * np.where(beside[:, None], [1, 1, 0], 1)
+    far = np.linalg.norm(lines, axis=1)
+    assert (((points - kept) * lines).sum(axis=1) / far > 0.4).all()
+
+
+def test_a_point_beside_the_drone_moves_it_horizontally_one_above_it_down():
+    tilt = np.arcsin(BESIDE)
+    for elevation, height in ((tilt - 0.01, 0.0), (0.01 - tilt, 0.0), (tilt + 0.01, -0.1), (-tilt - 0.01, 0.1)):
+        way = keep((0, 0, 0), (0, 0, 0), [(0.3 * np.cos(elevation), 0, 0.3 * np.sin(elevation))], 0.5)
+        assert way[0] < -0.1
+        assert abs(way[2]) < 1e-12 if height == 0.0 else way[2] / height > 0.9
 
 
 def test_the_payload_is_kept_from_what_the_drone_sees_as_it_moves_along():
