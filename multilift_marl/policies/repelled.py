@@ -2,7 +2,7 @@
 
 Each drone moves its slot against the nearest points of obstacles that it observes, within a distance and in proportion
 to how much nearer they are. Numbers: most successes on training maps of `navigate_senses`
-(`results/tune_repelled.py maps=24`).
+(`results/tune_rules.py`).
 """
 
 from __future__ import annotations
