@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.policies.filing import FormationFiled
 from multilift_marl.policies.formation import (
     Formation,
     FormationFeedback,
@@ -56,7 +57,14 @@ LINEAR: dict[str, type[Formation]] = {
     "hold_rotor": HoldRotor,
 }
 """Baselines that are linear maps of the observation."""
-Script = type[Formation] | type[PayloadGeometric] | type[TeamMpc] | type[RouteFormation] | type[FormationRepelled]
+Script = (
+    type[Formation]
+    | type[PayloadGeometric]
+    | type[TeamMpc]
+    | type[RouteFormation]
+    | type[FormationRepelled]
+    | type[FormationFiled]
+)
 SCRIPTED: dict[str, Script] = {
     **LINEAR,
     "mpc": TeamMpc,
@@ -65,6 +73,7 @@ SCRIPTED: dict[str, Script] = {
     "mpc_route_distributed": DistributedRouteMpc,
     "formation_route": RouteFormation,
     "formation_repelled": FormationRepelled,
+    "formation_filed": FormationFiled,
     "mpc_payload": PayloadRouteMpc,
     "mpc_narrow": NarrowRouteMpc,
     "mpc_potential": PotentialRouteMpc,
@@ -90,7 +99,7 @@ def fitting_scripts(vec: MultiliftVec) -> list[str]:
     for name, script in SCRIPTED.items():
         if issubclass(script, TeamMpc | RouteFormation):
             continue
-        if issubclass(script, FormationRepelled):
+        if issubclass(script, FormationRepelled | FormationFiled):
             known = script.sees(vec)
         else:
             known = not script.refusal(vec) if issubclass(script, Formation) else vec.config.env.sensing == "ideal"
