@@ -94,8 +94,8 @@ class FormationFiled:
         # 4. Set-points: with the payload beside the line; on a line through the gap; along an obstacle.
         wanted = slots.copy()
         beside = slots - np.einsum("eij,ej->ei", axes, (goal.position - own.start)[:, :2])[:, None]
-        rest = np.linalg.norm(goal.velocity, axis=1) > 1e-3
-        wanted[..., 1] += np.where(rest[:, None], self.FOLLOW * (load[..., 1] + beside[..., 1] - slots[..., 1]), 0.0)
+        moving = np.linalg.norm(goal.velocity, axis=1) > 1e-3
+        wanted[..., 1] += np.where(moving[:, None], self.FOLLOW * (load[..., 1] + beside[..., 1] - slots[..., 1]), 0.0)
         width = np.abs(beside[..., 1]).max(axis=1, keepdims=True)
         drawn = np.clip((self._gap[..., 2] - self.ROOM) / width, 1 - BESIDE, 1.0)
         wanted[..., 1] = np.where(knows, self._gap[..., 1] + drawn * beside[..., 1], wanted[..., 1])
