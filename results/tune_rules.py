@@ -1,4 +1,4 @@
-"""Tune the numbers of a rule-based baseline by CMA-ES (Hansen, arXiv 1604.00772) on training maps.
+"""Tune the numbers of a rule-based baseline by CMA-ES (Hansen, arXiv 1604.00772) on training maps: `pip install cma`.
 
   python results/tune_rules.py policy=formation_filed config=navigate_slots [maps=48] [generations=12] [seed=500]
 

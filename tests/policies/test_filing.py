@@ -20,7 +20,7 @@ def make(gap: float, width: float, **keys) -> ml.MultiliftVec:
     """Return a team before a wall across its line at x = 0 with a gap of a width [m], its middle at y = gap."""
     sides = [(gap + width / 2, 6.0), (-6.0, gap - width / 2)]
     walls = [{"shape": "box", "size": [0.2, b - a, 6], "position": [0, (a + b) / 2, 3]} for a, b in sides]
-    return ml.make_vec("navigate_slots", **GIVEN, **{"scene.obstacles": walls}, **keys)
+    return ml.make_vec("navigate_slots", **(GIVEN | {"scene.obstacles": walls} | keys))
 
 
 def fly(vec, policy) -> tuple[bool, np.ndarray]:
@@ -82,3 +82,20 @@ def test_it_refuses_other_tasks_and_beams():
         vec = ml.make_vec(name, num_envs=1, **keys)
         with pytest.raises(ConfigError, match="formation_filed is for task navigate"):
             make_scripted("formation_filed", vec)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{"env.num_drones": 2}, {"env.num_drones": 1, "payload.shape": "point"}, {"task_options.goal": [-4, 0, 2.5]},
+     {"env.obstacles.points": 1}],
+    ids=["two", "one", "upward", "one point"],
+)  # fmt: skip
+@pytest.mark.filterwarnings("error")
+def test_actions_are_finite_for_small_teams_vertical_lines_and_a_single_point(keys):
+    vec = make(0.5, 1.6, **keys)
+    policy = make_scripted("formation_filed", vec)
+    observation, _ = vec.reset(seed=0)
+    for _ in range(60):
+        action = policy.act(observation)
+        assert np.isfinite(action).all() and np.abs(action).max() <= 1
+        observation = vec.step(action, restart=True)[0]
