@@ -123,6 +123,9 @@ def pytest_collection_modifyitems(config, items):
     items[:] = [item for item in items if item not in redundant]
     for item in items:
         asked = asked_of(item)
+        if "planner_weights" in [value for value in asked.values() if isinstance(value, str)]:
+            # Its planner takes a minute to compile.
+            item.add_marker(pytest.mark.slow)
         task = asked.get("task", "hover")
         if task == "hover":
             continue

@@ -22,6 +22,8 @@ from multilift_marl.planning.team_planner import TeamPlanner, make_objective, ma
 from multilift_marl.schema.planner import PlannerConfig
 from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 N, STEPS, STEP = 3, 6, 0.05
 SIZE, Q, NU = state_size(N), 6 + 2 * N, 3 * N
 

@@ -11,6 +11,8 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.planning.team_model import ModelWork, step_state
 from multilift_marl.policies.baselines import make_scripted
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
 FULL = {
     "control.action": "full_state", "control.max_offset": 2.0, "control.max_velocity": 5.0,
@@ -93,7 +95,6 @@ def test_it_keeps_to_a_fast_figure_eight_within_millimetres():
     assert (fly(FULL) < 0.0035).all()
 
 
-@pytest.mark.slow
 def test_actions_that_come_late_cost_nothing_and_by_rates_something():
     late = {"randomization.action_delay": 1, "planner.delay": 0.02}
     assert (fly(FULL, **late) < 1.1 * fly(FULL)).all()

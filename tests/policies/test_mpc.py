@@ -14,6 +14,8 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.mpc import ENOUGH, TeamMpc
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 BY_RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
 FAST = {"task_options.speed": 2.0, "task_options.acceleration": 4.0, "task_options.rmse_from": 3.0}
 
@@ -23,15 +25,12 @@ def fly(config, overrides, episodes=2, seconds=6.0):
     return run_episodes(loaded, lambda vec: make_scripted("mpc", vec), episodes, 77)
 
 
-@pytest.mark.parametrize(
-    "overrides", [{}, *(pytest.param({"env.num_drones": n}, marks=pytest.mark.slow) for n in (3, 6))]
-)
+@pytest.mark.parametrize("overrides", [{}, {"env.num_drones": 3}, {"env.num_drones": 6}])
 def test_it_keeps_to_a_figure_eight_within_millimetres(overrides):
     result = fly("track", FAST | overrides)
     assert (result["payload_rmse_m"] < 0.0025).all()
 
 
-@pytest.mark.slow
 def test_chains_and_a_hidden_mass_cost_little():
     assert (fly("track", FAST | {"cable.model": "chain"}, 1)["payload_rmse_m"] < 0.004).all()
     assert (fly("track", FAST | {"randomization.payload_mass": 0.2})["payload_rmse_m"] < 0.009).all()
@@ -39,7 +38,6 @@ def test_chains_and_a_hidden_mass_cost_little():
     assert (fly("track", FAST | late)["payload_rmse_m"] < 0.006).all()
 
 
-@pytest.mark.slow
 def test_it_holds_what_it_does_not_know():
     """Hidden mass ± 20 % and a force up to 1.5 N, from starts up to half a metre away."""
     result = fly("hover", {}, episodes=4, seconds=8.0)
@@ -48,25 +46,21 @@ def test_it_holds_what_it_does_not_know():
     assert (without["payload_position_error_m"] > 0.01).all()
 
 
-@pytest.mark.slow
 def test_noise_costs_a_centimetre():
     noisy = fly("hover", {"randomization.observation_noise": 1.0}, episodes=6, seconds=8.0)
     assert noisy["success_rate"].all() and (noisy["payload_position_error_m"] < 0.02).all()
 
 
-@pytest.mark.slow
 def test_late_cameras_cost_a_centimetre():
     assert (fly("track", FAST | {"env.sensing": "mocap"})["payload_rmse_m"] < 0.02).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("sensing", "path", "most"), [("onboard", FAST, 0.03), ("blind", {}, 0.08)])
 def test_sensors_on_board_cost_centimetres(sensing, path, most):
     result = fly("track", path | {"env.sensing": sensing}, episodes=6)
     assert not result["failure_cause"].any() and (result["payload_rmse_m"] < most).all()
 
 
-@pytest.mark.slow
 def test_it_flies_tilted_poses():
     result = fly("pose", {}, episodes=2, seconds=8.0)
     assert result["success_rate"].all() and (result["payload_position_error_m"] < 0.01).all()
@@ -90,7 +84,7 @@ def test_a_target_that_leaps_is_approached():
 KNOWN = {"randomization.payload_mass": 0.0, "randomization.payload_force": 0.0}
 
 
-@pytest.mark.parametrize("n", [4, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [4, 8])
 def test_drones_keep_to_a_shape_that_is_drawn_in(n):
     """Within 2 s on 1 m the formation narrows to 0.55 of its width and turns by 40°; drones are within a centimetre."""
     vec = ml.make_vec("hover", num_envs=1, num_threads=1, **BY_RATES, **KNOWN, **{"env.num_drones": n})
@@ -183,10 +177,10 @@ def test_its_flight_is_the_same_alone_and_again():
 @pytest.mark.parametrize(
     ("config", "overrides", "said"),
     [
-        pytest.param("takeoff", {}, "policy=mpc cannot fly task takeoff", marks=pytest.mark.slow),
+        ("takeoff", {}, "policy=mpc cannot fly task takeoff"),
         ("gate", {}, "policy=mpc cannot fly task gate"),
-        pytest.param("loss", {}, "policy=mpc cannot fly task loss", marks=pytest.mark.slow),
-        pytest.param("recover", {}, "policy=mpc cannot fly task recover", marks=pytest.mark.slow),
+        ("loss", {}, "policy=mpc cannot fly task loss"),
+        ("recover", {}, "policy=mpc cannot fly task recover"),
         ("hover", {"env.num_drones": 1}, "two anchors or more"),
         ("hover", {"control.disturbance": "indi"}, "set control.disturbance=none"),
         ("hover", {"control.action": "reference"}, "acts by control.action=acc_rates"),

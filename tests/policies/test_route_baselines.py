@@ -51,6 +51,7 @@ def fly(vec, observation, policy):
     return terminated[0], info
 
 
+@pytest.mark.slow  # its planner takes a minute to compile
 @pytest.mark.parametrize("name", NAMES)
 def test_an_empty_map_is_flown_to_success(name):
     vec, observation = team_on([], **{"env.episode_seconds": 7.0, "task_options.speed": 2.0})
@@ -84,6 +85,7 @@ def test_a_field_turns_round_a_pillar_and_ends_in_a_trap():
     assert 0.3 * (1 / r - 1) / r**2 == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow  # its planner takes a minute to compile
 @pytest.mark.parametrize(("name", "arrives"), [("mpc_payload", True), ("mpc_potential", False)])
 def test_in_a_trap_a_field_ends_where_a_search_finds_out(name, arrives):
     """The team on the field's path stays in the trap until time is out; nothing touches anything there."""
@@ -113,6 +115,7 @@ def test_the_narrowest_shape_is_narrower_than_at_rest_and_within_its_limits(dron
     assert len(modes) == (drones > 2)  # two fly in line anyway
 
 
+@pytest.mark.slow  # its planner takes a minute to compile
 def test_a_narrow_formation_heads_along_its_path():
     vec, _ = team_on([(CYLINDER, (0.3, 0.3, 2.0), (-1.5, 0.0, 2.0), 0.0)])
     policy = make_scripted("mpc_narrow", vec)
@@ -128,6 +131,7 @@ def test_a_narrow_formation_heads_along_its_path():
     assert value[[0, -1], 3:] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow  # its planner takes a minute to compile
 @pytest.mark.parametrize("name", NAMES)
 def test_what_comes_in_sight_is_replanned_for(name):
     """A pillar beyond the range is not known; once it is near, the route leads round it without a leap."""

@@ -79,6 +79,7 @@ def test_a_team_goes_around_what_comes_into_sight():
     assert (seen[0] < (vec.world.obstacles.kind != NONE).sum(axis=1)).all() and (np.diff(seen, axis=0) >= 0).all()
 
 
+@pytest.mark.slow  # its planner takes a minute to compile
 def test_without_a_way_the_team_waits():
     vec = make("navigate", num_envs=1, **FLOWN)
     policy = make_scripted("mpc_route", vec)

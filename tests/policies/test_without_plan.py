@@ -13,6 +13,8 @@ from multilift_marl.planning.team_planner import Plans
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.last_plan import LastPlan
 
+pytestmark = pytest.mark.slow  # its planner takes a minute to compile
+
 
 def fly(config, make, seconds=6.0, episodes=2, **overrides):
     loaded = load_config(config, BY_RATES | overrides | {"env.episode_seconds": seconds, "env.num_threads": 1})
@@ -64,7 +66,6 @@ def test_for_a_while_it_flies_by_the_last_plan(spoil):
     assert (result["failure_cause"] == 0).all()
 
 
-@pytest.mark.slow
 def test_so_it_does_by_full_states():
     wide = {"max_offset": 2.0, "max_velocity": 5.0, "max_acceleration": 25.0, "max_jerk": 300.0, "max_cable_force": 5.0}
     settings = FAST | {f"control.{key}": value for key, value in wide.items()} | {"control.action": "full_state"}
