@@ -58,8 +58,12 @@ def place_anchors(
     payload = config.payload
     reach = np.min(length * np.sin(np.deg2rad(config.cable.angle)))
     ring = max(0.27 * scale, REST_SEPARATION * scale / (2 * np.sin(np.pi / n)) - reach) if n > 1 else 0.0
+    if payload.anchor_radius is not None:
+        if payload.anchors is not None or payload.shape == "point":
+            raise ConfigError("payload.anchor_radius is for anchors on a ring; drop it, or payload.anchors")
+        ring = payload.anchor_radius
     edge = 2 * max(ring, 0.15 * scale)
-    rectangle = n == 4 and payload.shape != "cylinder"
+    rectangle = n == 4 and payload.shape != "cylinder" and payload.anchor_radius is None
     standard = np.array([0.55, 0.45, 0.15]) * scale if rectangle else np.array([edge, edge, 0.15 * scale])
     size = standard if payload.size is None else np.asarray(payload.size, float)
     size = size if mesh is None else mesh.edges
@@ -76,7 +80,13 @@ def place_anchors(
         corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
         anchors = np.concatenate([corners * rim, np.full((4, 1), lid)], axis=1)
     else:
-        azimuth, ring = 2 * np.pi * np.arange(n) / n, min(ring, size[:2].min() / 2)
+        widest = size[:2].min() / 2
+        if payload.anchor_radius is not None and ring > widest:
+            raise ConfigError(
+                f"payload.anchor_radius={ring:g} lies outside a payload of {2 * widest:g} m; raise payload.size to "
+                f"{2 * ring:g} or more"
+            )
+        azimuth, ring = 2 * np.pi * np.arange(n) / n, min(ring, widest)
         anchors = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(n, lid)], axis=1)
     if payload.shape == "point":
         for key in ("size", "inertia", "center_of_mass"):

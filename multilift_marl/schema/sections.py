@@ -160,6 +160,9 @@ class PayloadConfig(Section):
     anchors: Annotated[tuple[Vector, ...] | None, Between(-100, 100, "m")] = Field(
         None, description="[m] attachment of each cable from the geometric centre; None: the standard rig's"
     )
+    anchor_radius: Annotated[Positive | None, Between(1e-3, 100, "m")] = Field(
+        None, description="[m] of a ring on which the cables are attached; None: the standard rig's, or anchors"
+    )
     drag_area: Annotated[Float, Between(0, 1000, "m²")] = Field(
         0.09, ge=0, description="[m²] C_d A of the payload (cube C_d 1.05 on its smaller faces)"
     )

@@ -205,6 +205,7 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
     later = recipe.keys() - stored.keys() - own  # keys that were added since
     assert {key for key in later if not key.startswith("planner.")} <= {
         "cable.azimuth",
+        "payload.anchor_radius",
         "train.critic_learning_rate",
         "train.init",
         "train.stages",

@@ -262,3 +262,30 @@ def test_non_negative_least_squares_meets_its_conditions():
 def test_every_cable_is_to_pull_and_to_stand(force, pull):
     forces = np.array([[0.0, -0.3, 1.0], force])
     assert balance._all_pull(forces, np.ones(2)) is pull
+
+
+# A ring of anchors of one's own
+
+
+@pytest.mark.parametrize("n", [3, 4, 6])
+def test_anchors_lie_on_a_ring_of_the_radius_that_is_asked_for(n):
+    system = make_system(n, **{"payload.anchor_radius": 0.55})
+    azimuth = 2 * np.pi * np.arange(n) / n
+    np.testing.assert_allclose(
+        system.anchors[:, :2], 0.55 * np.stack([np.cos(azimuth), np.sin(azimuth)], 1), atol=1e-12
+    )
+    np.testing.assert_allclose(system.payload_size, [1.1, 1.1, 0.15])
+    given = make_system(n, **{"payload.anchor_radius": 0.3, "payload.size": [0.9, 0.8, 0.2]})
+    np.testing.assert_allclose(np.linalg.norm(given.anchors[:, :2], axis=1), 0.3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ({"payload__size": [1.2, 1.0, 0.1]}, "payload.anchor_radius=0.55 lies outside a payload of 1 m"),
+        ({"payload__anchors": PLANE}, "payload.anchor_radius is for anchors on a ring"),
+        ({"payload__shape": "point"}, "payload.anchor_radius is for anchors on a ring"),
+    ],
+)
+def test_a_ring_that_cannot_be_is_refused(overrides, said):
+    assert said in refuse_system(payload__anchor_radius=0.55, **overrides)
