@@ -79,18 +79,34 @@ def shared() -> list[tuple[str, Term]]:
     return [item for item in first.items() if all(item in other.items() for other in others)]
 
 
-def section(name: str, task: type[Task], recipes: list[str]) -> str:
-    """Return the section of a task."""
+def listed(columns: tuple[str, ...], rows: Iterable[tuple[str, ...]], known: set[tuple[str, str]]) -> list[str]:
+    """Return a table of the rows whose names and meanings are new, and a sentence with the values of the others.
+
+    Args:
+        columns: of the table; the first is a name, the last a meaning.
+        rows: of the table.
+        known: names and meanings of earlier tasks; new ones are added.
+    """
+    new = [row for row in rows if (row[0], row[-1]) not in known]
+    again = [f"{row[0]} {', '.join(filter(None, row[1:-1]))}" for row in rows if (row[0], row[-1]) in known]
+    known |= {(row[0], row[-1]) for row in new}
+    parts = [table(columns, new)] if new else []
+    return parts + ([f"{columns[0].capitalize()}s as above: {'; '.join(again)}."] if again else [])
+
+
+def section(name: str, task: type[Task], recipes: list[str], known: set[tuple[str, str]]) -> str:
+    """Return the section of a task; see `listed`."""
     links = ", ".join(f"[`{each}`](../configs/{each}.yaml)" for each in recipes)
     parts = [f"### {name}", f"[{name}.md]({name}.md); configurations {links}."]
     options = [option_row(key, field) for key, field in task.Options.model_fields.items()]
-    parts.append(table(("option", "default", "meaning"), options))
+    parts += listed(("option", "default", "meaning"), options, known)
     if task.EXTRA:
         parts.append(table(_COMPONENTS, map(component_row, task.EXTRA)))
     if task.EXTRA_STATE:
         same = [part.name for part in task.EXTRA_STATE] == [part.name for part in task.EXTRA]
         parts.append(f"The global state has {'them' if same else names(task.EXTRA_STATE)}, too.")
-    parts.append(table(_REWARD, [reward_row(*item) for item in task.REWARD.items() if item not in shared()]))
+    rewards = [reward_row(*item) for item in task.REWARD.items() if item not in shared()]
+    parts += listed(_REWARD, rewards, known)
     return "\n\n".join(parts)
 
 
@@ -107,12 +123,12 @@ def contents() -> dict[str, str]:
     """Return what stands between the markers, by name."""
     state = [("payload, target, hidden quantities", names(STATE)), ("of each drone", names(DRONE_STATE))]
     state += [("where randomised", names(HIDDEN.values())), ("the same of each drone", names(DRONE_HIDDEN.values()))]
-    of_task = recipes()
+    of_task, known = recipes(), set[tuple[str, str]]()
     return {
         "observations": table(_COMPONENTS, map(component_row, OBSERVATION)),
         "state": table(("global state", "components (size, frame)"), state),
         "rewards": table(_REWARD, [reward_row(*item) for item in shared()]),
-        "tasks": "\n\n".join(section(name, task, of_task[name]) for name, task in sorted(TASKS.items())),
+        "tasks": "\n\n".join(section(name, task, of_task[name], known) for name, task in sorted(TASKS.items())),
     }
 
 

@@ -129,6 +129,13 @@ FLIGHTS: dict[str, Flight] = {
         "navigate, a wall's gap of 0.5 to 1.1 formations, own late senses to 1.5 m",
         scripts=("formation", "formation_repelled", "formation_filed"),
     ),
+    "regroup_senses": Flight(
+        "regroup_senses",
+        {},
+        "regroup_senses",
+        "regroup, own senses",
+        scripts=("formation", "formation_integral", "formation_adaptive"),
+    ),
     "recover": Flight("recover", {}, "recover", "recover"),
     "recover_realistic": Flight("recover_realistic", {}, "recover_realistic", "recover, realistic", scripts=FOLLOWING),
     "recover_crazymarl": Flight("recover_crazymarl", {}, "recover_crazymarl", "recover, CrazyMARL's starts", CRAZYMARL),

@@ -1,4 +1,4 @@
-"""Tune the numbers of a rule-based baseline by CMA-ES (Hansen, arXiv 1604.00772) on training maps: `pip install cma`.
+"""Tune the numbers of a rule by CMA-ES (Hansen, arXiv 1604.00772) on training maps or episodes: `pip install cma`.
 
   python results/tune_rules.py policy=formation_filed config=navigate_slots [maps=48] [generations=12] [seed=500]
 
@@ -25,6 +25,10 @@ RANGES = {
     "formation_repelled": {"DISTANCE": (0.4, 2.5), "GAIN": (0.1, 2.0), "SWAY": (0.0, 1.0)},
     "formation_filed": {
         "STOP": (0.3, 1.4), "SLIDE": (0.1, 1.5), "ROOM": (0.0, 0.6), "FOLLOW": (0.0, 1.0), "TURN": (0.5, 2.8),
+    },
+    "formation_adaptive": {
+        "GIVE": (0.0, 1.0), "LEAN": (0.0, 1.2), "FILTER": (0.1, 3.0), "LIFT": (0.0, 1.5), "LIFT_RATE": (0.0, 1.5),
+        "SHIFT_RATE": (0.0, 1.0),
     },
 }  # fmt: skip
 """What is tuned, and within what."""

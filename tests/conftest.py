@@ -97,6 +97,8 @@ def is_redundant(item: pytest.Item) -> bool:
     asked = {name: value for name, value in asked_of(item).items() if name not in own}
     if not {"task", "cables"} <= asked.keys() or asked["task"] == "hover":
         return False
+    if not find_task(asked["task"]).CHAINS:
+        return asked["cables"] == CABLES["chain"]
     chosen = TASKS.index(asked["task"]) + list(CABLES.values()).index(asked["cables"])
     if "num_drones" in asked:
         if (asked["num_drones"], asked["cables"]) == (2, CABLES["massless"]):  # what default tests fly
@@ -168,6 +170,11 @@ def _enough_drones(request):
 
 def _names(argument: str | tuple[str, ...]) -> list[str]:
     return [part.strip() for part in argument.split(",")] if isinstance(argument, str) else list(argument)
+
+
+def slow(*values: object) -> object:
+    """Return a parameter whose tests are slow."""
+    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def load_script(name: str) -> ModuleType:

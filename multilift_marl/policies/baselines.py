@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.policies.adaptive import FormationAdaptive
+from multilift_marl.policies.balanced import FormationBalanced
 from multilift_marl.policies.filing import FormationFiled
 from multilift_marl.policies.formation import (
     Formation,
@@ -64,6 +66,8 @@ Script = (
     | type[RouteFormation]
     | type[FormationRepelled]
     | type[FormationFiled]
+    | type[FormationAdaptive]
+    | type[FormationBalanced]
 )
 SCRIPTED: dict[str, Script] = {
     **LINEAR,
@@ -74,6 +78,8 @@ SCRIPTED: dict[str, Script] = {
     "formation_route": RouteFormation,
     "formation_repelled": FormationRepelled,
     "formation_filed": FormationFiled,
+    "formation_adaptive": FormationAdaptive,
+    "formation_balanced": FormationBalanced,
     "mpc_payload": PayloadRouteMpc,
     "mpc_narrow": NarrowRouteMpc,
     "mpc_potential": PotentialRouteMpc,
@@ -94,12 +100,12 @@ def _by_name(name: str) -> Script:
 
 
 def fitting_scripts(vec: MultiliftVec) -> list[str]:
-    """Return the names of the baselines that can act in the environments `vec`, without those that plan."""
+    """Return the names of baselines that can act in environments, but for those that plan or know the truth."""
     fitting = []
     for name, script in SCRIPTED.items():
-        if issubclass(script, TeamMpc | RouteFormation):
+        if issubclass(script, TeamMpc | RouteFormation | FormationBalanced):
             continue
-        if issubclass(script, FormationRepelled | FormationFiled):
+        if issubclass(script, FormationRepelled | FormationFiled | FormationAdaptive):
             known = script.sees(vec)
         else:
             known = not script.refusal(vec) if issubclass(script, Formation) else vec.config.env.sensing == "ideal"

@@ -285,6 +285,13 @@ def update_own_estimate(lo, hi, scene, load, first):
     """Estimate each payload from a drone's own anchor alone, at rest in the planned attitude."""
     for e in range(lo, hi):
         for n in range(load.tension.shape[1]):
+            if scene.true.cable_broken[e, n]:
+                # Without a cable it takes the payload to be where it is planned to be.
+                putmat(load.rotation[e, n], matrow(scene.planned.rotation, e))
+                put(load.position[e, n], row(scene.planned.position, e))
+                put(load.velocity[e, n], row(scene.planned.velocity, e))
+                put(load.body_rates[e, n], (0.0, 0.0, 0.0))
+                continue
             if not scene.knows_anchor[e, n]:
                 predict_position(e, n, load, scene.sensor)
                 continue

@@ -17,6 +17,7 @@ from multilift_marl.tasks.loss import Loss
 from multilift_marl.tasks.navigate import Navigate
 from multilift_marl.tasks.pose import Pose
 from multilift_marl.tasks.recover import Recover
+from multilift_marl.tasks.regroup import Regroup
 from multilift_marl.tasks.takeoff import Takeoff
 from multilift_marl.tasks.task_checks import check_declared
 from multilift_marl.tasks.track import Track
@@ -29,6 +30,7 @@ TASKS: dict[str, type[Task]] = {
     "navigate": Navigate,
     "pose": Pose,
     "recover": Recover,
+    "regroup": Regroup,
     "takeoff": Takeoff,
     "track": Track,
 }

@@ -23,7 +23,6 @@ from multilift_marl.mdp.observations import Component, kernels_first, list_compo
 from multilift_marl.mdp.rewards import RestBounds, Term, compose_reward, is_at_rest, resolve_reward
 from multilift_marl.mdp.rig_features import RIG, describe_rig, observed_units, scale_numbers
 from multilift_marl.mdp.stage_kernels import compose_check, compose_plan, in_turn
-from multilift_marl.rig.constants import RigArrays
 from multilift_marl.schema.validate import check_magnitudes, validate
 from multilift_marl.schema.values import Section
 from multilift_marl.sensing.measurement import Sensing
@@ -96,6 +95,7 @@ class Task:
         MIN_DRONES: with fewer it makes no sense.
         MAX_DISTANCE: of the payload from its target, beyond which it is out of range [m].
         CAN_PLAN: whether planners can fly it: all cables taut throughout, no drone lost, nothing in the way.
+        CHAINS: whether cables may be chains.
 
     Args:
         config: of the environments; `task_options`, `reward`, `env` and `sim` count.
@@ -129,6 +129,7 @@ class Task:
     MIN_DRONES: ClassVar[int] = 1
     MAX_DISTANCE: ClassVar[float] = MAX_DISTANCE
     CAN_PLAN: ClassVar[bool] = True
+    CHAINS: ClassVar[bool] = True
     own: Any
     settings: Any
 
@@ -136,6 +137,8 @@ class Task:
         e, n, system = world.num_envs, world.num_drones, world.system
         if n < self.MIN_DRONES:
             raise ConfigError(f"task {self.name} needs more drones; raise env.num_drones to {self.MIN_DRONES} or more")
+        if config.cable.model == "chain" and not self.CHAINS:
+            raise ConfigError(f"task {self.name} has no chains; set cable.model=massless")
         self.config, self.world, self.reference, self._sensing = config, world, reference, sensing
         self.options = validate(self.Options, config.task_options, "task_options")
         check_magnitudes(self.options, "task_options")
@@ -238,11 +241,6 @@ class Task:
             mass: true mass of the payload [kg].
         """
         raise NotImplementedError
-
-    @property
-    def hanging(self) -> RigArrays:
-        """`equilibrium` by its name before 0.2."""
-        return self.equilibrium
 
     def view_for(self, kernel: Callable[..., Any]) -> View:
         """Return what a kernel, called by `start`, reads and writes of `view`; see `reduce_view`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import make, make_system, zeros
+from conftest import make, make_system, slow, zeros
 
 from multilift_marl.policies.baselines import make_scripted
 
@@ -32,7 +32,7 @@ def fly(vec, policy, steps: int) -> np.ndarray:
     return np.array(path)
 
 
-@pytest.mark.parametrize("task", ["hover", "recover", "takeoff", "track", "pose"])
+@pytest.mark.parametrize("task", ["hover", slow("recover"), slow("takeoff"), "track", "pose"])
 def test_drones_start_outward_and_come_back_to_it(task):
     vec = make(task, num_drones=5, **OUTWARD)
     azimuth = vec.world.system.slot_azimuth

@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+from conftest import slow
 
 import multilift_marl as ml
 from multilift_marl.config.load import build_config
@@ -99,7 +100,7 @@ def until_heard(live: LiveFlight, node: PolicyNode) -> None:
     assert node.steps == 1
 
 
-@pytest.mark.parametrize("task", ["hover", "track", "pose", "land", "recover"])
+@pytest.mark.parametrize("task", ["hover", "track", "pose", slow("land"), slow("recover")])
 def test_a_flight_by_the_node_is_the_flight_by_the_policy(task):
     config = config_of(task, **{"env.episode_seconds": 20})
     here, there = Node(domain=DOMAIN), Node(domain=DOMAIN)
@@ -163,6 +164,7 @@ def test_the_node_flies_drones_that_hear_what_px4_hears(task):
     [
         ({"control.action": "ctbr"}, "of control.action=reference, not of ctbr"),
         ({"task": "loss", "env.num_drones": 4}, "nobody measures whose motors have stopped"),
+        ({"task": "regroup", "env.sensing": "ideal"}, "nobody measures whose cables are attached"),
     ],
 )
 def test_what_the_node_cannot_fly_is_refused(overrides, words):

@@ -79,7 +79,8 @@ def test_an_ended_environment_cannot_be_stepped(task, cables):
 
 @pytest.mark.parametrize("num_threads", [1, 2])
 def test_a_diverged_environment_ends_alone_and_soundly(task, cables, num_threads):
-    broken, sound = (make(task, num_envs=6, num_threads=num_threads, seed=3, **cables) for _ in range(2))
+    calm = {"task_options.absent": 0.0} if task == "regroup" else {}  # three of four often cannot hold its payload
+    broken, sound = (make(task, num_envs=6, num_threads=num_threads, seed=3, **cables, **calm) for _ in range(2))
     for vec in (broken, sound):
         vec.reset()
     others = [0, 1, 3, 4, 5]

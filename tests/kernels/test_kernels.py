@@ -184,6 +184,7 @@ def test_kernels_that_check_bounds_are_others(package, tmp_path):
     assert run(NORM, tmp_path, NUMBA_BOUNDSCHECK="1")[1] == COMPILING
 
 
+@pytest.mark.slow
 def test_a_package_that_is_read_only_keeps_kernels_in_the_users_cache(package, tmp_path):
     (package / "__pycache__").write_text("a file in the folder's place")
     assert run(NORM, tmp_path, XDG_CACHE_HOME=str(tmp_path / "caches")) == (pytest.approx(1), COMPILING)
@@ -194,6 +195,7 @@ def test_a_package_that_is_read_only_keeps_kernels_in_the_users_cache(package, t
     assert len(kernels(tmp_path / "caches")) == 2 * len(first) > 0
 
 
+@pytest.mark.slow
 def test_kernels_go_where_numba_is_told(package, tmp_path):
     run(NORM, tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "told"))
     assert kernels(tmp_path / "told") and not kernels(package)

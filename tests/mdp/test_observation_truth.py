@@ -31,6 +31,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "navigate": {"env.obstacle_sensing": "none"},
     "land": {"control.max_offset": 0.01},
     "loss": {"task_options.loss_time": [0.2, 0.3], "task_options.broadcast": True},
+    "regroup": {"task_options.events": [0.1], "task_options.event_spread": 0.05},
 }
 
 
@@ -219,6 +220,11 @@ def recover(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
     return {"grace": everyone(m, 1 - m.seconds / 2.0), "slack": ((length - spanned) / length)[..., None]}
 
 
+def regroup(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
+    """See docs/regroup.md."""
+    return {"attached": ~m.state["cable_broken"][..., None]}
+
+
 def takeoff(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
     """See docs/takeoff.md: the pull grows from 2.9 to 4.1 s, then the target leaves the ground."""
     climb = m.goal["velocity"][:, 2]
@@ -244,7 +250,7 @@ def track(m: Moment, later: list[Moment]) -> dict[str, np.ndarray]:
 
 OWN: dict[str, Callable[[Moment, list[Moment]], dict[str, np.ndarray]]] = {
     "gate": gate, "hover": lambda m, later: {}, "land": land, "loss": loss, "navigate": navigate,
-    "pose": pose, "recover": recover, "takeoff": takeoff, "track": track,
+    "pose": pose, "recover": recover, "regroup": regroup, "takeoff": takeoff, "track": track,
 }  # fmt: skip
 
 

@@ -164,6 +164,7 @@ def doubled(values):
     return values + values
 
 
+@pytest.mark.few_tasks
 def test_kernels_composed_of_the_package_s_own_count_no_references(task, monkeypatch):
     """Where they do, each call that is handed a view counts those of all of its arrays: three times the compilation."""
     counted, compile_one = {}, jit._compile

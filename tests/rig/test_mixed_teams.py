@@ -252,4 +252,4 @@ def test_a_mixed_team_opens_every_task(task, cables):
     vec.reset(seed=0)
     vec.step(zeros(vec))
     assert floats(vec.task.rig.mass) == floats([PRESETS[name].mass for name in MIX])
-    assert ml.load_config(task, {"vehicle.preset": MIX}).system.num_drones == 4
+    assert ml.load_config(task, {"env.num_drones": 4, "vehicle.preset": MIX}).system.num_drones == 4

@@ -82,6 +82,7 @@ def test_other_draws_stay_what_they_are_without(draws):
     assert (narrow["cable_length"] == 1.0).all() and not narrow["wind"].any()
 
 
+@pytest.mark.few_tasks
 def test_info_holds_the_draw_at_reset_and_at_every_step(task, cables):
     vec = make(task, **ALL, **cables)
     drawn = vec.reset()[1]["randomization"]

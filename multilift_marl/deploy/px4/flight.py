@@ -352,8 +352,8 @@ def check_config(config: Config) -> Config:
             f"PX4 has set-points for control.action={' and '.join(ACTIONS)}, not for {config.control.action}; take a "
             "policy of one of these interfaces"
         )
-    if config.task == "loss":
-        raise ConfigError("PX4 cannot fly config=loss: a team that has lost a drone cannot be brought back")
+    if config.task in ("loss", "regroup"):
+        raise ConfigError(f"PX4 cannot fly config={config.task}: a team that has lost a drone cannot be brought back")
     if config.task == "land" and (pace := config.task_options.get("pace", 1.0)) > LANDING_PACE:
         raise ConfigError(
             f"drones under PX4 follow config=land too late at task_options.pace={pace:g}, and the "
