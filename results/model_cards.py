@@ -39,7 +39,7 @@ SIMULATED = "Trained and evaluated in this simulation alone; not flown on a real
 REFUSED = "Environments with other observations or another action interface are refused."
 HEAD = """# Shipped policies
 
-The policies of `ml.load_policy(<name>)`, and the gain of each over the best baseline. Names link to cards (JSON):
+The policies of `ml.load_policy(<name>)`, and how each compares with the best baseline. Names link to cards (JSON):
 observations and normalisation, recipe, seeds, metrics as [mean, low, high] of the 95 % interval, robustness to shifts,
 limits.
 
@@ -48,8 +48,8 @@ python evaluate.py run=hover episodes=200 seed=1000  # evaluate a policy; the ot
 python train.py config=hover                         # train it again
 ```
 
-- Weights are of training seed 0; the gain is the mean over all recorded seeds. Columns, episodes and verdicts are those
-  of [results.md](results.md); training is environment steps and wall-clock minutes.
+- Weights are of training seed 0, verdicts of all recorded seeds, as in [results.md](results.md), where the gains are;
+  training is environment steps and wall-clock minutes.
 - All were trained and evaluated in this simulation alone, not on real drones. Performance on other rigs, numbers of
   drones or conditions is known only where `shifts` of the card state it.
 - Environments with other observations or another [action interface](control.md#action-interfaces) are refused.
@@ -221,22 +221,22 @@ def _differences(section: Any, usual: Any) -> dict[str, Any]:
 
 def page(cards: list[dict[str, Any]]) -> str:
     """Return docs/models.md."""
-    lines = ["| policy | task and conditions | drones | actions | training | gain (95 % interval) | verdict |"]
-    lines.append("|" + "---|" * 7)
+    lines = ["| policy | task and conditions | drones | actions | training | verdict |"]
+    lines.append("|" + "---|" * 6)
     for each in cards:
         training = each["training"]
         counts = {rig.get("env.num_drones", each["num_drones"]) for rig in training["rigs"]} or {each["num_drones"]}
         drones = str(min(counts)) if len(counts) == 1 else f"{min(counts)}–{max(counts)}"
         minutes = "" if training["minutes"] is None else f", {training['minutes']:.0f} min"
         task = f"[{each['task']}](results.md#{each['task']})"
-        rows = [[row["conditions"], row["gain"], row["verdict"]] for row in each["evaluation"]] or [["", "-", "-"]]
-        titles, gains, verdicts = (list(column) for column in zip(*rows, strict=True))
+        rows = [[row["conditions"], row["verdict"]] for row in each["evaluation"]] or [["", "-"]]
+        titles, verdicts = (list(column) for column in zip(*rows, strict=True))
         titles = ["" if text == each["task"] else text.removeprefix(f"{each['task']}, ") for text in titles]
         steps = f"{training['environment_steps'] / 1e6:.1f} M steps{minutes}"
         cells = [f"[{each['name']}](models/{each['name']}.json)", "<br>".join(filter(None, [task, *titles]))]
-        cells += [drones, f"`{each['actions']['interface']}`", steps, "<br>".join(gains), "<br>".join(verdicts)]
+        cells += [drones, f"`{each['actions']['interface']}`", steps, "<br>".join(verdicts)]
         if len(titles) > 1:
-            cells[-2:] = (f"<br>{cell}" for cell in cells[-2:])
+            cells[-1] = f"<br>{cells[-1]}"
         lines.append(f"| {' | '.join(cells)} |")
     return f"{HEAD}\n" + "\n".join(lines) + "\n"
 
