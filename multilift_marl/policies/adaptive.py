@@ -47,7 +47,9 @@ class FormationAdaptive:
 
     def __init__(self, vec: MultiliftVec):
         if not self.sees(vec):
-            raise ConfigError("policy=formation_adaptive needs to measure cables; set env.sensing=onboard")
+            raise ConfigError(
+                "policy=formation_adaptive needs to measure cables; set env.sensing=onboard, env.units=si"
+            )
         system, gains = vec.world.system, make_gains(vec.config.control, vec.world.system)
         shape = (vec.num_envs, vec.num_drones)
         self._dt, self._largest = 1.0 / vec.config.env.policy_hz, vec.config.control.max_offset
@@ -67,8 +69,8 @@ class FormationAdaptive:
 
     @staticmethod
     def sees(vec: MultiliftVec) -> bool:
-        """Return whether drones measure the tension and direction of their cables."""
-        return all(f"{name}_0" in vec.observation_names for name in NEEDED)
+        """Return whether drones measure the tension and direction of their cables, lengths in metres."""
+        return vec.config.env.units == "si" and all(f"{name}_0" in vec.observation_names for name in NEEDED)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
         """Forget what was felt in the environments of the mask (E,) (None: all)."""

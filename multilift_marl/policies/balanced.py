@@ -89,7 +89,7 @@ class FormationBalanced:
         solve_cable_forces((0.0, 0.0, weight), (0.0, 0.0, 0.0), LEVEL, arms, LEAST, force)
         size = np.linalg.norm(force, axis=1, keepdims=True)
         length = true.cable_length[e][keep, None] + size / true.cable_stiffness[e][keep, None]
-        moved = system.anchors[keep] + length * force / size - system.slots[keep]
+        moved = system.anchors[keep] + length * force / size - system.cable_ends[keep]
         # A drone that is pulled by more than its formation's force hangs back by what its position gain gives way.
         stiffness = (self._gains.mass * self._gains.k_p)[keep, None]
         offset[keep] = moved + (force - nominal) / stiffness

@@ -251,11 +251,14 @@ def measure_cable(lo, hi, scene, load, first):
             along = unit(add(along, off))
             off_tension = memory.tension_offset[e, n] + sensor.tension * normal_pair(e, memory)[0]
             load.tension[e, n] = max(true.cable_tension[e, n] + off_tension * scene.resting_tension[n], 0.0)
-            scene.knows_anchor[e, n] = first or true.cable_tension[e, n] > 0.0  # slack or broken: it points nowhere
+            # slack or broken: it points nowhere
+            whole = first and not true.cable_broken[e, n]
+            scene.knows_anchor[e, n] = whole or true.cable_tension[e, n] > 0.0
 
             # The anchor is a nominal length along it.
             # Nominal length and stretch at rest: the true length is not known.
-            reach = norm(_planned_cable(e, n, scene))
+            # A drone whose slot is lowered, as it waits to be attached, is nearer.
+            reach = max(norm(_planned_cable(e, n, scene)), rig.cable_length[n])
             arm = mul(mat(own.drone_rotation, e, n), add(hook, scale(reach, along)))
             put(scene.anchor[e, n], add(vec(own.drone_position, e, n), arm))
 

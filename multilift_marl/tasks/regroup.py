@@ -179,6 +179,13 @@ class Regroup(Task):
                 f"task_options.events={option.events} must rise by more than task_options.event_spread="
                 f"{option.event_spread:g} from one to the next"
             )
+        if option.events and option.events[0] < option.success_seconds:
+            raise ConfigError(
+                f"task_options.events={option.events} must leave task_options.success_seconds="
+                f"{option.success_seconds:g} before the first"
+            )
+        if self.config.cable.breaking_load is not None:
+            raise ConfigError("cables of task regroup do not break; leave cable.breaking_load out")
         self._ranges = make_ranges(option)
         world.breakable = True
         shape = (e, len(option.events))
@@ -194,6 +201,7 @@ class Regroup(Task):
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target, start and events; see `Task.start`."""
         start_near_target(env, rng, self.view_for(start_near_target), self._ranges, self.equilibrium)
+        self.world.state.cable_broken[env], self.goal.slot_velocity[env] = False, 0.0  # of a draw, an episode before
         option, own, n = self.options, self.own, self.world.num_drones
         own.attached[env], own.waiting[env], own.slack[env] = True, False, 0.0
         own.event[env], own.held[env], own.peak_tension[env] = 0, False, 0.0
@@ -206,6 +214,11 @@ class Regroup(Task):
             own.who[env, k] = rng.integers(n) if absent is None else absent
             absent = int(own.who[env, k]) if absent is None else None
 
+    def begin(self, env: int) -> bool:
+        """See `Task.begin`; of a state that is given, too, broken cables are those that are not attached."""
+        self.own.attached[env] = ~self.world.state.cable_broken[env]
+        return super().begin(env)
+
     def _detach(self, env: int, n: int) -> None:
         """Let drone n start without its cable, a little nearer to its anchor."""
         state, rig = self.world.state, self.rig
@@ -215,13 +228,18 @@ class Regroup(Task):
         place = anchor + (1 - SLACK) * (state.drone_position[env, n] - anchor)
         hover_drone(env, n, state, (0.0, 0.0, 0.0), self.goal.drone_yaw[env] + rig.heading[n], self.equilibrium)
         state.drone_position[env, n] = place
+        self.goal.slots[env, n, 2] -= self.own.slack[env, n]
+        self.goal.cable_force[env, n] = 0.0
 
     def succeeded(self) -> np.ndarray:
         """At rest before each event and throughout the last seconds, all joined, and never too large a tension."""
         own, option = self.own, self.options
-        changed = (own.event == len(option.events)) & ~own.waiting.any(axis=1)
         held = super().succeeded() & own.held.all(axis=1)
-        return held & changed & (own.peak_tension <= option.success_tension)
+        return held & self._changed() & (own.peak_tension <= option.success_tension)
+
+    def _changed(self) -> np.ndarray:
+        """Return in which environments (E,) all events are over and nobody waits to join."""
+        return np.asarray((self.own.event == len(self.options.events)) & ~self.own.waiting.any(axis=1))
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
@@ -232,5 +250,5 @@ class Regroup(Task):
             Criterion(
                 "held_before_events", CONDITION, lambda: np.asarray(1.0 * ~own.held.all(axis=1)), throughout=False
             ),
-            Criterion("joined", CONDITION, lambda: np.asarray(1.0 * own.waiting.any(axis=1)), throughout=False),
+            Criterion("events_done", CONDITION, lambda: np.where(self._changed(), 0.0, 1.0), False),
         )

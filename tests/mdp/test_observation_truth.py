@@ -31,7 +31,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "navigate": {"env.obstacle_sensing": "none"},
     "land": {"control.max_offset": 0.01},
     "loss": {"task_options.loss_time": [0.2, 0.3], "task_options.broadcast": True},
-    "regroup": {"task_options.events": [0.1], "task_options.event_spread": 0.05},
+    "regroup": {"task_options.events": [0.1], "task_options.event_spread": 0.05, "task_options.success_seconds": 0.1},
 }
 
 

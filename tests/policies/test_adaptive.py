@@ -91,6 +91,7 @@ def test_it_needs_to_feel_its_cable():
     vec = make("hover")
     assert "formation_adaptive" not in fitting_scripts(vec)
     assert "formation_adaptive" in fitting_scripts(make("hover", **ONBOARD))
+    assert "formation_adaptive" not in fitting_scripts(make("hover", **ONBOARD, **{"env.units": "cable"}))
     with pytest.raises(ConfigError, match="needs to measure cables"):
         make_scripted("formation_adaptive", vec)
 
@@ -99,3 +100,11 @@ def test_who_knows_the_truth_flies_regroup_alone():
     with pytest.raises(ConfigError, match="formation_balanced is for task regroup"):
         make_scripted("formation_balanced", make("hover"))
     assert "formation_balanced" not in fitting_scripts(make("regroup_senses", num_drones=6))
+
+
+def test_hooks_off_the_centre_do_not_move_the_slots_of_a_balanced_team():
+    still = {f"task_options.start_{key}": 0.0 for key in ("radius", "tilt", "speed")}
+    known = {"randomization.payload_mass": 0.0, "randomization.payload_center_of_mass": [0, 0, 0]}
+    vec = make("regroup", num_drones=6, **still, **known, **{"task_options.absent": 0.0, "cable.hook": [0, 0, -0.1]})
+    observation, _ = vec.reset(seed=0)
+    assert np.abs(make_scripted("formation_balanced", vec).act(observation)).max() < 1e-3

@@ -120,12 +120,66 @@ def test_a_team_that_does_nothing_does_not_hold_it():
     assert not vec.task.succeeded().any() and not vec.task.own.held.all(axis=1).any()
 
 
+def test_an_episode_does_not_depend_on_the_one_before():
+    fresh, used = (regroup(**SHORT | {"task_options.absent": 0.0, "task_options.event_spread": 0.0}) for _ in range(2))
+    used.reset(seed=3)
+    for _ in range(40):  # slots are moving
+        used.step(zeros(used))
+    assert used.task.goal.slot_velocity.any()
+    for vec in (fresh, used):
+        vec.reset(seed=7)
+        for _ in range(5):
+            vec.step(zeros(vec))
+    assert (fresh.world.state.drone_position == used.world.state.drone_position).all()
+
+
+@pytest.mark.parametrize("hz", [125, 250])
+def test_an_absent_drone_waits_at_its_lowered_slot_from_the_start(hz):
+    vec = regroup(num_envs=32, **{"task_options.absent": 1.0, "sim.control_hz": hz})
+    vec.reset(seed=0)
+    away, slots = ~vec.task.own.attached, vec.task.goal.slots.copy()
+    before = vec.reference.position.copy()
+    vec.step(zeros(vec))
+    np.testing.assert_allclose(vec.task.goal.slots, slots, atol=1e-9)
+    assert np.abs(vec.reference.position - before)[away].max() < 0.02
+    assert away.sum() == 32
+
+
+def test_starts_that_are_drawn_again_leave_no_cable_broken():
+    vec = regroup(num_envs=64, **{"task_options.start_tilt": 90.0})
+    vec.reset(seed=0)
+    assert (vec.world.state.cable_broken == ~vec.task.own.attached).all()
+    assert (vec.world.state.cable_broken.sum(axis=1) <= 1).all()
+
+
+def test_a_given_state_says_whose_cables_are_attached():
+    vec = regroup(num_envs=1, **{"task_options.absent": 0.0})
+    broken = np.array([[False, True, False, False, False, False]])
+    vec.reset(seed=0, options={"state": {"cable_broken": broken}})
+    vec.step(zeros(vec))
+    assert (vec.task.own.attached == ~broken).all() and vec.world.state.cable_tension[0, 1] == 0
+
+
+def test_who_joins_knows_its_anchor_while_its_slot_rises():
+    vec = regroup(num_envs=32, **SHORT | {"task_options.absent": 1.0, "task_options.event_spread": 0.0})
+    lengths = []
+    for observation in fly(vec, 3.0):
+        own, names = vec.task.own, vec.observation_names
+        taut = own.attached & (own.slack > 0.01) & (vec.world.state.cable_tension > 0.5)
+        told = observation[..., names.index("cable_0") : names.index("cable_0") + 3]
+        lengths.append(np.linalg.norm(told[taut], axis=-1))
+    # The nominal length, which the cable has, once the estimate has followed.
+    assert np.concatenate(lengths).size > 50 and abs(np.median(np.concatenate(lengths)) - 1.0) < 0.005
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
         ({"cable.model": "chain"}, "task regroup has no chains; set cable.model=massless"),
         ({"task_options.events": [4.0, 4.3]}, "must rise by more than task_options.event_spread=0.5"),
         ({"task_options.events": [-1.0, 4.0]}, "task_options.events"),
+        ({"task_options.events": [0.5, 4.0]}, "must leave task_options.success_seconds=1 before the first"),
+        ({"cable.breaking_load": 100.0}, "cables of task regroup do not break"),
     ],
 )
 def test_what_cannot_be_is_refused(overrides, said):
