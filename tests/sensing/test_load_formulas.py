@@ -34,8 +34,9 @@ def team(quiet: bool = True):
     planned.slots[0] = planned.position[0] + ANCHORS * [3, 3, 0] + [0, 0, 1.05]
     planned.cable_force[0], planned.drone_yaw[0] = [[0.5, 0.2, 3.0], [-0.4, 0.3, 3.1], [0.1, -0.6, 2.9]], 0.25
     rig = record(
-        anchors=ANCHORS, hooks=HOOKS, hooked=True, heading=np.array([0.2, -0.3, 0.5]), mass=np.array([0.6, 0.7, 0.8])
-    )
+        anchors=ANCHORS, hooks=HOOKS, hooked=True, heading=np.array([0.2, -0.3, 0.5]), mass=np.array([0.6, 0.7, 0.8]),
+        cable_length=np.array([0.8, 0.9, 0.7]),
+    )  # fmt: skip
     sensor = LoadSensor(DT, follow=(0.4, 0.1), turn=(0.3, 0.2))
     memory = LoadMemory(np.full(1, 77, np.uint64), np.zeros((1, 3, 3)), np.zeros((1, 3)))
     scene = load_sensing.Scene(
@@ -129,6 +130,26 @@ def test_an_encoder_sees_the_direction_of_the_cable_from_the_hook():
         along = place(n) - hook
         reach = np.linalg.norm(planned_cable(scene, n))
         np.testing.assert_allclose(scene.anchor[0, n], hook + reach * along / np.linalg.norm(along), atol=1e-12)
+
+
+def test_a_drone_whose_slot_is_lowered_takes_its_cable_to_have_its_length():
+    scene, load = team()
+    scene.planned.slots[0, 1, 2] -= 0.3
+    assert np.linalg.norm(planned_cable(scene, 1)) < 0.9
+    with np.errstate(over="ignore"):
+        plain(load_sensing.measure_cable)(0, 1, scene, load, False)
+    hook = scene.true.drone_position[0, 1] + scene.true.drone_rotation[0, 1] @ HOOKS[1]
+    along = place(1) - hook
+    np.testing.assert_allclose(scene.anchor[0, 1], hook + 0.9 * along / np.linalg.norm(along), atol=1e-12)
+
+
+def test_a_broken_cable_tells_nothing_at_a_start_either():
+    scene, load = team()
+    scene.true.cable_broken[0, 2], scene.true.cable_tension[0] = True, 0.0
+    for first, known in ((True, [True, True, False]), (False, [False, False, False])):
+        with np.errstate(over="ignore"):
+            plain(load_sensing.measure_cable)(0, 1, scene, load, first)
+        assert scene.knows_anchor[0].tolist() == known
 
 
 def test_an_offset_of_the_encoder_turns_the_direction_in_the_body_frame():
