@@ -15,9 +15,8 @@ from multilift_marl.control.cable_forces import solve_cable_forces
 from multilift_marl.control.gains import make_gains
 from multilift_marl.errors import ConfigError
 from multilift_marl.physical import GRAVITY
-from multilift_marl.policies.adaptive import TAKE_UP
 from multilift_marl.policies.slot_offsets import offset_actions
-from multilift_marl.tasks.regroup import Regroup
+from multilift_marl.tasks.regroup import TAKE_UP, Regroup
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec

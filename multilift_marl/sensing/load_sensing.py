@@ -257,7 +257,7 @@ def measure_cable(lo, hi, scene, load, first):
 
             # The anchor is a nominal length along it.
             # Nominal length and stretch at rest: the true length is not known.
-            # A drone whose slot is lowered, as it waits to be attached, is nearer.
+            # A planned cable may be slack: of a lowered slot in `regroup`, before `takeoff` and after `land`.
             reach = max(norm(_planned_cable(e, n, scene)), rig.cable_length[n])
             arm = mul(mat(own.drone_rotation, e, n), add(hook, scale(reach, along)))
             put(scene.anchor[e, n], add(vec(own.drone_position, e, n), arm))

@@ -30,7 +30,7 @@ from multilift_marl.sim.state import hover_drone
 from multilift_marl.tasks.base import Kernels, Task
 
 SLACK = 0.08  # [-] of its cable's length, by which a drone that waits to join is below its slot
-TAKE_UP = 2.0  # [s] in which the slot of a drone that has joined rises to where the cable is taut
+TAKE_UP = 2.0  # [s] in which the slot of a drone that has joined rises, and the drone takes its share of the load
 
 
 class RegroupOptions(StartOptions):
@@ -88,7 +88,7 @@ class RegroupSettings(NamedTuple):
     seconds: float
     """[s] that the payload is to be held before an event."""
     lowered: np.ndarray
-    """(N,) slots of drones that are not attached [m]."""
+    """(N,) by how much the slots of drones that are not attached are lowered [m]."""
 
 
 @inlined
