@@ -81,6 +81,7 @@ def test_its_lead_starts_anew_with_every_episode():
 @pytest.mark.slow
 def test_it_is_no_base_of_a_residual():
     others = {"payload_geometric", "formation_route", "formation_repelled", "formation_filed"}
+    others |= {"formation_adaptive", "formation_balanced"}
     assert set(LINEAR) == {name for name in SCRIPTED if not name.startswith("mpc")} - others
     for name in LINEAR:
         task = {"formation_narrow": "gate", "formation_redistributed": "loss"}.get(name, "track")
