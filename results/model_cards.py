@@ -96,7 +96,7 @@ def _observations(policy: LearnedPolicy) -> dict[str, Any]:
     """Return what each drone observes, in order, and how it is normalised."""
     config, normalizer = policy.config, policy.actor.normalizer
     components: dict[str, int] = {}
-    newest = policy.observation_names[: len(policy.observation_names) // config.env.history]
+    newest = policy.observation_names[: len(policy.observation_names) // len(config.env.ages)]
     for each in newest:
         component = each.rpartition("_")[0]
         components[component] = components.get(component, 0) + 1

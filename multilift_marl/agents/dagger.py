@@ -45,6 +45,17 @@ def make_teacher(name: str, vec: MultiliftVec) -> Policy:
     return OwnPolicy(name, vec, "train.dagger.teacher") if ":" in name else make_scripted(name, vec)
 
 
+def taken_numbers(learner: Learner) -> torch.Tensor:
+    """Return which numbers of an observation (U,) the policy takes."""
+    actor = learner.actor
+    taken = (actor.base != 0).any(0)
+    if actor.used is None:
+        taken[:] = True
+    else:
+        taken |= actor.used.reshape(len(taken), -1).any(1)
+    return taken.nonzero()[:, 0]
+
+
 class TaughtFlights(LearningRollouts):
     """Flights of one rig, whose steps are kept with the teacher's commands in them; see `LearningRollouts`.
 
@@ -52,7 +63,8 @@ class TaughtFlights(LearningRollouts):
         capacity: S, steps that are kept.
 
     Attributes:
-        observed, taught: (S, N, D), (S, N, A) steps that are kept, and the teacher's commands in them.
+        observed, taught: (S, N, U), (S, N, A) the numbers that the policy takes of the steps that are kept, and the
+            teacher's commands in them.
         count: of steps so far; those beyond S have overwritten the oldest.
 
     Raises:
@@ -64,7 +76,9 @@ class TaughtFlights(LearningRollouts):
         vec, settings = env.vec, learner.config.dagger
         self._settings, self._horizon = settings, learner.config.horizon
         self._teacher = make_teacher(settings.teacher, with_truth(vec) if settings.truth else vec)
-        self.observed = torch.zeros(capacity, vec.num_drones, vec.observation_size)
+        self._taken = taken_numbers(learner)
+        self.observed = torch.zeros(capacity, vec.num_drones, len(self._taken))
+        self._newest = torch.zeros(self.fresh, vec.num_drones, vec.observation_size)
         self.taught = torch.zeros(capacity, vec.num_drones, vec.action_size)
         self.count = 0
         self._by_teacher: np.ndarray | None = None  # which episodes it flies
@@ -100,8 +114,10 @@ class TaughtFlights(LearningRollouts):
     def _keep(self, observation: np.ndarray, taught: np.ndarray, mask: np.ndarray) -> None:
         """Keep the steps of the environments in the mask."""
         count = int(mask.sum())
+        seen = torch.from_numpy(observation[mask])
+        self._newest[(self.count + np.arange(count)) % len(self._newest)] = seen
         at = (self.count + np.arange(count)) % len(self.observed)
-        self.observed[at] = torch.from_numpy(observation[mask])
+        self.observed[at] = seen[..., self._taken]
         self.taught[at] = torch.from_numpy(taught[mask].astype(np.float32))
         self.count += count
 
@@ -112,13 +128,17 @@ class TaughtFlights(LearningRollouts):
 
     def newest(self) -> torch.Tensor:
         """Return what drones observed in the last steps that were kept, as many as a batch has."""
-        recent = torch.arange(max(self.count - self.fresh, 0), self.count) % len(self.observed)
-        return self.observed[recent]
+        return self._newest[: self.count]
 
     def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return observations (size, N, D) and the teacher's commands (size, N, A) of steps that are kept, drawn."""
+        """Return observations (size, N, D) and the teacher's commands (size, N, A) of steps that are kept, drawn.
+
+        What the policy does not take of the observations is 0.
+        """
         chosen = torch.randint(min(self.count, len(self.observed)), (size,))
-        return self.observed[chosen], self.taught[chosen]
+        observed = torch.zeros(size, *self._newest.shape[1:])
+        observed[..., self._taken] = self.observed[chosen]
+        return observed, self.taught[chosen]
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Go on in the episodes after those that were under way."""
@@ -144,7 +164,8 @@ class DaggerRollouts(LearningRollouts):
         self._train = train = learner.config
         capacity = min(train.dagger.capacity, train.frames + total * train.horizon) // len(envs)
         vecs = [env.vec for env in envs]
-        needed = 4 * capacity * sum(vec.num_drones * (vec.observation_size + vec.action_size) for vec in vecs)
+        kept = len(taken_numbers(learner)) + vecs[0].action_size
+        needed = 4 * capacity * kept * sum(vec.num_drones for vec in vecs)
         if needed > (there := os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")):
             raise ConfigError(
                 f"{capacity * len(envs)} steps take {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; "

@@ -47,14 +47,14 @@ class Gain(NamedTuple):
 
 
 class Evaluator:
-    """Evaluates the policies of one training and keeps the best of them.
+    """Evaluates the policies of one training and keeps one of them (`eval.keep`).
 
     Args:
         config: of the training.
 
     Attributes:
-        best: what a checkpoint holds of the best policy, its `iteration`, and its `score` in its evaluation, success
-            and negative error; None before the first.
+        best: what a checkpoint holds of the policy that is kept, its `iteration`, and its `score` in its evaluation,
+            success and negative error; None before the first.
         initial: the same of the policy of `train.init`, without score; None where there is none.
     """
 
@@ -64,7 +64,7 @@ class Evaluator:
         self.initial: dict[str, Any] | None = None
 
     def evaluate(self, content: dict[str, Any]) -> dict[str, float]:
-        """Fly a policy without exploration; keep it if it is better than the best so far.
+        """Fly a policy without exploration; keep it if it is better than the best so far, or the last is kept.
 
         Args:
             content: of the policy's checkpoint, and its `iteration`.
@@ -76,11 +76,12 @@ class Evaluator:
         summary = summarize(self._fly(policy.bind, 0))
         values = {f"eval/{name}": summary[name]["mean"] for name in _METRICS}
         score = [values["eval/success_rate"], -values["eval/payload_position_error_m"]]
-        if self.best is None or (score > self.best["score"] and self._confirm(policy, content["iteration"])):
+        best, keep_last = self.best, self.config.eval.keep == "last"
+        if best is None or keep_last or (score > best["score"] and self._confirm(policy, content["iteration"])):
             weights = {name: tensor.clone() for name, tensor in content["actor"].items()}  # learning changes them
-            self.best = content | {"actor": weights, "score": score}
+            best = self.best = content | {"actor": weights, "score": score}
         return values | {
-            "eval/best_iteration": float(self.best["iteration"]),
+            "eval/best_iteration": float(best["iteration"]),
             "eval/seconds": time.perf_counter() - start,
         }
 

@@ -204,7 +204,7 @@ def make_contract(policy: LearnedPolicy) -> dict[str, Any]:
 def _check_names(policy: LearnedPolicy) -> None:
     config = policy.config
     actions = tuple(number.name for number in ACTIONS[config.control.action].numbers)
-    observations = observation_names(config.control.action, find_task(config.task).extra(config), config.env.history)
+    observations = observation_names(config.control.action, find_task(config.task).extra(config), config.env.ages)
     for found, known, what in (
         (policy.action_names, actions, "actions"),
         (policy.observation_names, observations, "observations"),
@@ -223,7 +223,8 @@ def _describe_observation(policy: LearnedPolicy) -> dict[str, Any]:
     return {
         "shape": ["batch", "drones", size],
         "dtype": "float32",
-        "steps": config.env.history,
+        "steps": len(config.env.ages),
+        "ages": list(config.env.ages),
         "step_size": at,
         "units": config.env.units,
         "components": parts,
@@ -270,7 +271,8 @@ def _measure_thrusts(config: Config) -> np.ndarray:
 
 def _describe_normalizer(normalizer: Normalizer) -> str:
     """Return in words what becomes of each observed number."""
-    standardised = f"each number, standardised, within ± {normalizer.clip:g} deviations"
+    since = ", of earlier steps how it differs from the newest" if normalizer.steps > 1 else ""
+    standardised = f"each number{since}, standardised, within ± {normalizer.clip:g} deviations"
     k = f"{normalizer.asinh:g}"
     return standardised + (f", then asinh({k} x / deviation) / asinh({k}) of it" if normalizer.asinh else "")
 

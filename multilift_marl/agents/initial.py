@@ -24,7 +24,7 @@ from multilift_marl.tasks import find_task
 
 _KEY = "train.init"
 _MEANINGS = ("control.action", "env.units")
-_NETWORK = ("train.actor", "train.hidden", "train.gru", "train.asinh", "train.observe")
+_NETWORK = ("train.actor", "train.hidden", "train.gru", "train.asinh", "train.observe", "train.changes")
 
 
 class Initial(NamedTuple):
@@ -79,7 +79,7 @@ class Initial(NamedTuple):
             self._compare("was trained with", key, there, here)
         action, task = here.control.action, find_task(here.task)
         names = [number.name for number in ACTIONS[action].numbers]
-        observed = observation_names(action, task.extra(here), here.env.history)
+        observed = observation_names(action, task.extra(here), here.env.ages)
         if difference := self.policy.first_difference(names, observed):
             raise ConfigError(
                 f"{_KEY}={self.name} was trained in task {there.task} and cannot start a training in this "

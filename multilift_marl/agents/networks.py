@@ -28,6 +28,7 @@ class Normalizer(nn.Module):
         size: of what it takes.
         asinh: K; 0: without the fine scale.
         clip: bound of the standardised numbers.
+        steps: H, of what it takes: those after the first are replaced by how they differ from that one.
 
     Attributes:
         copies: how often each number is in what it returns.
@@ -40,9 +41,9 @@ class Normalizer(nn.Module):
     shift: torch.Tensor
     scale: torch.Tensor
 
-    def __init__(self, size: int, asinh: float = 0.0, clip: float = 8.0):
+    def __init__(self, size: int, asinh: float = 0.0, clip: float = 8.0, steps: int = 1):
         super().__init__()
-        self.asinh, self.clip = asinh, clip
+        self.asinh, self.clip, self.steps = asinh, clip, steps
         self.copies = 2 if asinh else 1
         self.outputs = self.copies * size
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
@@ -54,7 +55,7 @@ class Normalizer(nn.Module):
     @torch.no_grad()
     def update(self, batch: torch.Tensor) -> None:
         """Include a batch (..., size) in the statistics."""
-        flat = batch.reshape(-1, batch.shape[-1]).to(torch.float64, copy=True)
+        flat = self._differ(batch).reshape(-1, batch.shape[-1]).to(torch.float64, copy=True)
         added, mean = flat.shape[0], flat.mean(0)
         delta, total = mean - self.mean, self.count + added
         # Sums of squares about two means are joined by δ² n m/(n + m), without a second pass over the old ones.
@@ -66,8 +67,15 @@ class Normalizer(nn.Module):
         # The floor of 0.01 leaves a constant number near 0, where 1/σ would blow up its round-off.
         self.scale.copy_(1.0 / (self.square / total).sqrt().clamp(min=1e-2))
 
+    def _differ(self, x: torch.Tensor) -> torch.Tensor:
+        if self.steps == 1:
+            return x
+        steps = x.unflatten(-1, (self.steps, -1))
+        return torch.cat([steps[..., :1, :], steps[..., 1:, :] - steps[..., :1, :]], -2).flatten(-2)
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return (..., outputs): zero mean, unit variance, clipped; each followed by the same on the fine scale."""
+        x = self._differ(x)
         rows = (x - self.shift).mul_(self.scale).clamp(-self.clip, self.clip)
         if not self.asinh:
             return rows
@@ -195,7 +203,7 @@ class Actor(nn.Module):
         initial_std: deviation at the start.
         base: matrix of the base policy (A, D).
         gru: H, size of the memory; 0 for a policy without.
-        asinh: see `Normalizer`.
+        asinh, steps: see `Normalizer`.
         used: bool (D,), which numbers of an observation the network takes; the base policy takes all. None: all.
     """
 
@@ -204,10 +212,10 @@ class Actor(nn.Module):
 
     def __init__(
         self, kind: str, observation_size: int, action_size: int, hidden: Sequence[int], initial_std: float,
-        base: torch.Tensor, gru: int = 0, asinh: float = 0.0, used: torch.Tensor | None = None,
+        base: torch.Tensor, gru: int = 0, asinh: float = 0.0, used: torch.Tensor | None = None, steps: int = 1,
     ):  # fmt: skip
         super().__init__()
-        self.normalizer = Normalizer(observation_size, asinh)
+        self.normalizer = Normalizer(observation_size, asinh, steps=steps)
         factors = None if used is None else used.float().repeat_interleave(self.normalizer.copies)
         self.register_buffer("used", factors, persistent=False)
         inputs = self.normalizer.outputs
@@ -267,8 +275,9 @@ def build_actor(train: TrainConfig, base: torch.Tensor, names: Sequence[str]) ->
                 raise ConfigError(f"train.observe names no component '{name}'{nearest(name, dict.fromkeys(parts))}")
         used = torch.tensor([part in train.observe for part in parts])
     action_size, size = base.shape
+    steps = len(names) // sum("@" not in name for name in names) if train.changes else 1
     return Actor(
-        train.actor, size, action_size, train.hidden, train.initial_std, base, train.gru, train.asinh, used
+        train.actor, size, action_size, train.hidden, train.initial_std, base, train.gru, train.asinh, used, steps
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from multilift_marl.config.load import resolve_config
 from multilift_marl.control.controller import Controller
 from multilift_marl.envs.commander import COMMANDERS, Commander, find_commander
 from multilift_marl.envs.episodes import Episodes
+from multilift_marl.envs.history import History
 from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.envs.pipeline import Pipeline, StageContext, describe_stages, join_pipelines
 from multilift_marl.envs.refusals import check_action, refuse_action, refuse_step
@@ -82,17 +83,18 @@ class MultiliftVec:
         self.reference = self.controller.reference
         self.action_names = self.controller.action_names
         self.action_size = a = len(self.action_names)
-        self.observation_names = observation_names(config.control.action, kind.extra(config), config.env.history)
+        self.observation_names = observation_names(config.control.action, kind.extra(config), config.env.ages)
         self.observation_size = len(self.observation_names)
         self._estimator = estimator
         commands = self.controller.command_size
-        sizes = a, self.observation_size // config.env.history
+        sizes = a, self.observation_size // len(config.env.ages)
         self._sensing = Sensing(config, self.world, estimator, sizes, commands)
         self.task = kind(config, self.world, self.reference, self._sensing)
         self.state_size = self.task.critic.shape[1]
         self.reward_terms, self.failure_causes = tuple(kind.REWARD), kind.causes()
         observation = self.task.observation
-        self._stacked = observation if config.env.history == 1 else np.tile(observation, config.env.history)
+        self._history = History(observation, config.env.ages)
+        self._stacked = self._history.stacked
         self._starts = Episodes(config, self.world, self.task, self._sensing)
         # Episode -1 is none, and all are over: a first reset begins episode 0, a step before it is refused.
         self.seeds, self.episodes = np.full(e, config.seed, np.int64), np.full(e, -1, np.int64)
@@ -245,6 +247,7 @@ class MultiliftVec:
         saved |= {f"task.{key}": array for key, array in self.task.state_dict().items()}
         saved |= self.controller.state_dict()
         saved |= {f"sensing.{key}": array.copy() for key, array in self._sensing.arrays().items()}
+        saved |= {f"history.{key}": array.copy() for key, array in self._history.arrays().items()}
         saved |= {name: getattr(self, name).copy() for name in _SAVED}
         if self.commander is not None:
             saved |= {f"commander.{name}": array.copy() for name, array in self.commander.arrays().items()}
@@ -262,6 +265,7 @@ class MultiliftVec:
         whole = "steps", "seeds", "sensing.sent", "sensing.seen", "sensing.obstacle_steps"
         counts = dict.fromkeys(whole, (0, most))
         counts |= {"episodes": (-1, most), "task.time": (0, most), "task.cause": (0, len(self.failure_causes) - 1)}
+        counts["history.newest"] = 0, max(self.config.env.ages)
         counts |= {f"task.own.{name}": limits for name, limits in self.task.count_limits().items()}
         counts |= {f"sensing.{name}": (0, getattr(delays, name)[1]) for name in ("action_delay", "observation_delay")}
         # Kernels index by these and check no bounds: a number out of range would reach into other memory.
@@ -277,6 +281,8 @@ class MultiliftVec:
         self._starts.load_state_dict(groups["sensing"])
         for name in _SAVED:
             getattr(self, name)[:] = saved[name]
+        for name, array in self._history.arrays().items():
+            array[:] = saved[f"history.{name}"]
         if self.commander is not None:
             for name, array in self.commander.arrays().items():
                 array[:] = saved[f"commander.{name}"]
@@ -313,7 +319,7 @@ class MultiliftVec:
             if not self._checked:
                 self.task.check_written(e)
                 self._checked = True
-            self._stacked[e] = np.tile(self.task.observation[e], self.config.env.history)
+            self._history.begin(e)
 
     def use_controller(self, controller: Controller, report: Callable[[SystemState], None] | None = None) -> None:
         """Let another controller of this world fly the drones from the next reset on.
@@ -328,7 +334,7 @@ class MultiliftVec:
     def _bind(self) -> None:
         """Build the stages of every shard, from the controller and the task as they are."""
         teams = StageContext(
-            self.world, self.controller, self.task, self._estimator, self._sensing, self._commands, self._stacked
+            self.world, self.controller, self.task, self._estimator, self._sensing, self._commands, self._history
         )
         self._pipelines = {shard.lo: Pipeline(teams, shard, self.control_ticks) for shard in self.world.shards}
         self._parts = join_pipelines(self._pipelines, self.world)

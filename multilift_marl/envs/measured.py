@@ -69,7 +69,7 @@ class MeasuredTeam(MultiliftVec):
         self.task.begin(0)
         self.controller.start(0)
         self._observe(0)
-        self._stacked[0] = np.tile(self.task.observation[0], self.config.env.history)
+        self._history.begin(0)
         return self._stacked.copy()
 
     def command(self, action: np.ndarray) -> Reference:

@@ -13,8 +13,8 @@ import numpy as np
 
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.obstacle_margin import Surroundings, sector_planes
-from multilift_marl.kernels.jit import bind, kernel_name
-from multilift_marl.mdp.observation_kernels import stack
+from multilift_marl.envs.history import History
+from multilift_marl.kernels.jit import kernel_name
 from multilift_marl.sensing.estimator import StateEstimator
 from multilift_marl.sensing.measurement import Sensing
 from multilift_marl.sim.world import Shard, World
@@ -45,13 +45,13 @@ class StageContext(NamedTuple):
     sensing: Sensing
     commands: np.ndarray
     """(E, N, A) what the controller takes: the task's own array of actions, unless a planner makes it from them."""
-    stacked: np.ndarray
-    """(E, N, H D) float32 observations of the last H steps; the task's own array where H = 1."""
+    history: History
+    """What was observed before."""
 
 
 def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[Stage], list[Stage], list[Stage]]:
     """Return what runs for a shard before its control ticks, at each of `ticks`, and after them."""
-    world, controller, task, estimator, sensing, commands, stacked = teams
+    world, controller, task, estimator, sensing, commands, history = teams
     lo, hi = shard.lo, shard.hi
     on_shard = {name: partial(call, lo, hi) for name, call in task.stages.items()}
     arriving = sensing.applied if sensing.delays_action else commands
@@ -91,8 +91,8 @@ def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[St
         after.append(Stage("observe (NumPy)", partial(own.observe, *every), is_whole=True))
     if sensing.delays_observation:
         after.append(Stage("delay observation", partial(sensing.bind_delay(task.observation), lo, hi)))
-    if stacked is not task.observation:
-        after.append(Stage("stack", bind(stack, lo, hi, task.observation, stacked)))
+    if (stack := history.bind(lo, hi)) is not None:
+        after.append(Stage("stack", stack))
     return before, tick, after
 
 

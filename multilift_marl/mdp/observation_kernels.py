@@ -10,7 +10,7 @@ import numpy as np
 
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.errors import ConfigError
-from multilift_marl.kernels.jit import compose, is_plain, kernel
+from multilift_marl.kernels.jit import compose, is_plain
 from multilift_marl.math3d import turn
 from multilift_marl.mdp.global_state import StateComponents
 from multilift_marl.mdp.observations import OBSERVATION_SIZE, Component, list_components
@@ -92,16 +92,3 @@ def check_written(written: np.ndarray, parts: Sequence[Component], what: str) ->
     bad = ~np.isfinite(written.reshape(-1, len(names))).all(axis=0)
     if bad.any():
         raise ConfigError(f"{names[int(bad.argmax())]} of the {what} is not finite; mend what computes it")
-
-
-@kernel
-def stack(lo, hi, observation, stacked):
-    """Put the newest observations (E, N, D) before the earlier ones (E, N, H D) and drop the oldest."""
-    size = observation.shape[2]
-    for e in range(lo, hi):
-        for n in range(observation.shape[1]):
-            # From the end, or numbers would be overwritten before they have moved.
-            for k in range(stacked.shape[2] - 1, size - 1, -1):
-                stacked[e, n, k] = stacked[e, n, k - size]
-            for k in range(size):
-                stacked[e, n, k] = observation[e, n, k]

@@ -294,13 +294,13 @@ def previous_action(size: int) -> Component:
     return Component("previous_action", size, "-", "-", "own last action", own_velocity, False)
 
 
-def observation_names(action: str, extra: tuple[Component, ...] = (), history: int = 1) -> tuple[str, ...]:
+def observation_names(action: str, extra: tuple[Component, ...] = (), ages: tuple[int, ...] = (0,)) -> tuple[str, ...]:
     """Return the name of every number in an observation, such as "velocity_1", or "velocity_1@-2" of two steps ago.
 
     Args:
         action: the action interface.
         extra: what a task adds.
-        history: how many steps it holds, the newest first.
+        ages: how many steps ago each observation is that it holds.
     """
     names = [f"{part.name}_{i}" for part in list_components(action, extra) for i in range(part.size)]
-    return tuple(name + (f"@-{step}" if step else "") for step in range(history) for name in names)
+    return tuple(name + (f"@-{step}" if step else "") for step in ages for name in names)

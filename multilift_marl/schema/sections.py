@@ -17,6 +17,7 @@ from multilift_marl.schema.values import (
     Float,
     FloatPerDrone,
     FourPerDrone,
+    History,
     Int,
     Lean,
     Level,
@@ -65,7 +66,14 @@ class EnvConfig(Section):
     units: Literal["si", "cable"] = Field(
         "si", description="of observations and full actions; cable: those of the similar rig with cables of 1 m"
     )
-    history: Int = Field(1, ge=1, le=50, description="steps that an observation holds, the newest first")
+    history: History = Field(
+        1, description="steps that an observation holds, the newest first; or how many steps ago each is, [0, ...]"
+    )
+
+    @property
+    def ages(self) -> tuple[int, ...]:
+        """How many steps ago each observation is that drones hold."""
+        return tuple(range(self.history)) if isinstance(self.history, int) else self.history
 
 
 class SimConfig(Section):

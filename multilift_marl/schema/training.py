@@ -120,6 +120,9 @@ class TrainConfig(Section):
     observe: tuple[str, ...] | None = Field(
         None, min_length=1, description="components of the observation that the network takes, by name; None: all"
     )
+    changes: bool = Field(
+        False, description="whether the network takes of env.history by how much earlier steps differ from the newest"
+    )
     sequence: Int = Field(
         32, ge=1, le=100_000, description="steps that gradients of a GRU go back: train.horizon, or a part of it"
     )
@@ -191,3 +194,6 @@ class EvalConfig(Section):
 
     every: Int = Field(25, ge=1, description="iterations between evaluations")
     episodes: Int = Field(128, ge=1, le=1_000_000, description="episodes of each")
+    keep: Literal["best", "last"] = Field(
+        "best", description="policy to keep: the one that flew best, or the one evaluated last"
+    )

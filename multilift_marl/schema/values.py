@@ -124,6 +124,12 @@ def _choice(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
 
 
+def _rise_from_now(value: int | tuple[int, ...]) -> int | tuple[int, ...]:
+    if isinstance(value, tuple) and (value[:1] != (0,) or list(value) != sorted(set(value))):
+        raise ValueError("must be a number of steps, or rise from 0, such as [0, 2, 8]")
+    return value
+
+
 def _places(value: Any) -> Any:
     """Refuse a list of anything but lists of three or four, with which pydantic's message would be of text."""
     shaped = isinstance(value, list | tuple) and all(isinstance(each, list | tuple) for each in value)
@@ -132,10 +138,14 @@ def _places(value: Any) -> Any:
     return value
 
 
+Ages = tuple[Annotated[Int, Field(ge=0, le=1000)], ...]
+History = Annotated[Annotated[Int, Field(ge=1, le=50)] | Ages, AfterValidator(_rise_from_now)]
 Level = Annotated[Float, Field(ge=0), BeforeValidator(_level)]
 Places = Annotated[str | tuple[tuple[Float, ...], ...] | None, BeforeValidator(_places)]
 Delay = Annotated[Int, Field(ge=0, le=50)]
 Span = Annotated[tuple[Positive, Positive], BeforeValidator(_range), AfterValidator(_rising)]
+Count = Annotated[Int, Field(ge=1, le=1000)]
+Counts = Annotated[tuple[Count, Count], BeforeValidator(_range), AfterValidator(_rising)]
 Shares = Annotated[tuple[Float, Float], BeforeValidator(_range), AfterValidator(_rising), Between(0, 1)]
 Choice = BeforeValidator(_choice)
 Delays = Annotated[tuple[Delay, Delay], BeforeValidator(_range)]

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import multilift_marl as ml
+from multilift_marl.agents import dagger
 from multilift_marl.agents.dagger import DaggerRollouts
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.rigs import evaluated_rigs
@@ -73,6 +74,21 @@ def test_steps_are_kept_as_they_were_flown_and_the_oldest_make_room():
     assert len(rollouts.observed) == 150
     assert torch.equal(rollouts.observed[90], first)
     assert not torch.equal(rollouts.observed[193 - 150 - 1], torch.zeros_like(first))
+
+
+def test_numbers_that_the_network_does_not_take_are_not_kept(monkeypatch):
+    """They change nothing."""
+    keys = {"train.observe": ["payload_error", "payload_velocity"], "train.asinh": 10.0}
+    learned, kept = [], []
+    for whole in (False, True):
+        if whole:
+            monkeypatch.setattr(dagger, "taken_numbers", lambda learner: torch.arange(learner.actor.base.shape[1]))
+        trainer = Trainer(config(**keys), Path("unused"))
+        assert isinstance(trainer.rollouts, DaggerRollouts)
+        learned.append([trainer.step()["loss"] for _ in range(3)])
+        kept.append(trainer.rollouts.flights[0].observed.shape[2])
+    assert learned[0] == learned[1]
+    assert kept[0] < 20 < kept[1]
 
 
 RIGS = ({"env.num_drones": 3}, {"env.num_drones": 4, "payload.mass": 1.2})

@@ -32,7 +32,7 @@ def checkpoint(task="hover", **overrides):
     """Return what a policy needs of a checkpoint: random weights, as large as after training, and statistics."""
     config = load_config(task, SHORT | overrides)
     actions = [number.name for number in ACTIONS[config.control.action].numbers]
-    names = observation_names(config.control.action, find_task(config.task).extra(config), config.env.history)
+    names = observation_names(config.control.action, find_task(config.task).extra(config), config.env.ages)
     torch.manual_seed(0)
     base = 0.5 * torch.randn(len(actions), len(names)) * (torch.rand(len(actions), len(names)) < 0.05)
     actor = Actor(
@@ -53,18 +53,25 @@ def policy(task="hover", **overrides):
 
 
 @pytest.mark.parametrize(
-    ("kind", "history", "asinh"),
+    ("kind", "history", "asinh", "changes"),
     [
-        ("local", 1, 0),
-        ("set", 3, 20),
+        ("local", 1, 0, False),
+        ("set", 3, 20, False),
         *(
             pytest.param(*each, marks=pytest.mark.slow)
-            for each in (("local", 3, 0), ("local", 1, 20), ("set", 1, 0), ("attention", 1, 0))
+            for each in (
+                ("local", 3, 0, False),
+                ("local", (0, 2, 7), 0, True),
+                ("local", 1, 20, False),
+                ("set", 1, 0, False),
+                ("attention", 1, 0, False),
+            )
         ),
     ],
 )
-def test_the_network_acts_as_the_policy_for_any_teams(tmp_path, kind, history, asinh):
-    learned = policy(**{"train.actor": kind, "env.history": history, "train.asinh": asinh})
+def test_the_network_acts_as_the_policy_for_any_teams(tmp_path, kind, history, asinh, changes):
+    keys = {"train.actor": kind, "env.history": history, "train.asinh": asinh, "train.changes": changes}
+    learned = policy(**keys)
     contract = export_policy(learned, tmp_path / "new" / "folder")
     file = tmp_path / "new" / "folder" / contract["network"]["file"]
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
@@ -82,6 +89,7 @@ def test_the_network_acts_as_the_policy_for_any_teams(tmp_path, kind, history, a
     assert 0.02 < (np.abs(action) == 1).mean() < 0.98  # some are clipped, and most are not
     assert contract["network"]["largest_difference"] <= 1e-5
     assert ("asinh(20 x" in contract["inside"]["normaliser"]) == bool(asinh)
+    assert ("differs from the newest" in contract["inside"]["normaliser"]) == changes
 
 
 def test_a_network_whose_actions_are_not_numbers_is_not_taken_for_the_policy(tmp_path, monkeypatch):
@@ -110,6 +118,7 @@ def test_the_contract_names_what_the_environment_tells(task):
     contract = make_contract(learned)
     told = contract["observation"]
     size = told["step_size"]
+    assert (told["steps"], told["ages"]) == (2, [0, 1])
     assert told["names"] == list(vec.observation_names) and told["shape"][-1] == vec.observation_size == 2 * size
     for part in told["components"]:
         names = [f"{part['name']}_{i}" for i in range(part["size"])]

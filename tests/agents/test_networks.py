@@ -121,6 +121,25 @@ def test_networks_take_the_components_that_are_named_alone(gru, asinh):
     torch.testing.assert_close(act(other)[0, 0] - act(first)[0, 0], torch.tensor(0.5))
 
 
+@pytest.mark.parametrize("asinh", [0.0, 20.0])
+def test_a_network_may_take_how_much_earlier_steps_differ(asinh):
+    """It acts as one that is given the differences."""
+    names = [f"{name}{age}" for age in ("", "@-2", "@-9") for name in ("a_0", "b_0")]
+    told, given = (
+        build_actor(TrainConfig(hidden=(16,), asinh=asinh, changes=changes), torch.zeros(2, 6), names)
+        for changes in (True, False)
+    )
+    rng = torch.manual_seed(0)
+    torch.nn.init.orthogonal_(given.team.net[-1].weight)
+    told.load_state_dict(given.state_dict())
+    seen = torch.randn(100, 3, 6, generator=rng) + torch.tensor([5.0, -3.0] * 3)
+    differ = torch.cat([seen[..., :2], seen[..., 2:4] - seen[..., :2], seen[..., 4:] - seen[..., :2]], -1)
+    told.normalizer.update(seen)
+    given.normalizer.update(differ)
+    assert torch.equal(told(seen)[0], given(differ)[0])
+    assert not torch.equal(told(seen)[0], given(seen)[0])
+
+
 def test_a_component_that_is_not_observed_is_refused_by_name():
     with pytest.raises(ConfigError, match="no component 'slot_eror'; did you mean 'slot_error'"):
         build_actor(TrainConfig(observe=("slot_eror",)), torch.zeros(1, 1), ["slot_error_0"])

@@ -115,30 +115,42 @@ def test_a_weight_scales_its_term_and_no_other(task, cables):
             np.testing.assert_allclose(heavier[other], factor * plain[other], rtol=1e-12)
 
 
-def test_a_history_holds_the_observations_of_the_last_steps_and_starts_filled_with_the_first():
-    plain, told = (make("hover", num_envs=3, **{"env.history": history}) for history in (1, 3))
+@pytest.mark.parametrize(("history", "ages"), [(3, (0, 1, 2)), ((0, 1, 5), (0, 1, 5))])
+def test_a_history_holds_earlier_observations_and_starts_filled_with_the_first(history, ages):
+    plain, told = (make("hover", num_envs=3, **{"env.history": steps}) for steps in (1, history))
     first, whole = plain.reset(seed=5)[0], told.reset(seed=5)[0]
-    seen = [first, first, first]
+    seen = [first] * 6
     assert whole.shape == (3, plain.num_drones, 3 * plain.observation_size)
     assert told.observation_names[: plain.observation_size] == plain.observation_names
-    assert told.observation_names[-1] == plain.observation_names[-1] + "@-2"
+    assert told.observation_names[-1] == f"{plain.observation_names[-1]}@-{ages[-1]}"
     for step in range(12):
         action = bold_actions(plain, step)
         observation, *_ = plain.step(action)
         whole, *_ = told.step(action)
-        seen = [observation, *seen[:2]]
-        np.testing.assert_array_equal(whole, np.concatenate(seen, axis=2))
+        seen = [observation, *seen[:5]]
+        np.testing.assert_array_equal(whole, np.concatenate([seen[age] for age in ages], axis=2))
     one = np.array([False, True, False])
     (observation, _), (whole, _) = plain.reset(mask=one), told.reset(mask=one)
     seen = [np.where(one[:, None, None], observation, earlier) for earlier in [observation, *seen[1:]]]
-    np.testing.assert_array_equal(whole, np.concatenate(seen, axis=2))
+    np.testing.assert_array_equal(whole, np.concatenate([seen[age] for age in ages], axis=2))
+    seen = [np.where(one[:, None, None], observation, earlier) for earlier in seen]
+    for step in range(4):  # what was before the episode does not come back
+        observation, *_ = plain.step(bold_actions(plain, step))
+        whole, *_ = told.step(bold_actions(plain, step))
+        seen = [observation, *seen[:5]]
+        np.testing.assert_array_equal(whole, np.concatenate([seen[age] for age in ages], axis=2))
 
 
-def test_a_history_is_saved_with_the_environments():
-    one, other = (make("hover", num_envs=2, **{"env.history": 2}) for _ in range(2))
+@pytest.mark.parametrize("history", [2, (0, 3)])
+def test_a_history_is_saved_with_the_environments(history):
+    one, other = (make("hover", num_envs=2, **{"env.history": history}) for _ in range(2))
     one.reset(seed=0)
     other.reset(seed=1)
     for step in range(5):
         one.step(bold_actions(one, step))
-    other.load_state_dict(one.state_dict())
-    np.testing.assert_array_equal(one.step(bold_actions(one, 5))[0], other.step(bold_actions(one, 5))[0])
+    saved = one.state_dict()
+    other.load_state_dict(saved)
+    for step in range(5, 9):
+        np.testing.assert_array_equal(one.step(bold_actions(one, step))[0], other.step(bold_actions(one, step))[0])
+    with pytest.raises(ValueError, match=r"history\.newest"):
+        other.load_state_dict(saved | {"history.newest": np.array([0, 9])})

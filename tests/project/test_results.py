@@ -249,6 +249,8 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "env.obstacle_sensing",
         "control.max_weight",
         "train.observe",
+        "eval.keep",
+        "train.changes",
         *(key for key in later if key.startswith(("train.diffmpc.", "train.dagger."))),
         *(key for key in later if key.startswith("env.obstacles.")),
     }
