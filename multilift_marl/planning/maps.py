@@ -1,7 +1,7 @@
 """Maps of the task `navigate`: obstacles between a start and a goal, drawn from a seed.
 
 Lengths are in units of the resting formation's width over that of four falcons (`unit_length`): a gap is narrow or wide
-for a formation. A map is a function of level, seed and team alone.
+for a formation. A map is a function of level, course, seed and team alone.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from multilift_marl.rig.system import System
 from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, clear_obstacles, place_obstacle
 
 LEVELS = ("sparse", "dense", "narrow", "unknown")
-CAPACITY = 16  # rows that a map needs at most
+CAPACITY = 16  # rows that a map of the usual length needs at most
 FALCONS = 1.4637  # [m] width of the resting formation of four falcons
 LENGTH = 8.0  # from start to goal, like the next ones in units of length
 WIDTH = 3.0  # the payload may stray from the line between them
-FIELD = 2.6  # obstacles stand as far as this before and behind the middle, and ...
-SIDE = 2.8  # ... to its sides
+MARGIN = 1.4  # at both ends without obstacles
+SIDE = 2.8  # obstacles stand as far as this to the sides of the middle
 LEVEL = 1.4  # height of start and goal, at least
 RISE = 0.2  # by which they may be higher
 CEILING = 0.3  # of the payload above that level, 0.1 m added
-PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # how many; least gaps between them
+PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # how many on LENGTH; least gaps
 RADIUS = 0.12, 0.32  # of pillars
 GAPS = 0.5, 0.8  # range of the widths of a narrow map's gaps over the resting formation's
 ALONE = 4.0
@@ -32,6 +32,34 @@ SPARE = 0.15  # that a gap is wider than the payload, at least
 WALLS = 3  # of a narrow map
 MAX_WALLS = CAPACITY // 2
 _DRAWS = 4000
+
+
+class Course(NamedTuple):
+    """What a level leaves open."""
+
+    length: float = LENGTH
+    """From start to goal."""
+    pillars: tuple[int, int] | None = None
+    """Least and greatest number of pillars, where there is room; None: `PILLARS`, more on a longer course."""
+    gaps: tuple[float, float] = GAPS
+    walls: int = WALLS
+
+    @property
+    def field(self) -> float:
+        """How far before and behind the middle obstacles stand."""
+        return self.length / 2 - MARGIN
+
+    def most_pillars(self, level: str) -> int:
+        """Return how many pillars a map of a level has at most."""
+        usual = round(PILLARS[level][0] * self.field / COURSE.field)
+        return usual if self.pillars is None else self.pillars[1]
+
+    def capacity(self, level: str) -> int:
+        """Return how many rows of obstacles the maps of a level need."""
+        return CAPACITY if level == "narrow" else max(CAPACITY, self.most_pillars(level))
+
+
+COURSE = Course()
 
 
 class Obstacle(NamedTuple):
@@ -72,25 +100,28 @@ def unit_length(system: System) -> float:
     return formation_width(system) / FALCONS
 
 
-def draw_map(level: str, seed: int, system: System, gaps: tuple[float, float] = GAPS, walls: int = WALLS) -> Map:
-    """Return the map of a level that belongs to a seed; a narrow one has `walls` with `gaps`."""
+def draw_map(level: str, seed: int, system: System, course: Course = COURSE) -> Map:
+    """Return the map of a level that belongs to a seed."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(LEVELS.index(level),)))
     unit = unit_length(system)
     height = max(LEVEL * unit, float(system.payload_size[2]) + 0.5)
     start, goal = (
-        np.array([side * LENGTH / 2 * unit, rng.uniform(-0.8, 0.8) * unit, height + rng.uniform(0, RISE) * unit])
+        np.array([side * course.length / 2 * unit, rng.uniform(-0.8, 0.8) * unit, height + rng.uniform(0, RISE) * unit])
         for side in (-1, 1)
     )
-    low = np.array([-(LENGTH / 2 + 1.0) * unit, -WIDTH * unit, 0.6 * height])
-    high = np.array([(LENGTH / 2 + 1.0) * unit, WIDTH * unit, height + 0.1 + CEILING * unit])
+    low = np.array([-(course.length / 2 + 1.0) * unit, -WIDTH * unit, 0.6 * height])
+    high = np.array([(course.length / 2 + 1.0) * unit, WIDTH * unit, height + 0.1 + CEILING * unit])
     # No team flies over what stands on the ground, its cables upright and the payload at the ceiling.
     reach = float(system.cable_length.max() + np.linalg.norm(system.anchors, axis=1).max())
     tall = high[2] + reach + 0.1
     if level == "narrow":
         least = float(system.payload_size[:2].min()) + SPARE * unit
-        placed = _walls(rng, unit, tall, (formation_width(system), least), gaps, walls)
+        placed = _walls(rng, unit, tall, (formation_width(system), least), course)
     else:
-        placed = _pillars(rng, unit, tall, (height - 0.2 * unit, height + reach), *PILLARS[level])
+        balls, count = (height - 0.2 * unit, height + reach), course.most_pillars(level)
+        if course.pillars is not None:
+            count = int(rng.integers(course.pillars[0], count + 1))
+        placed = _pillars(rng, unit, tall, balls, count, PILLARS[level][1], course.field)
     return Map(start, goal, low, high, tuple(placed))
 
 
@@ -102,15 +133,16 @@ def place_map(env: int, drawn: Map, obstacles: Obstacles, first: int = 0) -> Non
 
 
 def _pillars(
-    rng: np.random.Generator, unit: float, tall: float, balls: tuple[float, float], count: int, apart: float
-) -> list[Obstacle]:
+    rng: np.random.Generator, unit: float, tall: float, balls: tuple[float, float], count: int, apart: float,
+    field: float,
+) -> list[Obstacle]:  # fmt: skip
     """Draw pillars `tall` [m], round and square, and, one in five, balls between two heights, surfaces `apart`."""
     placed: list[Obstacle] = []
     discs = np.zeros((0, 3))
     for _ in range(_DRAWS):
         if len(placed) == count:
             break
-        x, y = rng.uniform((-FIELD, -SIDE), (FIELD, SIDE)) * unit
+        x, y = rng.uniform((-field, -SIDE), (field, SIDE)) * unit
         radius = rng.uniform(*RADIUS) * unit
         gaps = np.hypot(discs[:, 0] - x, discs[:, 1] - y) - discs[:, 2] - radius
         if (gaps < apart * unit).any():
@@ -128,20 +160,15 @@ def _pillars(
 
 
 def _walls(
-    rng: np.random.Generator,
-    unit: float,
-    tall: float,
-    widths: tuple[float, float],
-    gaps: tuple[float, float],
-    walls: int,
+    rng: np.random.Generator, unit: float, tall: float, widths: tuple[float, float], course: Course
 ) -> list[Obstacle]:
     """Draw walls `tall` [m] across the way with gaps: as `gaps` over the first of `widths`, at least the second [m]."""
-    placed = []
+    placed, walls = [], course.walls
     thick, end, top = 0.1 * unit, (WIDTH + 1.5) * unit, tall / 2
     middle = rng.uniform(-0.3, 0.3) * unit
     for wall in range(walls):
-        x = (wall - (walls - 1) / 2) * min(2.2, 2 * FIELD / max(walls, 1)) * unit + rng.uniform(-0.2, 0.2) * unit
-        half = 0.5 * max(rng.uniform(*gaps) * widths[0], widths[1])
+        x = (wall - (walls - 1) / 2) * min(2.2, 2 * course.field / max(walls, 1)) * unit + rng.uniform(-0.2, 0.2) * unit
+        half = 0.5 * max(rng.uniform(*course.gaps) * widths[0], widths[1])
         middle = float(np.clip(middle + rng.uniform(-1.4, 1.4) * unit, -2.0 * unit, 2.0 * unit))
         lean = rng.uniform(-0.15, 0.15)  # of the wall from the perpendicular [rad]
         for side in (-1.0, 1.0):

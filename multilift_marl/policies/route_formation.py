@@ -34,6 +34,7 @@ class RouteFormation(RouteSearch):
 
     NAME: ClassVar[str] = "formation_route"
     INTERFACE: ClassVar[str] = "reference"
+    INSIDE: ClassVar[float] = 0.3  # as there is no feedback
     AHEAD: ClassVar[float] = 0.0
     SAYS: ClassVar[bool] = False  # it searches from wherever it has been led to
 

@@ -22,7 +22,6 @@ from multilift_marl.tasks.navigate import Navigate
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
-INSIDE = 0.1  # [m] that routes keep from the bounds of the map, beyond which the payload is out of range
 RETRY = 0.2  # [s] after a search that found no way on
 
 
@@ -34,6 +33,7 @@ class RouteSearch:
 
     Class attributes:
         NAME: of the policy.
+        INSIDE: what routes keep from the bounds of the map, beyond which the payload is out of range [m].
         AHEAD: by which a route that goes on begins later, as a search takes time [s].
         SAYS: whether it warns where no route is found.
 
@@ -49,6 +49,7 @@ class RouteSearch:
     """
 
     NAME: ClassVar[str]
+    INSIDE: ClassVar[float] = 0.1
     AHEAD: ClassVar[float] = 0.1
     SAYS: ClassVar[bool] = True
     _vec: MultiliftVec
@@ -163,8 +164,8 @@ class RouteSearch:
         yaw = 0.0 if self._task.rig.is_point else heading(tuple(load.rotation[e, 0].ravel()))
         start = np.append(load.position[e].mean(axis=0), yaw)
         ends = np.array([start[:3], own.goal[e]])  # those of a given map may be closer to its bounds
-        low = np.minimum(own.low[e] + INSIDE, ends.min(axis=0))
-        high = np.maximum(own.high[e] - INSIDE, ends.max(axis=0))
+        low = np.minimum(own.low[e] + self.INSIDE, ends.min(axis=0))
+        high = np.maximum(own.high[e] - self.INSIDE, ends.max(axis=0))
         settings = RouteSettings(low=tuple(low), high=tuple(high))
         self.searches[e] += 1
         try:

@@ -28,15 +28,16 @@ from multilift_marl.mdp.rewards import (
     velocity,
 )
 from multilift_marl.navigation.team_clearance import rest_clearance
-from multilift_marl.planning.maps import CAPACITY, GAPS, MAX_WALLS, WALLS, Map, draw_map, place_map
+from multilift_marl.planning.maps import GAPS, LENGTH, MAX_WALLS, WALLS, Course, Map, draw_map, place_map, unit_length
 from multilift_marl.rig.obstacles import NONE
 from multilift_marl.rig.system import System
-from multilift_marl.schema.values import Between, Float, Int, Section, Span, Vector
+from multilift_marl.schema.values import Between, Counts, Float, Int, Section, Span, Vector
 from multilift_marl.sim.obstacles import Obstacles
 from multilift_marl.tasks.base import Kernels, Task
 
 Place = Annotated[Vector, Between(-1e3, 1e3, "m")]
 SPARE = 0.10  # [m] of clearance that the reward asks for
+FAR = 9.0  # [m] that a goal is seen to be away at most, of four falcons: beyond all of the usual length
 ROOM = 2.0  # [m] of the payload's space about a given map
 PEAK = 35.0 / 16.0  # of an eased motion's speed over its mean, see `math3d.ease`
 
@@ -57,9 +58,18 @@ class NavigateOptions(ArrivalOptions):
         GAPS, description="[-] widths of the gaps of level narrow over the resting formation's, or their range"
     )
     walls: Int = Field(WALLS, ge=1, le=MAX_WALLS, description="of level narrow")
+    length: Annotated[Float, Between(4, 100, "m")] = Field(
+        LENGTH, description="[m] from start to goal, for a formation as wide as that of four falcons"
+    )
+    pillars: Counts | None = Field(None, description="of a map, or their range; None: the level's, in 8 m")
     map: Int | None = Field(None, ge=0, lt=2**31, description="seed of the one map; None: drawn for each episode")
     speed: Annotated[Float, Between(0.01, 100, "m/s")] = Field(1.0, description="[m/s] peak speed of the target")
     start_radius: Float = Field(0.05, ge=0, description="[m] start within a ball of this radius about the map's")
+
+    @property
+    def course(self) -> Course:
+        """What the level leaves open."""
+        return Course(self.length, self.pillars, self.gaps, self.walls)
 
 
 class NavigateArrays(NamedTuple):
@@ -88,6 +98,7 @@ class NavigateSettings(NamedTuple):
 
     speed: float
     radius: float
+    far: float
     bounds: RestBounds
 
 
@@ -153,8 +164,9 @@ def clearance(e, v, margin):
 
 @inlined
 def to_goal(e, n, v):
-    """Goal minus where the target is."""
-    return sub(row(v.own.goal, e), row(v.goal.position, e))
+    """Goal minus where the target is, no longer than on a course of the usual length."""
+    way = sub(row(v.own.goal, e), row(v.goal.position, e))
+    return scale(v.settings.far / max(norm(way), v.settings.far), way)
 
 
 @inlined
@@ -208,11 +220,11 @@ class Navigate(Task):
     }
     KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, check=measure_way)
     EXTRA: ClassVar[tuple[Component, ...]] = (
-        Component("to_goal", 3, "slot", "m", "goal minus the target's present place", to_goal),
+        Component("to_goal", 3, "slot", "m", "goal minus the target's present place, up to 9 m", to_goal),
         Component("target_velocity", 3, "slot", "m/s", "velocity of the target", target_velocity),
     )
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = (
-        Component("to_goal", 3, "world", "m", "goal minus the target's present place", to_goal),
+        Component("to_goal", 3, "world", "m", "goal minus the target's present place, up to 9 m", to_goal),
         Component("target_velocity", 3, "world", "m/s", "velocity of the target", target_velocity),
         Component("clearance", 1, "-", "m", "least distance from obstacles, at most 2", least_clearance),
     )
@@ -227,13 +239,16 @@ class Navigate(Task):
             )
         if option.level == "given":
             self._given = given_map(option, self.world.system, self.world.obstacles)
-        elif scenery.reserved < CAPACITY:
-            raise ConfigError(f"task navigate places up to {CAPACITY} obstacles; set scene.reserved={CAPACITY} or more")
+        elif option.level == "narrow" and option.pillars is not None:
+            raise ConfigError("task_options.pillars means nothing at level narrow; leave it out")
+        elif scenery.reserved < (rows := option.course.capacity(option.level)):
+            raise ConfigError(f"task navigate places up to {rows} obstacles; set scene.reserved={rows} or more")
         self._first = len(scenery.obstacles)
         start, goal, low, high, place = (np.zeros((e, 3)) for _ in range(5))
         lengths = np.zeros(e), np.zeros(e)
+        far = FAR * unit_length(self.world.system)
         self.own = NavigateArrays(np.zeros(e, np.int64), start, goal, low, high, place, *lengths)
-        self.settings = NavigateSettings(option.speed, option.start_radius, RestBounds.of(option))
+        self.settings = NavigateSettings(option.speed, option.start_radius, far, RestBounds.of(option))
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw the map, and where the team starts; see `Task.start`."""
@@ -242,7 +257,7 @@ class Navigate(Task):
         if option.level == "given":
             drawn = self._given
         else:
-            drawn = draw_map(option.level, seed, self.world.system, option.gaps, option.walls)
+            drawn = draw_map(option.level, seed, self.world.system, option.course)
         place_map(env, drawn, self.world.obstacles, self._first)
         own.map[env], own.start[env], own.goal[env] = seed, drawn.start, drawn.goal
         own.low[env], own.high[env], own.peak_tension[env] = drawn.low, drawn.high, 0.0

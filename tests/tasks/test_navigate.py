@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import make, refusal, zeros
 
-from multilift_marl.planning.maps import CAPACITY, LEVELS, draw_map, formation_width, unit_length
+from multilift_marl.planning.maps import CAPACITY, LEVELS, Course, draw_map, formation_width, unit_length
 from multilift_marl.rig.obstacles import BOX, CYLINDER, NONE
 from multilift_marl.sim.obstacles import clear_obstacles, place_obstacle
 from multilift_marl.tasks.navigate import PEAK
@@ -34,6 +34,37 @@ def test_maps_keep_starts_free_and_repeat(level, drones):
                 away = abs(place[0] - position[0]) if kind == BOX and size[1] > unit else 9.0
                 assert min(away, np.hypot(*(place - position)[:2])) > 0.5 * width
     assert draw_map(level, 0, system).obstacles != draw_map(level, 1, system).obstacles
+
+
+def test_courses_have_their_length_and_their_number_of_pillars():
+    system = make("hover", num_envs=1, num_drones=6).world.system
+    unit, course = unit_length(system), Course(length=20.0, pillars=(8, 20))
+    counts = set()
+    for seed in range(60):
+        drawn = draw_map("sparse", seed, system, course)
+        counts.add(len(drawn.obstacles))
+        along = np.array([each.position[0] for each in drawn.obstacles])
+        assert np.abs(along).max() <= 8.6 * unit and drawn.goal[0] - drawn.start[0] == pytest.approx(20 * unit)
+        assert (drawn.low < drawn.start).all() and (drawn.goal < drawn.high).all()
+    assert min(counts) == 8 and max(counts) == 20
+    assert course.capacity("sparse") == 20 and Course(length=20.0).capacity("sparse") == round(7 * 8.6 / 2.6)
+    as_dense = len(draw_map("sparse", 0, system, Course(length=20.0)).obstacles)
+    assert as_dense == Course(length=20.0).most_pillars("sparse")
+    walls = [draw_map("narrow", 0, system, Course(length=length, walls=2)).obstacles for length in (8.0, 20.0)]
+    assert len(walls[0]) == len(walls[1]) == 4 and Course(length=20.0).capacity("narrow") == CAPACITY
+
+
+def test_a_goal_is_seen_no_farther_away_than_on_the_usual_course():
+    for length, seen in ((8.0, None), (20.0, 9.0)):
+        vec = make("navigate", num_envs=2, **{"task_options.length": length, "scene.reserved": 23})
+        observation, _ = vec.reset(seed=0)
+        at = vec.observation_names.index("to_goal_0")
+        way = vec.task.own.goal - vec.task.goal.position
+        far = np.linalg.norm(way, axis=1)
+        expected = far if seen is None else seen * unit_length(vec.world.system)
+        found = observation[..., at : at + 3]
+        np.testing.assert_allclose(np.linalg.norm(found, axis=-1), np.broadcast_to(expected, (4, 2)).T, rtol=1e-6)
+        np.testing.assert_allclose(found[..., 2], (way[:, 2] * expected / far)[:, None].repeat(4, 1), rtol=1e-4)
 
 
 def test_environments_hold_the_maps_of_their_seeds():
@@ -125,6 +156,10 @@ def test_a_payload_outside_the_map_is_out_of_range():
 
 def test_scenes_without_room_for_a_map_are_refused():
     assert "scene.reserved=16" in refusal(make, "navigate", **{"scene.reserved": 3})
+    assert "scene.reserved=30" in refusal(make, "navigate", **{"task_options.pillars": [8, 30]})
+    assert "scene.reserved=23" in refusal(make, "navigate", **{"task_options.length": 20})
+    assert "pillars" in refusal(make, "navigate", **{"task_options.pillars": 3, "task_options.level": "narrow"})
+    assert "pillars" in refusal(make, "navigate", **{"task_options.pillars": [8, 3]})
 
 
 def test_configured_obstacles_stay_beside_those_of_maps():
