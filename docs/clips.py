@@ -51,7 +51,7 @@ CLIPS = {
     "clip_navigate": Clip("navigate_dense", "mpc_route", 1, 0.5, 9.5, ROUTE, "chase", 2.0, most=800_000),
     "clip_pose": Clip("pose", "pose", 1, 0.0, 8.0, {}, "side", 2.0),
     "clip_recover": Clip("recover", "recover", 0, 0.0, 2.5, {}, "side", 0.5),
-    "clip_regroup": Clip("regroup_senses", "formation_adaptive", 3, 3.5, 8.0, {}, "side", 2.0, most=400_000),
+    "clip_regroup": Clip("regroup_senses", "regroup_senses", 3, 3.0, 7.5, {}, "side", 2.0, most=400_000),
     "clip_takeoff": Clip("takeoff", "takeoff", 0, 2.0, 7.0, {}, "side", 2.0),
     "clip_track": Clip("track", "track", 0, 4.0, 8.0, {}, "top", 2.0),
 }

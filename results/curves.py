@@ -1,6 +1,7 @@
 """Draw learning curves without a base policy: evaluations during training, the band and the median of the seeds.
 
-python results/curves.py [folder]      quickstart.png and from_nothing.png, in docs/images unless a folder is given
+python results/curves.py [folder]      quickstart.png, imitation.png, from_nothing.png, in docs/images unless a folder
+                                       is given
 """
 
 from __future__ import annotations
@@ -36,6 +37,10 @@ SUCCESS = Panel("eval/success_rate", "success [%]", 100.0)
 ERROR = Panel("eval/payload_position_error_m", "position error [cm]", 100.0, logarithmic=True)
 PICTURES = {  # file: recipes and their labels, panels
     "quickstart": ({"quickstart": "hover by thrust and body rates"}, (SUCCESS, ERROR)),
+    "imitation": (
+        {"navigate_senses": "past unknown obstacles, 2 to 8 drones", "regroup_senses": "drones leave and join"},
+        (SUCCESS, ERROR),
+    ),
     "from_nothing": (
         {
             "hover_acc_rates": "accelerations and tilt rates", "hover_ctbr": "thrust and body rates",

@@ -122,6 +122,13 @@ FLIGHTS: dict[str, Flight] = {
         "navigate, unknown obstacles, own late senses",
         scripts=("formation", "formation_repelled"),
     ),
+    "navigate_course": Flight(
+        "navigate_course",
+        {},
+        "navigate_senses",
+        "navigate, unknown obstacles over 20 m",
+        scripts=("formation", "formation_repelled"),
+    ),
     "navigate_slots": Flight(
         "navigate_slots",
         {},

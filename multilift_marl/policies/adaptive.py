@@ -4,7 +4,7 @@ A drone puts its slot to where it would exert the cable force that it measures, 
 place: along the cable's direction, and farther out by what its position gain gives way under the force. What is left
 of its anchor's error it takes out by proportional and integral feedback. Nothing is known of the payload's mass, of the
 other drones and of whether they carry. Numbers: most successes on training episodes of `regroup_senses`
-(`results/tune_rules.py`), in which drones that had joined misjudged their anchors by some centimetres.
+(`results/tune_rules.py`).
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ class FormationAdaptive:
     """
 
     INTERFACE: ClassVar[str] = "reference"
-    GIVE: float = 0.397
-    LEAN: float = 0.264
-    FILTER: float = 2.32
-    LIFT: float = 0.534
-    LIFT_RATE: float = 1.44
-    SHIFT_RATE: float = 0.551
+    GIVE: float = 0.414
+    LEAN: float = 0.362
+    FILTER: float = 1.34
+    LIFT: float = 0.9
+    LIFT_RATE: float = 1.46
+    SHIFT_RATE: float = 0.588
 
     def __init__(self, vec: MultiliftVec):
         if not self.sees(vec):
