@@ -20,7 +20,7 @@ from multilift_marl.tasks import find_task
 
 FLOAT, DOUBLE = TensorProto.FLOAT, TensorProto.DOUBLE
 CONFIG = load_config("hover", {"env.num_drones": 2, "payload.mass": 0.7, "env.episode_seconds": 0.4})
-NAMES = list(observation_names(CONFIG.control.action, find_task("hover").extra(CONFIG), 1))
+NAMES = list(observation_names(CONFIG.control.action, find_task("hover").extra(CONFIG)))
 ACTIONS = ["outward", "sideways", "up", "yaw"]
 D, A, H = len(NAMES), 4, 3
 WEIGHT = np.random.default_rng(0).normal(0, 0.02, (D, A)).astype(np.float32)
