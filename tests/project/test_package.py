@@ -200,8 +200,8 @@ def commands_of(block):
 
 
 SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 train.diffmpc.window=4 eval.episodes=2"  # one iteration
-# One environment of each of five rigs.
-FIVE = SHORT.replace("num_envs=4", "num_envs=5").replace("frames=32", "frames=40")
+# One environment of each of six rigs.
+SIX = SHORT.replace("num_envs=4", "num_envs=6").replace("frames=32", "frames=48")
 SHORTER = {  # of each script: keys that go, and what is added
     "train.py": (re.findall(r"(\S+)=", SHORT), SHORT),
     "evaluate.py": (["episodes"], "episodes=1 env.episode_seconds=0.4"),
@@ -246,7 +246,7 @@ def shorter(command):
     kept = [part for part in arguments if part.split("=")[0] not in dropped or "resume" in command]
     kept = [part.replace("=examples/", f"={ROOT}/examples/") for part in kept]
     if "config=navigate_senses" in arguments and more == SHORT:
-        more = FIVE
+        more = SIX
     return script, kept + ("" if "resume" in command else more).split()
 
 
