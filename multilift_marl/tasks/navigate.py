@@ -237,10 +237,10 @@ class Navigate(Task):
             raise ConfigError(
                 f"task_options.{own[0]} means nothing at level {option.level}; set task_options.level=given"
             )
+        if option.pillars is not None and option.level in ("narrow", "given"):
+            raise ConfigError(f"task_options.pillars means nothing at level {option.level}; leave it out")
         if option.level == "given":
             self._given = given_map(option, self.world.system, self.world.obstacles)
-        elif option.level == "narrow" and option.pillars is not None:
-            raise ConfigError("task_options.pillars means nothing at level narrow; leave it out")
         elif scenery.reserved < (rows := option.course.capacity(option.level)):
             raise ConfigError(f"task navigate places up to {rows} obstacles; set scene.reserved={rows} or more")
         self._first = len(scenery.obstacles)

@@ -198,6 +198,7 @@ def test_a_given_map_is_the_scene_with_its_start_and_goal():
         ({"task_options.high": [2, 2, 2]}, r"goal=[3.0, 1.0, 1.6] is outside the payload's space"),
         ({"task_options.goal": [0.3, 0, 1.5]}, "at task_options.goal=[0.3, 0.0, 1.5] the team is in an obstacle"),
         ({"task_options.start": [1, 2]}, "task_options.start"),
+        ({"task_options.pillars": 3}, "task_options.pillars means nothing at level given"),
     ],
 )
 def test_given_maps_that_cannot_be_are_refused(change, said):
