@@ -52,6 +52,15 @@ def test_crazymarl_starts_are_its_samplers():
     assert (vec.task.goal.position == [0, 0, 1.5]).all()
 
 
+def test_crazymarl_drones_stand_about_the_load_in_their_order():
+    vec = make("recover_crazymarl", num_envs=1000, num_drones=4)
+    vec.reset(seed=0)
+    beside = vec.world.state.drone_position[..., :2] - vec.world.state.payload_position[:, None, :2]
+    azimuth = np.arctan2(beside[..., 1], beside[..., 0])
+    step = np.exp(1j * (np.roll(azimuth, -1, axis=1) - azimuth)).mean(axis=0)  # from each to the next
+    assert np.angle(step) == pytest.approx(np.full(4, np.pi / 2), abs=0.3)
+
+
 def test_tilt_and_cable_angle_count_after_the_grace_alone():
     vec = make("recover", num_envs=2)
     vec.reset(seed=0)

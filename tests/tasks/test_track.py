@@ -43,6 +43,12 @@ def test_own_time_starts_at_rest_and_runs_at_full_rate_after_the_ramp():
 
 
 @KINDS
+def test_paths_begin_above_the_origin_at_their_height(kind):
+    begins = track(kind, 8, **{"task_options.height": 2.6}).task.goal.position
+    assert begins == pytest.approx(np.tile([0.0, 0.0, 2.6], (8, 1)), abs=1e-12)
+
+
+@KINDS
 def test_velocity_acceleration_and_jerk_are_derivatives_of_the_position(kind):
     rows, dt = goals(track(kind), 300), 0.02
     for name, derivative, tolerance in (
