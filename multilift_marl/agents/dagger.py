@@ -4,7 +4,7 @@ The network flies, and learns what the teacher would have commanded at each step
 teacher flies most episodes itself. The teacher may know the true states (`train.dagger.truth`) and read what no
 drone observes: what the network makes of it rests on each drone's own observation alone. All steps are kept, up to
 `train.dagger.capacity`, and learned from again and again. They are not saved, nor is what a teacher plans: a training
-that is resumed begins new episodes, and collects anew.
+that is resumed begins new episodes, and collects anew before it learns on.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from multilift_marl.schema.training import TrainConfig
 
 SMALL = 0.05
 """[-] differences of actions below which they are squared: above it the network takes sides, and no mean."""
+REFILL = 20
+"""Batches that a resumed training collects first, or as many as there were: few steps alone would be overfitted."""
 TEACHER = 4  # purpose of seeds, beside those of `envs/core.py` and `rollouts.NOISE`
 
 
@@ -173,20 +175,23 @@ class DaggerRollouts(LearningRollouts):
             )
         self.flights = [TaughtFlights(env, learner, total, max(capacity, 1)) for env in envs]
         self._all = RigRollouts(self.flights)
+        self._first: int | None = None  # iteration in which it began to collect
 
     def collect(self, iteration: int) -> Batches:
         """See `LearningRollouts.collect`; a batch for each rig."""
         batches = self._all.collect(iteration)
         begin = time.perf_counter()
         torch.set_num_threads(self._train.threads)
-        loss = self._learn()
+        if self._first is None:
+            self._first = iteration
+        loss = self._learn() if iteration + 1 - self._first >= min(self._first, REFILL) else {}
         torch.set_num_threads(1)
         share = self.flights[0].share(iteration)
-        self.values = {"loss": loss, "teacher_share": share, "learning_seconds": time.perf_counter() - begin}
+        self.values = loss | {"teacher_share": share, "learning_seconds": time.perf_counter() - begin}
         return batches
 
-    def _learn(self) -> float:
-        """Fit the policy to what is kept, `epochs` times as many steps as a batch has; return the loss."""
+    def _learn(self) -> dict[str, float]:
+        """Fit the policy to what is kept, `epochs` times as many steps as a batch has; return the loss by its name."""
         learner, train = self._learner, self._train
         for flights in self.flights:
             learner.actor.normalizer.update(flights.newest())
@@ -198,7 +203,7 @@ class DaggerRollouts(LearningRollouts):
             torch.nn.utils.clip_grad_norm_(parameters, train.max_grad_norm)
             learner.optimizer.step()
             losses.append(torch.stack(parts).sum())
-        return float(torch.stack(losses).mean())
+        return {"loss": float(torch.stack(losses).mean())}
 
     def _fit(self, observed: torch.Tensor, taught: torch.Tensor) -> torch.Tensor:
         """Add the gradient of a rig's share of the loss; return that share."""
