@@ -146,14 +146,15 @@ def find_cause(e, v):
         # each drone alone: ground, its cable, its tilt, its height
         if drone[2] - _extent(frame, limits.drone_half[n]) < TOUCH and _counts(GROUND, ignored):
             return GROUND
-        if state.cable_broken[e, n] and _counts(BROKEN, ignored):
+        broken = state.cable_broken[e, n]  # of a drone that is detached, too
+        if broken and _counts(BROKEN, ignored):
             return BROKEN
         if frame[8] < _MIN_UP and _counts(TILT, ignored):
             return TILT
         if drone[2] < payload[2] and _counts(BELOW, ignored):
             return BELOW
-        if dot(cable, column(frame, 2)) < 0.0 or dot(cable, up) < _MIN_CABLE_PAYLOAD:
-            if _counts(CABLE, ignored):
+        if not broken and _counts(CABLE, ignored):
+            if dot(cable, column(frame, 2)) < 0.0 or dot(cable, up) < _MIN_CABLE_PAYLOAD:
                 return CABLE
         # against those before it: drones, then cables
         for m in range(n):
@@ -163,6 +164,8 @@ def find_cause(e, v):
             v.min_separation[e] = min(v.min_separation[e], separation)
             if separation < limits.separation[n, m] and _counts(COLLISION, ignored):
                 return COLLISION
+            if broken or state.cable_broken[e, m]:
+                continue
             foot = add(payload, mul(attitude, row(rig.anchors, m)))
             other = add(vec(state.drone_position, e, m), mul(mat(state.drone_rotation, e, m), row(rig.hooks, m)))
             if segment_distance(anchor, end, foot, other) < limits.cables[n, m] and _counts(CROSSING, ignored):

@@ -176,6 +176,21 @@ def test_what_is_ignored_passes_and_nothing_beside_it():
     assert cause(view) == "none"
 
 
+@pytest.mark.parametrize("who", [0, 1])
+def test_where_there_is_no_cable_none_crosses_or_points_the_wrong_way(who):
+    """Drones that are detached, of task regroup, collide and tilt like the others."""
+    crossing = team(separation=np.zeros((2, 2)), cables=np.full((2, 2), 5.0))
+    inverted = team()
+    inverted.state.drone_rotation[0, who] = turned([1.0, 0.0, 0.0], np.radians(175.0))
+    inverted.mask.ignored[0] = ignore(failures.TILT)
+    close = team(separation=np.full((2, 2), 5.0))
+    for view, expected in ((crossing, "cable_crossing"), (inverted, "cable_angle"), (close, "drone_collision")):
+        assert cause(view) == expected
+        view.mask.ignored[0] |= ignore(failures.BROKEN)
+        view.state.cable_broken[0, who] = True
+        assert cause(view) == ("none" if expected.startswith("cable") else expected)
+
+
 def test_a_lost_drone_is_no_partner():
     view = team(separation=np.full((2, 2), 5.0))
     assert cause(view) == "drone_collision"
