@@ -265,7 +265,7 @@ def build_actor(train: TrainConfig, base: torch.Tensor, names: Sequence[str]) ->
         names: of the numbers of an observation (D,).
 
     Raises:
-        ConfigError: `train.observe` names a component that there is not.
+        ConfigError: `train.observe` names a component that there is not, or `train.changes` without earlier steps.
     """
     used = None
     if train.observe is not None:
@@ -276,6 +276,11 @@ def build_actor(train: TrainConfig, base: torch.Tensor, names: Sequence[str]) ->
         used = torch.tensor([part in train.observe for part in parts])
     action_size, size = base.shape
     steps = len(names) // sum("@" not in name for name in names) if train.changes else 1
+    if train.changes and steps == 1:
+        raise ConfigError(
+            "train.changes=true is about the earlier steps of env.history, and there are none; set env.history=4, or "
+            "leave it out"
+        )
     return Actor(
         train.actor, size, action_size, train.hidden, train.initial_std, base, train.gru, train.asinh, used, steps
     )  # fmt: skip

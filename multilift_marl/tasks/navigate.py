@@ -72,6 +72,27 @@ class NavigateOptions(ArrivalOptions):
         return Course(self.length, self.pillars, self.gaps, self.walls)
 
 
+OF_LEVELS = {
+    ("start", "goal", "low", "high"): ("given",),
+    ("gaps", "walls"): ("narrow",),
+    ("pillars",): ("sparse", "dense", "unknown"),
+    ("length", "map"): ("sparse", "dense", "narrow", "unknown"),
+}
+
+
+def check_level(option: NavigateOptions) -> None:
+    """Refuse, by a ConfigError, options that have no effect at the level."""
+    for names, levels in OF_LEVELS.items():
+        if option.level in levels:
+            continue
+        for name in names:
+            if getattr(option, name) != NavigateOptions.model_fields[name].get_default():
+                raise ConfigError(
+                    f"task_options.{name} means nothing at level {option.level}; leave it out, or set "
+                    f"task_options.level={'|'.join(levels)}"
+                )
+
+
 class NavigateArrays(NamedTuple):
     """What an episode holds beside its goal."""
 
@@ -232,13 +253,7 @@ class Navigate(Task):
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, e, scenery = self.options, self.world.num_envs, self.world.system.scenery
-        own = [name for name in ("start", "goal", "low", "high") if getattr(option, name) is not None]
-        if own and option.level != "given":
-            raise ConfigError(
-                f"task_options.{own[0]} means nothing at level {option.level}; set task_options.level=given"
-            )
-        if option.pillars is not None and option.level in ("narrow", "given"):
-            raise ConfigError(f"task_options.pillars means nothing at level {option.level}; leave it out")
+        check_level(option)
         if option.level == "given":
             self._given = given_map(option, self.world.system, self.world.obstacles)
         elif scenery.reserved < (rows := option.course.capacity(option.level)):

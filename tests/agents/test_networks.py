@@ -138,6 +138,8 @@ def test_a_network_may_take_how_much_earlier_steps_differ(asinh):
     given.normalizer.update(differ)
     assert torch.equal(told(seen)[0], given(differ)[0])
     assert not torch.equal(told(seen)[0], given(seen)[0])
+    with pytest.raises(ConfigError, match=r"train.changes=true .* env.history"):
+        build_actor(TrainConfig(changes=True), torch.zeros(2, 2), ["a_0", "b_0"])
 
 
 def test_a_component_that_is_not_observed_is_refused_by_name():
