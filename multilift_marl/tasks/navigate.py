@@ -74,21 +74,20 @@ class NavigateOptions(ArrivalOptions):
 
 OF_LEVELS = {
     ("start", "goal", "low", "high"): ("given",),
-    ("gaps", "walls"): ("narrow",),
     ("pillars",): ("sparse", "dense", "unknown"),
-    ("length", "map"): ("sparse", "dense", "narrow", "unknown"),
+    ("map",): ("sparse", "dense", "narrow", "unknown"),
 }
 
 
 def check_level(option: NavigateOptions) -> None:
-    """Refuse, by a ConfigError, options that have no effect at the level."""
+    """Refuse, by a ConfigError, options of other levels; gaps, walls and length may come from a configuration."""
     for names, levels in OF_LEVELS.items():
         if option.level in levels:
             continue
         for name in names:
             if getattr(option, name) != NavigateOptions.model_fields[name].get_default():
                 raise ConfigError(
-                    f"task_options.{name} means nothing at level {option.level}; leave it out, or set "
+                    f"task_options.{name} means nothing at level {option.level}; set it to null, or "
                     f"task_options.level={'|'.join(levels)}"
                 )
 

@@ -199,19 +199,11 @@ def test_a_given_map_is_the_scene_with_its_start_and_goal():
         ({"task_options.goal": [0.3, 0, 1.5]}, "at task_options.goal=[0.3, 0.0, 1.5] the team is in an obstacle"),
         ({"task_options.start": [1, 2]}, "task_options.start"),
         ({"task_options.pillars": 3}, "task_options.pillars means nothing at level given"),
-        ({"task_options.length": 9}, "task_options.length means nothing at level given"),
         ({"task_options.map": 3}, "task_options.map means nothing at level given"),
     ],
 )
 def test_given_maps_that_cannot_be_are_refused(change, said):
     assert said in refusal(make, "navigate", **(GIVEN | change))
-
-
-@pytest.mark.parametrize("option", ["gaps", "walls"])
-@pytest.mark.parametrize("level", ["sparse", "unknown"])
-def test_walls_that_no_map_has_are_refused(option, level):
-    said = refusal(make, "navigate", **{f"task_options.{option}": 1, "task_options.level": level})
-    assert f"task_options.{option} means nothing at level {level}" in said and "task_options.level=narrow" in said
 
 
 def test_a_straight_flight_without_obstacles_succeeds():
