@@ -118,11 +118,11 @@ def test_a_resumed_training_goes_on_with_its_networks(tmp_path):
     assert again.iteration == 12
     for name, expected in trainer.learner.actor.state_dict().items():
         assert torch.equal(again.learner.actor.state_dict()[name], expected), name
-    while "loss" not in (values := again.step()):  # few steps alone would be overfitted
+    for _ in range(11):  # few steps alone would be overfitted
+        assert "loss" not in again.step()
         for name, expected in trainer.learner.actor.state_dict().items():
             assert torch.equal(again.learner.actor.state_dict()[name], expected), name
-    (flights,) = again.rollouts.flights
-    assert flights.count > 1000
+    values = again.step()
     assert values["loss"] < 0.7 * losses[0], (values, losses)
 
 
