@@ -11,19 +11,19 @@ from multilift_marl.envs.core import MultiliftVec
 class EpisodeStatistics:
     """Follows the returns of the episodes in flight from batch to batch.
 
-    Nothing counts before an episode's length has passed: until then those end that the staggered start cut short, and
-    of the whole ones that follow only the failures.
+    Nothing counts before the length of the longest episodes has passed: until then those end that the staggered start
+    cut short, and of the whole ones that follow only the failures.
 
     Args:
-        vec: environments like those of the rollouts.
+        vecs: environments like those of the rollouts, of each rig.
         num_envs: environments of all rigs together.
 
     Attributes:
         returns: of the episodes in flight (E,).
     """
 
-    def __init__(self, vec: MultiliftVec, num_envs: int):
-        self._length, self._terms = vec.max_steps, vec.reward_terms
+    def __init__(self, vecs: list[MultiliftVec], num_envs: int):
+        self._length, self._terms = max(vec.max_steps for vec in vecs), vecs[0].reward_terms
         self.returns = np.zeros(num_envs)
 
     def read(self, batches: Batches, iteration: int) -> dict[str, float]:

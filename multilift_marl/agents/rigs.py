@@ -10,7 +10,7 @@ from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
 from multilift_marl.schema.training import TrainConfig
 
-_COMMON = ("task", "seed", "train", "eval", "env.num_envs", "env.policy_hz", "env.episode_seconds")
+_COMMON = ("task", "seed", "train", "eval", "env.num_envs", "env.policy_hz")
 
 
 def divide_rigs(environment: Config) -> list[Config]:

@@ -210,7 +210,7 @@ class Trainer:
         """Have the policy act in the environments of the present stage."""
         self.env, environment = envs[0], self.curriculum.environment
         self.rollouts = make_rollouts(environment, envs, self.learner)
-        self.episodes = EpisodeStatistics(self.env.vec, environment.env.num_envs)
+        self.episodes = EpisodeStatistics([env.vec for env in envs], environment.env.num_envs)
 
     def _advance(self, success: float | None) -> None:
         """Go on to the next stage where the present one is over."""
