@@ -65,6 +65,7 @@ JARGON = ("Input ", "Value error", "Field required", "Tuple ", "instance of", "\
 SHARES = {  # key of `randomization`: width
     "payload_mass": 0.2, "payload_inertia": 0.3, "payload_drag": 0.5, "cable_length": 0.05, "cable_stiffness": 0.4,
     "vehicle_mass": 0.1, "vehicle_thrust_coefficient": 0.08, "vehicle_rotor_time_constant": 0.25, "vehicle_drag": 0.6,
+    "rotor_thrust_coefficient": 0.04,
 }  # fmt: skip
 # all hidden parameters; one set for all tests, since what is hidden is compiled into the global state
 ALL = {f"randomization.{key}": width for key, width in SHARES.items()} | {

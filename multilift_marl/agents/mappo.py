@@ -192,6 +192,12 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
     """
     config, start = learner.config, time.perf_counter()
 
+    # 0. The first statistics of the observations, or the first update would learn from inputs of another scale than all
+    # others. An untrained policy acts alike by any: its last layer is zero.
+    fresh = not learner.actor.normalizer.count
+    if fresh:
+        _update_statistics(learner, batches)
+
     # 1. Advantages, from values of the critic before the update, normalised over all batches.
     estimates = [estimate_advantage(learner, batch) for batch in batches]
     advantages = torch.cat([advantage.flatten() for advantage, _ in estimates])
@@ -229,12 +235,10 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
             stop = True
             break
 
-    # 3. Statistics of the observations, for the next rollouts.
-    for batch in batches:
-        # After the update, or old log-probabilities would be of other inputs than the new ones, and the ratios not 1 at
-        # first.
-        learner.actor.normalizer.update(batch[_OBSERVATION])
-        learner.critic.normalizer.update(learner.critic_input(batch))
+    # 3. Statistics of the observations, for the next rollouts. After the update, or old log-probabilities would be of
+    # other inputs than the new ones, and the ratios not 1 at first.
+    if not fresh:
+        _update_statistics(learner, batches)
 
     names = ("approx_kl", "clip_fraction", "loss_policy", "loss_critic", "gradient_norm")
     result = dict(zip(names, torch.stack(diagnostics).mean(0).tolist(), strict=True))
@@ -246,6 +250,13 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
         "stopped_early": float(stop),
         "learning_seconds": time.perf_counter() - start,
     }
+
+
+def _update_statistics(learner: Learner, batches: Sequence[TensorDictBase]) -> None:
+    """Include the observations and states of rollouts in the statistics by which they are standardised."""
+    for batch in batches:
+        learner.actor.normalizer.update(batch[_OBSERVATION])
+        learner.critic.normalizer.update(learner.critic_input(batch))
 
 
 def _list_columns(
@@ -305,9 +316,11 @@ def surrogate_loss(
     clipped = log_ratio.clamp((-clip).log1p(), clip.log1p())
     # min(r A, clip(r) A): pessimistic, so that there is nothing to gain beyond the bounds but all to lose.
     gain = torch.stack([log_ratio.exp() * advantage, clipped.exp() * advantage], -1).min(dim=-1).values
-    # KL below: the mean of log π_old/π over what π_old drew, unbiased, and negative at times.
+    # KL: the mean of r - 1 - log r over what π_old drew (k3 of Schulman, "Approximating KL divergence", 2020), unbiased
+    # and never negative.
+    kl = (log_ratio.expm1() - log_ratio).mean()
     share = (clipped != log_ratio).float().mean()
-    return (-gain).mean(), distribution.entropy().mean(), -log_ratio.mean(), share
+    return (-gain).mean(), distribution.entropy().mean(), kl, share
 
 
 def value_loss(learner: Learner, source: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

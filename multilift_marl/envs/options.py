@@ -175,8 +175,11 @@ def check_draw(fixed: Rows, nominal: Rows, system: System) -> None:
             _refuse_beyond(name, rows, 100.0, "in its units")
     # The ratio counts: each that is fixed is checked with the other, which is nominal where it is not.
     coefficient, mass = fixed.get("vehicle_thrust_coefficient", 1.0), fixed.get("vehicle_mass", system.drone_mass)
-    thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles]) * coefficient
-    names = [name for name in ("vehicle_mass", "vehicle_thrust_coefficient") if name in fixed]
+    rotors = np.sum(fixed.get("rotor_thrust_coefficient", np.ones(4)), axis=-1)
+    thrust = np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles]) * coefficient * rotors
+    names = [
+        name for name in ("vehicle_mass", "vehicle_thrust_coefficient", "rotor_thrust_coefficient") if name in fixed
+    ]
     if names and (thrust > MAX_THRUST * GRAVITY * mass).any():
         raise ValueError(
             f"with the {' and '.join(names)} that reset is to fix, a drone lifts more than {MAX_THRUST:g} × its "

@@ -95,6 +95,13 @@ def thrust_coefficient(e, n, v):
 
 
 @inlined
+def own_rotors(e, n, v):
+    """Thrust coefficient of each rotor over that of its drone, minus 1."""
+    own = v.parameters.rotor_thrust_coefficient[e, n]
+    return own[0] - 1.0, own[1] - 1.0, own[2] - 1.0, own[3] - 1.0
+
+
+@inlined
 def rotor_time_constant(e, n, v):
     """Time constant of the rotors over the nominal one, minus 1."""
     return v.parameters.vehicle_rotor_time_constant[e, n] - 1.0
@@ -182,6 +189,9 @@ DRONE_HIDDEN = {  # the same of each drone
     "vehicle_rotor_time_constant": Component(
         "rotor_time_constant", 1, "-", "-", "time constant of the rotors over the nominal one, minus 1",
         rotor_time_constant,
+    ),
+    "rotor_thrust_coefficient": Component(
+        "rotors", 4, "-", "-", "thrust coefficient of each rotor over that of its drone, minus 1", own_rotors
     ),
     "obstacles": Component(
         "nearest_obstacle", 3, "target", "m", "from the drone to the nearest point of an obstacle", drone_obstacle

@@ -135,7 +135,7 @@ def assess_motion(
     middle = SAMPLES // 2
     payload = positions[:, middle], rotations[:, middle]
     quantities = (
-        *_measure_drones(motion, times, system, 1 - ranges.vehicle_thrust_coefficient),
+        *_measure_drones(motion, times, system, ranges.weakest_rotor),
         *_measure_places(motion, payload, team, system),
     )
     margins, violations = [], []

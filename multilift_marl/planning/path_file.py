@@ -256,7 +256,7 @@ def check_thrust(source: str, table: np.ndarray, system: System, ranges: Randomi
     swing = np.hypot(rate[:, 3] ** 2, bend[:, 3])[:, None] * np.linalg.norm(system.slots[:, :2], axis=1)
     thrust = np.linalg.norm(gravity, axis=1)[:, None] / GRAVITY * np.linalg.norm(hover, axis=1) + own * swing
     most = 4 * np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])
-    most = most * (1 - ranges.vehicle_thrust_coefficient)
+    most = most * ranges.weakest_rotor
     i, n = np.unravel_index(np.argmax(thrust / most), thrust.shape)
     if not isfinite(thrust[i, n]) or thrust[i, n] > most[n]:
         raise ConfigError(

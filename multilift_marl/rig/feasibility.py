@@ -46,11 +46,7 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
     if system.air.wash or system.air.ground_effect:
         for vehicle in vehicles:
             check_rotors(vehicle)
-    if system.air.turbulence and not system.wind[:2].any() and not ranges.wind:
-        raise ConfigError(
-            "wind.turbulence is as strong as the horizontal mean wind, and there is none; set wind.velocity or "
-            "randomization.wind, or switch wind.turbulence off"
-        )
+    _check_turbulence(system, ranges)
     thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in vehicles])
     if thrust.sum() < MIN_THRUST_TO_WEIGHT * system.weight:
         lifted = "payload, drones and cables" if system.cable_mass.any() else "payload and drones"
@@ -66,11 +62,11 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
     # As vectors: a leaning cable takes thrust beside what it lifts.
     hover = np.linalg.norm(heaviest * system.formation_force + cable_weight + own, axis=1)
     # The weakest rotors under the heaviest drone; `cable_weight` does not vary with the payload.
-    thrust *= 1 - ranges.vehicle_thrust_coefficient
+    thrust *= ranges.weakest_rotor
     if np.any(hover > thrust):
         i = int(np.argmax(hover - thrust))
-        varied = ranges.vehicle_mass or ranges.vehicle_thrust_coefficient
-        cure = "randomization.vehicle_mass, randomization.vehicle_thrust_coefficient, " if varied else ""
+        own = ("vehicle_mass", "vehicle_thrust_coefficient", "rotor_thrust_coefficient")
+        cure = "".join(f"randomization.{name}, " for name in own if getattr(ranges, name))
         raise RigError(
             f"drone {i} would need {hover[i]:.1f} N of its {thrust[i]:.1f} N to hover under the heaviest payload; "
             f"lower {cure}payload.mass, randomization.payload_mass or cable.angle, or share the load by "
@@ -99,6 +95,21 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
         )
 
 
+def _check_turbulence(system: System, ranges: RandomizationConfig) -> None:
+    """Refuse turbulence of no strength, and a strength without turbulence."""
+    air = system.air
+    if air.turbulence and air.turbulence_speed is None and not system.wind[:2].any() and not ranges.wind:
+        raise ConfigError(
+            "wind.turbulence is as strong as the horizontal mean wind, and there is none; set wind.turbulence_speed, "
+            "wind.velocity or randomization.wind, or switch wind.turbulence off"
+        )
+    if air.turbulence_speed is not None and not air.turbulence:
+        raise ConfigError(
+            f"wind.turbulence_speed={air.turbulence_speed:g} m/s means nothing with wind.turbulence=false; set it to "
+            "null, or wind.turbulence=true"
+        )
+
+
 def check_fixed(system: System, ranges: RandomizationConfig, fixed: Mapping[str, np.ndarray]) -> None:
     """Refuse masses and rotors fixed for episodes with which a team could not lift what it carries.
 
@@ -106,18 +117,19 @@ def check_fixed(system: System, ranges: RandomizationConfig, fixed: Mapping[str,
 
     Args:
         system, ranges: the configured ones.
-        fixed: `payload_mass` (K,) [kg], `vehicle_mass` (K, N) [kg] and `vehicle_thrust_coefficient` (K, N) [-] of K
-            episodes, or some of them; other names do not count.
+        fixed: `payload_mass` (K,) [kg], `vehicle_mass` (K, N) [kg], `vehicle_thrust_coefficient` (K, N) [-] and
+            `rotor_thrust_coefficient` (K, N, 4) [-] of K episodes, or some of them; other names do not count.
 
     Raises:
         ConfigError: naming what is fixed.
     """
-    culprits = [name for name in ("payload_mass", "vehicle_mass", "vehicle_thrust_coefficient") if name in fixed]
+    names = ("payload_mass", "vehicle_mass", "vehicle_thrust_coefficient", "rotor_thrust_coefficient")
+    culprits = [name for name in names if name in fixed]
     if not culprits:
         return
     worst = _lift(
         system, (1 + ranges.payload_mass) * system.payload_mass, (1 + ranges.vehicle_mass) * system.drone_mass,
-        1 - ranges.vehicle_thrust_coefficient,
+        ranges.weakest_rotor,
     )  # fmt: skip
     thrust, weight = np.broadcast_arrays(*_lift(system, **{name: fixed[name] for name in culprits}))
     limit = min(MIN_THRUST_TO_WEIGHT, worst[0] / worst[1])
@@ -133,18 +145,23 @@ def check_fixed(system: System, ranges: RandomizationConfig, fixed: Mapping[str,
 
 def _lift(
     system: System, payload_mass: np.ndarray | float | None = None, vehicle_mass: np.ndarray | None = None,
-    vehicle_thrust_coefficient: np.ndarray | float = 1.0,
+    vehicle_thrust_coefficient: np.ndarray | float = 1.0, rotor_thrust_coefficient: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the thrust and the weight [N] of a team, nominal where nothing else is given."""
+    """Return the thrust and the weight [N] of a team, nominal where nothing else is given.
+
+    A drone that does not turn has all rotors at the thrust of its weakest one.
+    """
     payload = system.payload_mass if payload_mass is None else payload_mass
     drones = system.drone_mass if vehicle_mass is None else vehicle_mass
     thrust = 4 * np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles]) * vehicle_thrust_coefficient
+    if rotor_thrust_coefficient is not None:
+        thrust = thrust * rotor_thrust_coefficient.min(axis=-1)
     return thrust.sum(axis=-1), GRAVITY * (payload + drones.sum(axis=-1) + system.cable_mass.sum())
 
 
 def _check_hooks(system: System, ranges: RandomizationConfig) -> None:
     """Refuse hooks so far from a drone's centre that its rotors could not hold their moment."""
-    heaviest, weakest = 1 + ranges.payload_mass, 1 - ranges.vehicle_thrust_coefficient
+    heaviest, weakest = 1 + ranges.payload_mass, ranges.weakest_rotor
     cable_forces = heaviest * system.formation_force + system.hook_force - system.formation_force
     for i, vehicle in enumerate(system.vehicles):
         force = cable_forces[i] + [0, 0, (1 + ranges.vehicle_mass) * vehicle.mass * GRAVITY]
@@ -217,7 +234,7 @@ def _find_wind(config: SystemConfig) -> float:
 def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, system: System) -> None:
     """Refuse a drone that its rotors or the air would throw about within a physics step."""
     step, lightest = system.timestep, vehicle.mass * (1 - ranges.vehicle_mass)
-    strongest = vehicle.rotor_thrust_max * (1 + ranges.vehicle_thrust_coefficient)
+    strongest = vehicle.rotor_thrust_max * ranges.strongest_rotor
     inertia = np.array(vehicle.inertia) * (1 - ranges.vehicle_mass)
     if 4 * strongest > MAX_THRUST * lightest * GRAVITY:
         raise ConfigError(
@@ -234,7 +251,7 @@ def _check_drone(vehicle: Vehicle, ranges: RandomizationConfig, wind: float, sys
     # Rotors that damp the climb by c [kg/s] damp the roll by c a²/2, each a/√2 off the axis: c h is to be below m and
     # 2 J/a².
     least = min(lightest, 2 * inertia.min() / vehicle.arm**2)
-    if system.inflow and vehicle.inflow_damping * (1 + ranges.vehicle_thrust_coefficient) * step > least:
+    if system.inflow and vehicle.inflow_damping * ranges.strongest_rotor * step > least:
         raise ConfigError(
             f"inflow into rotors of vehicle.rotor_radius={vehicle.rotor_radius:g} m stops a drone of vehicle.mass="
             f"{vehicle.mass:g} kg and vehicle.inertia {list(vehicle.inertia)} kg m² within less than sim.timestep="

@@ -232,6 +232,9 @@ class RandomizationConfig(Section):
     vehicle_rotor_time_constant: Share = Field(
         0.0, description="[-] of each drone's rotors, up and down, scaled by 1 ± this, uniform"
     )
+    rotor_thrust_coefficient: Share = Field(
+        0.0, description="[-] of each single rotor, beside that of all of its drone's, scaled by 1 ± this, uniform"
+    )
     vehicle_drag: Share = Field(0.0, description="[-] drag of each drone scaled by 1 ± this, uniform")
     wind: Annotated[Float, Between(0, 60, "m/s")] = Field(
         0.0, ge=0, description="[m/s] horizontal mean wind, beside wind.velocity, uniform up to this"
@@ -245,6 +248,16 @@ class RandomizationConfig(Section):
     observation_delay: Delays = Field((0, 0), description="[policy steps] a number, or the range of a uniform draw")
     action_delay: Delays = Field((0, 0), description="[policy steps] a number, or the range of a uniform draw")
 
+    @property
+    def weakest_rotor(self) -> float:
+        """Smallest thrust of a rotor over the nominal one [-]."""
+        return (1 - self.vehicle_thrust_coefficient) * (1 - self.rotor_thrust_coefficient)
+
+    @property
+    def strongest_rotor(self) -> float:
+        """Largest thrust of a rotor over the nominal one [-]."""
+        return (1 + self.vehicle_thrust_coefficient) * (1 + self.rotor_thrust_coefficient)
+
 
 class WindConfig(Section):
     """The air (docs/air.md)."""
@@ -252,7 +265,10 @@ class WindConfig(Section):
     velocity: Annotated[Vector, Between(-60, 60, "m/s")] = Field(
         (0.0, 0.0, 0.0), description="[m/s] mean wind in the world frame"
     )
-    turbulence: bool = Field(False, description="Dryden turbulence of MIL-F-8785C, as strong as the mean wind")
+    turbulence: bool = Field(False, description="Dryden turbulence of MIL-F-8785C")
+    turbulence_speed: Annotated[Float | None, Between(0, 60, "m/s")] = Field(
+        None, ge=0, description="[m/s] horizontal mean wind that turbulence is as strong as; None: the one there is"
+    )
     gust: Annotated[Vector, Between(-60, 60, "m/s")] = Field(
         (0.0, 0.0, 0.0), description='[m/s] amplitude of a "1 - cosine" gust in the world frame'
     )

@@ -27,6 +27,8 @@ class AirConstants(NamedTuple):
     gusts: bool
     """Whether there is turbulence or a gust."""
     turbulence: bool
+    turbulence_speed: float
+    """Mean wind that it is as strong as [m/s]; negative: the one there is."""
     gust: tuple[float, float, float]
     """Amplitude, world frame [m/s]; times in [s]."""
     gust_start: float
@@ -69,6 +71,7 @@ def make_air(system: System) -> AirConstants:
     return AirConstants(
         gusts=bool(air.turbulence or any(air.gust)),
         turbulence=air.turbulence,
+        turbulence_speed=-1.0 if air.turbulence_speed is None else float(air.turbulence_speed),
         gust=air.gust,
         gust_start=float(air.gust_start),
         gust_rise=float(air.gust_rise),

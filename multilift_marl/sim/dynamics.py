@@ -87,7 +87,7 @@ def apply_loads(rows, thrust, hidden_loads, data, constants, air_model, varied):
                 square = target * target + 2.0 * target * gap * mean_first + gap * gap * mean_second
                 f = b * square
                 if varied is not None:
-                    f *= varied.thrust[e, n]
+                    f *= varied.thrust[e, n] * varied.rotor[e, n, k]
                 reaction = kappa * f
                 if air_model is not None:
                     if air_constants.inflow:

@@ -129,7 +129,8 @@ def step_gusts(e, wind, state, air, timestep, c):
     """
     gust = scale(gust_factor(air.steps[e] * timestep, c.gust_start, c.gust_rise, c.gust_hold), c.gust)
     if c.turbulence:
-        across, upward, long, high = dryden(state.payload_position[e, 2], hypot(wind[0], wind[1]))
+        speed = hypot(wind[0], wind[1]) if c.turbulence_speed < 0.0 else c.turbulence_speed
+        across, upward, long, high = dryden(state.payload_position[e, 2], speed)
         gust = add(gust, turbulence(e, air, across, upward, wind))
         # Frozen turbulence (Taylor): time in the filters is the way through the air over the scale length.
         distance = timestep * max(MIN_AIRSPEED, norm(sub(row(state.payload_velocity, e), wind)))

@@ -40,12 +40,14 @@ class Parameters(NamedTuple):
     """(E, N) [-]."""
     vehicle_drag: np.ndarray
     """(E, N) [-]."""
+    rotor_thrust_coefficient: np.ndarray
+    """(E, N, 4) [-] of each rotor, beside that of its drone's."""
 
 
 POSITIVE = tuple(name for name in Parameters._fields if not name.endswith(("center_of_mass", "drag")))
 CONFIGURED = (  # cost something in every step, so they may only differ where the configuration says that they do
     "payload_center_of_mass", "payload_drag", "vehicle_thrust_coefficient", "vehicle_rotor_time_constant",
-    "vehicle_drag",
+    "vehicle_drag", "rotor_thrust_coefficient",
 )  # fmt: skip
 MASSES = frozenset(("payload_mass", "payload_inertia", "payload_center_of_mass", "vehicle_mass"))
 
@@ -61,6 +63,8 @@ class RotorVariation(NamedTuple):
     """(E,) [-] over nominal."""
     thrust: np.ndarray
     """(E, N) [-] over nominal."""
+    rotor: np.ndarray
+    """(E, N, 4) [-] beside that."""
     drag: np.ndarray
     """(E, N) [-] over nominal."""
     lag: np.ndarray
@@ -94,6 +98,7 @@ def nominal_parameters(system: System, num_envs: int) -> Parameters:
         vehicle_thrust_coefficient=np.ones((e, n)),
         vehicle_rotor_time_constant=np.ones((e, n)),
         vehicle_drag=np.ones((e, n)),
+        rotor_thrust_coefficient=np.ones((e, n, 4)),
     )
 
 
@@ -107,6 +112,7 @@ def make_rotor_variation(system: System, parameters: Parameters) -> RotorVariati
         center_varies="payload_center_of_mass" in system.varied,
         payload_drag=parameters.payload_drag,
         thrust=parameters.vehicle_thrust_coefficient,
+        rotor=parameters.rotor_thrust_coefficient,
         drag=parameters.vehicle_drag,
         lag=np.zeros((e, n, 2, 3)),
     )

@@ -85,13 +85,11 @@ class Draw:
     def _draw_more(self, env: int, rng: np.random.Generator) -> None:
         """Draw what has a stream of its own; all of it, so that no part depends on which others are switched on.
 
-        The order is that of `Parameters`, then wind: a field changes the episodes of all seeds unless it is drawn last.
+        What is new is drawn last: elsewhere it would change the episodes of all seeds.
         """
-        for name in Parameters._fields[1:]:
-            array = getattr(self.parameters, name)
-            width = np.asarray(getattr(self.ranges, name))
-            change = width * rng.uniform(-1.0, 1.0, array.shape[1:])
-            array[env] = change if name == "payload_center_of_mass" else array[env] * (1.0 + change)
+        *first, last = Parameters._fields[1:]
+        for name in first:
+            self._draw_parameter(name, env, rng)
         speed = self.ranges.wind * rng.uniform()
         direction = rng.uniform(-np.pi, np.pi)
         self.values["wind"][env] += speed * np.cos(direction), speed * np.sin(direction), 0.0
@@ -101,3 +99,10 @@ class Draw:
             delay = rng.integers(low, high + 1)
             if name in self.values:
                 self.values[name][env] = delay
+        self._draw_parameter(last, env, rng)
+
+    def _draw_parameter(self, name: str, env: int, rng: np.random.Generator) -> None:
+        """Draw one of the parameters that scale, or are moved, by a uniform share."""
+        array = getattr(self.parameters, name)
+        change = np.asarray(getattr(self.ranges, name)) * rng.uniform(-1.0, 1.0, array.shape[1:])
+        array[env] = change if name == "payload_center_of_mass" else array[env] * (1.0 + change)

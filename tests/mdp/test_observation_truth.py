@@ -284,7 +284,7 @@ def test_the_global_state_holds_what_an_episode_hides():
     ranges = {
         "payload_inertia": 0.2, "payload_center_of_mass": [0.01, 0.01, 0.01], "action_delay": [0, 3],
         "cable_length": 0.1, "vehicle_mass": 0.05, "vehicle_thrust_coefficient": 0.05,
-        "vehicle_rotor_time_constant": 0.2,
+        "vehicle_rotor_time_constant": 0.2, "rotor_thrust_coefficient": 0.05,
     }  # fmt: skip
     plain = make("hover", num_envs=3, num_drones=3)
     vec = make(
@@ -297,7 +297,7 @@ def test_the_global_state_holds_what_an_episode_hides():
     drawn, system, n = info["randomization"], vec.config.system, 3
     first, _, size = vec.task.drone_numbers
     state, action = vec.state(), vec.action_size
-    assert vec.state_size == plain.state_size + n * 4 + 8
+    assert vec.state_size == plain.state_size + n * 8 + 8
     of_drones = state[:, first : first + n * size].reshape(3, n, size)
     expected = np.stack(
         [
@@ -306,7 +306,8 @@ def test_the_global_state_holds_what_an_episode_hides():
         ],
         axis=-1,
     )  # fmt: skip
-    np.testing.assert_allclose(of_drones[..., size - action - 4 : size - action], expected, atol=1e-6)
+    expected = np.concatenate([expected, drawn["rotor_thrust_coefficient"] - 1], axis=-1)
+    np.testing.assert_allclose(of_drones[..., size - action - 8 : size - action], expected, atol=1e-6)
     assert (np.abs(expected).max(axis=(0, 1)) > 0.01).all()
     gust = turned(heading(vec.task.goal.rotation), vec.world.air.gust)
     rest = [

@@ -134,8 +134,10 @@ def test_teams_hang_in_equilibrium_with_their_own_cables_and_vehicles(model):
     tolerance = 1e-6 + 0.6 * cable_weight
     np.testing.assert_allclose(world.state.cable_tension, expected[:, None].repeat(3, 1), atol=tolerance)
     before = world.state.payload_position.copy()
-    gain = world.system.vehicle.thrust_coefficient * p.vehicle_thrust_coefficient
-    lift = (gain[..., None] * world.state.rotor_speed**2).sum(axis=2) * world.state.drone_rotation[..., 2, 2]
+    gain = world.system.vehicle.thrust_coefficient * p.vehicle_thrust_coefficient[..., None]
+    thrust = gain * p.rotor_thrust_coefficient * world.state.rotor_speed**2
+    np.testing.assert_allclose(thrust, thrust[..., :1].repeat(4, 2), rtol=1e-12)  # no moment
+    lift = thrust.sum(axis=2) * world.state.drone_rotation[..., 2, 2]
     weight = GRAVITY * (
         p.payload_mass + p.vehicle_mass.sum(axis=1) + world.system.cable_mass[0] * p.cable_length.sum(1)
     )
@@ -221,6 +223,34 @@ def test_thrust_follows_its_own_coefficient_and_lags_by_its_own_time_constant():
     world.step(np.full_like(thrust, 3.0), 5)
     lag = np.array([exp(-0.02 / (k * vehicle.rotor_time_constant_up)) for k in (1.0, 1.4)])
     np.testing.assert_allclose(world.state.rotor_speed[:, 0, 0], goal + (first - goal) * lag, rtol=1e-9)
+
+
+def test_a_weak_rotor_turns_its_drone_by_the_thrust_that_it_lacks():
+    world = free_world(2, **{"randomization.rotor_thrust_coefficient": 0.3})
+    factors = np.ones((2, 1, 4))
+    factors[1, 0] = 1.0, 0.8, 1.0, 1.0
+    world.set_parameters(EVERYONE, rotor_thrust_coefficient=factors)
+    vehicle = world.system.vehicle
+    world.step(steady(world, 1.5))
+    lever = np.array(vehicle.rotor_positions)[1]
+    lacking = 0.2 * 1.5 * np.array([lever[1], -lever[0], vehicle.rotor_spin[1] * vehicle.torque_ratio])
+    turned = world.state.drone_body_rates[:, 0]
+    np.testing.assert_allclose(turned[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(turned[1], -lacking / vehicle.inertia * world.system.timestep, rtol=1e-4)
+    slower = world.state.drone_velocity[0, 0, 2] - world.state.drone_velocity[1, 0, 2]
+    assert slower == pytest.approx(0.2 * 1.5 / vehicle.mass * world.system.timestep, rel=1e-6)
+
+
+def test_single_rotors_change_no_other_draw_and_follow_their_width():
+    widths = {"randomization.vehicle_mass": 0.1, "randomization.wind": 2.0, "randomization.action_delay": (0, 3)}
+    plain = make("hover", num_envs=64, num_drones=3, **widths)
+    own = make("hover", num_envs=64, num_drones=3, **widths, **{"randomization.rotor_thrust_coefficient": 0.2})
+    before, drawn = (vec.reset(seed=3)[1]["randomization"] for vec in (plain, own))
+    factors = drawn.pop("rotor_thrust_coefficient")
+    assert factors.shape == (64, 3, 4) and len(np.unique(factors)) == factors.size
+    assert 0.8 <= factors.min() < 0.81 and 1.19 < factors.max() <= 1.2 and factors.mean() == pytest.approx(1, abs=0.02)
+    for name, array in before.items():
+        np.testing.assert_array_equal(drawn[name], array, err_msg=name)
 
 
 def test_drag_of_drone_and_payload_follow_their_factors():

@@ -102,6 +102,16 @@ def test_turbulence_starts_stationary_and_stays_so_in_flight():
         np.testing.assert_allclose(found, [across, across, upward], rtol=0.06)
 
 
+def test_turbulence_may_be_as_strong_as_another_wind_than_there_is():
+    world = World(make_system(1, **{"wind.turbulence": True, "wind.turbulence_speed": 5.0}), 3000, 2)
+    world.step(hover_thrust(world))
+    across, upward, _, _ = dryden(1.5, 5.0)
+    np.testing.assert_allclose(world.air.gust.std(axis=0), [across, across, upward], rtol=0.06)
+    none = World(make_system(1, **WINDY, **{"wind.turbulence_speed": 0.0}), 2, 1)
+    none.step(hover_thrust(none), 10)
+    assert not none.air.gust.any()
+
+
 def test_without_wind_there_is_no_turbulence():
     world = World(make_system(1, **{"wind.turbulence": True, "randomization.wind": 1.0}), 2, 1)
     world.step(hover_thrust(world), 10)
