@@ -13,6 +13,8 @@ from multilift_marl.kernels.jit import compose, inlined, is_plain
 from multilift_marl.math3d import norm, row, sub, vec
 from multilift_marl.schema.sections import RewardTerm
 
+HARMLESS = 0.75  # tensions up to this share of the limit are no snatch
+
 
 class Term(NamedTuple):
     """One term of a task's reward: `weight` times `value`."""
@@ -217,6 +219,18 @@ def is_at_rest(e, v, bounds):
     placed = v.errors.distance[e] <= bounds.distance and v.errors.angle[e] <= bounds.angle
     speed, rate = norm(row(v.state.payload_velocity, e)), norm(row(v.state.payload_body_rates, e))
     return placed and speed <= bounds.speed and rate <= bounds.body_rate
+
+
+@inlined
+def snatch(e, v):
+    """Rise of the episode's largest tension in this step above 75 % of the limit, over that limit.
+
+    For tasks whose `own` has `peak_tension` and `counted_tension` (E,), brought into line by `Kernels.update`, and
+    whose `settings` have the limit `tension` [-].
+    """
+    # Rises alone add up to the episode's peak, whatever the steps: an old snatch does not count again.
+    counted = max(v.own.counted_tension[e], HARMLESS * v.settings.tension)
+    return max(v.own.peak_tension[e] - counted, 0.0) / v.settings.tension
 
 
 @inlined

@@ -22,14 +22,13 @@ from multilift_marl.mdp.rewards import (
     action_rate,
     attitude,
     distance,
+    snatch,
     stillness,
     update_peak_tension,
 )
 from multilift_marl.schema.values import Between, Float, Section
 from multilift_marl.sensing.loss_detection import LEAST_CHANGE, SETTLED, WINDOW, expect_changes, notice_loss
 from multilift_marl.tasks.base import Kernels, Task
-
-HARMLESS = 0.75  # tensions up to this share of the limit are no snatch
 
 
 class LossOptions(StartOptions):
@@ -108,14 +107,6 @@ def stop_motors(e, v):
             v.state.cable_broken[e, who] = True
     # Here, at every control step: a snatch is over within a policy step.
     update_peak_tension(e, v, v.own.peak_tension)
-
-
-@inlined
-def snatch(e, v):
-    """Rise of the episode's largest tension in this step above 75 % of the limit, over that limit."""
-    # Rises alone add up to the episode's peak, whatever the steps: an old snatch does not count again.
-    counted = max(v.own.counted_tension[e], HARMLESS * v.settings.tension)
-    return max(v.own.peak_tension[e] - counted, 0.0) / v.settings.tension
 
 
 @inlined

@@ -27,10 +27,21 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
+from multilift_marl.mdp.criteria import Criterion
 from multilift_marl.mdp.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
 from multilift_marl.mdp.initial_states import TargetOptions, check_heights, in_ball
 from multilift_marl.mdp.observations import Component, cable_vector
-from multilift_marl.mdp.rewards import RestBounds, Term, action_rate, attitude, distance, failure, stillness
+from multilift_marl.mdp.rewards import (
+    RestBounds,
+    Term,
+    action_rate,
+    attitude,
+    distance,
+    failure,
+    snatch,
+    stillness,
+    update_peak_tension,
+)
 from multilift_marl.physical import GRAVITY
 from multilift_marl.schema.values import Float, Section
 from multilift_marl.sim.state import place_at_hook
@@ -47,7 +58,10 @@ class RecoverOptions(TargetOptions):
     start_slack: Float = Field(0.6, gt=0, le=1, description="[-] slack: shortest distance of a hook over cable length")
     grace: Float = Field(2.0, ge=0, description="[s] in which tilt and cable angle are no failure")
     success_distance: Float = Field(0.01, gt=0, description="[m] payload closer than this to its target ...")
-    success_seconds: Float = Field(0.5, gt=0, description="[s] ... throughout the last seconds")
+    success_seconds: Float = Field(0.5, gt=0, description="[s] ... throughout the last seconds, and ...")
+    success_tension: Float = Field(
+        50.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
+    )
 
 
 class SlackStart(NamedTuple):
@@ -153,19 +167,37 @@ def _turn_formation(e, state, goal, rig):
     place_formation(e, goal, rig)
 
 
+class RecoverArrays(NamedTuple):
+    """What an episode holds beside its goal."""
+
+    peak_tension: np.ndarray
+    """(E,) largest tension in the episode over that at rest [-]."""
+    counted_tension: np.ndarray
+    """(E,) the same, as the reward has counted it [-]."""
+
+
 class RecoverSettings(NamedTuple):
     """Constants of the task."""
 
     grace: float
     """[s] in which tilt and cable angle are no failure."""
     bounds: RestBounds
+    tension: float
+    """Largest tension of a success over that at rest [-]."""
 
 
 @inlined
 def end_grace(e, v):
-    """Let all failures count once the grace is over; the goals stay."""
+    """Let all failures count once the grace is over; note the largest tension; the goals stay."""
+    update_peak_tension(e, v, v.own.peak_tension)
     if v.time[e] > v.settings.grace:
         v.mask.ignored[e] = 0
+
+
+@inlined
+def end_step(e, v):
+    """Let the next step count what tension it adds."""
+    v.own.counted_tension[e] = v.own.peak_tension[e]
 
 
 @inlined
@@ -186,16 +218,18 @@ class Recover(Task):
     name: ClassVar[str] = "recover"
     Options: ClassVar[type[Section]] = RecoverOptions
     options: RecoverOptions
+    own: RecoverArrays
     REWARD: ClassVar[dict[str, Term]] = {
         "position": Term(0.4, distance, 0.25, "m"),
         "precision": Term(0.25, distance, 0.01, "m"),
         "attitude": Term(0.15, attitude, 6.0, "deg"),
         "stillness": Term(0.2, stillness, (0.2, 0.3), "m/s, rad/s"),
         "failure": Term(0.0, failure),
+        "snatch": Term(0.0, snatch),
         "action_rate": Term(-0.05, action_rate),
     }
     CAN_PLAN: ClassVar[bool] = False
-    KERNELS: ClassVar[Kernels] = Kernels(plan=end_grace)
+    KERNELS: ClassVar[Kernels] = Kernels(plan=end_grace, update=end_step)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("grace", 1, "-", "-", "share of the time left in which tilt and cable angle are no failure", grace),
         Component(
@@ -213,7 +247,8 @@ class Recover(Task):
         self._early = ignore(TILT, CABLE)
         if option.start == "crazymarl":  # a quarter of its teams start on the ground
             self._early = ignore(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
-        self.settings = RecoverSettings(option.grace, RestBounds(option.success_distance))
+        self.own = RecoverArrays(np.zeros(self.world.num_envs), np.zeros(self.world.num_envs))
+        self.settings = RecoverSettings(option.grace, RestBounds(option.success_distance), option.success_tension)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target and team; see `Task.start`."""
@@ -223,6 +258,7 @@ class Recover(Task):
         putmat(goal.rotation[env], rot_z(radians(rng.uniform(-option.target_yaw, option.target_yaw))))
         place_formation(env, goal, self.rig)
         self.mask.ignored[env] = self._early
+        self.own.peak_tension[env] = self.own.counted_tension[env] = 0.0
         throw = SlackStart(option.start_radius, radians(option.start_tilt), option.start_speed, *self._slack)
         if option.start == "slack":
             _throw(env, rng, state, goal, self.equilibrium, throw)
@@ -234,3 +270,13 @@ class Recover(Task):
         carried = rig.mass + mass / self.world.num_drones
         state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / rig.thrust_coefficient)[:, None]
         state.payload_body_rates[env] = 0.0
+
+    def succeeded(self) -> np.ndarray:
+        """At the target throughout the last seconds, and never too large a tension."""
+        return super().succeeded() & (self.own.peak_tension <= self.options.success_tension)
+
+    def criteria(self) -> tuple[Criterion, ...]:
+        """See `Task.criteria`."""
+        bound = self.options.success_tension
+        tension = Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False)
+        return (*super().criteria(), tension)
