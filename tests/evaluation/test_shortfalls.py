@@ -110,7 +110,7 @@ SOFT = {  # bounds that some teams keep to and others do not
     "loss": {"task_options.success_body_rate": 0.05, "task_options.success_tension": 2.0},
     "navigate": {"task_options.success_tension": 1.01, "task_options.success_distance": 0.05},
     "pose": {"task_options.success_distance": 0.02, "task_options.success_angle": 2.0},
-    "recover": {"task_options.success_distance": 0.0015},
+    "recover": {"task_options.success_distance": 0.0015, "task_options.success_tension": 45.0},
     "regroup": {"task_options.success_distance": 0.5, "task_options.success_angle": 20.0},
     "takeoff": {"task_options.success_distance": 0.01, "task_options.success_tension": 1.3},
     "track": {"task_options.success_distance": 0.06},

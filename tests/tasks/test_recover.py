@@ -77,8 +77,26 @@ def test_success_is_within_a_centimetre_at_the_end():
     for _ in range(vec.max_steps):
         info = vec.step(zeros(vec))[4]
     assert not info["success"].any()
-    vec.task.good_time[:] = [0.5, 0.48]
+    vec.task.good_time[:], vec.task.own.peak_tension[:] = [0.5, 0.48], 1.0
     assert vec.task.succeeded().tolist() == [True, False]
+
+
+def test_success_limits_the_tension_of_the_whole_episode():
+    vec = make("recover", num_envs=8, **{"reward.snatch": -2.0})
+    vec.reset(seed=0)
+    limit, column, peak, paid = vec.task.options.success_tension, vec.reward_terms.index("snatch"), np.zeros(8), 0.0
+    for _ in range(50):
+        vec.step(zeros(vec))
+        now = (vec.world.state.cable_tension / vec.world.system.resting_tension).max(axis=1)
+        assert (vec.task.own.peak_tension >= now - 1e-12).all()  # also what is over within a policy step
+        assert (vec.task.own.peak_tension >= peak).all()
+        peak, paid = vec.task.own.peak_tension.copy(), paid + vec.task.terms[:, column]
+    assert peak.min() > 10
+    np.testing.assert_allclose(paid, -2.0 * np.maximum(peak - 0.75 * limit, 0.0) / limit, atol=1e-12)
+    vec.task.good_time[:], vec.task.own.peak_tension[:] = 1.0, [limit - 1, limit, limit + 1, 1, 1, 1, 1, 500]
+    assert vec.task.succeeded().tolist() == [True, True, False, True, True, True, True, False]
+    vec.reset()
+    assert not vec.task.own.peak_tension.any() and not vec.task.own.counted_tension.any()
 
 
 @pytest.mark.slow

@@ -44,10 +44,15 @@ def test_the_plan_is_observed_from_the_target():
 
 @pytest.mark.parametrize("time, grace, left", [(0.0, 3.0, 1.0), (1.2, 3.0, 0.6), (3.5, 3.0, 0.0), (0.1, 0.0, 0.0)])
 def test_grace_is_observed_as_the_share_that_is_left(time, grace, left):
-    view = record(time=np.array([time]), settings=record(grace=grace), mask=record(ignored=np.array([7])))
+    view = record(
+        time=np.array([time]), settings=record(grace=grace), own=record(peak_tension=np.array([2.0])),
+        mask=record(ignored=np.array([7]), lost=np.array([[False]])), resting_tension=np.array([4.0]),
+        state=record(cable_tension=np.array([[12.0]])),
+    )  # fmt: skip
     assert plain(recover.grace)(0, 0, view) == pytest.approx(left)
     plain(recover.end_grace)(0, view)
     assert view.mask.ignored[0] == (0 if time > grace else 7)
+    assert view.own.peak_tension[0] == 3.0
 
 
 def lost_team(time: float, snap: bool = False):
