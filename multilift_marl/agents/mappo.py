@@ -168,7 +168,11 @@ def estimate_advantage(learner: Learner, batch: TensorDictBase) -> tuple[torch.T
     """
     following = batch["next"]
     value: torch.Tensor = learner.critic(learner.critic_input(batch))
-    next_value = learner.critic(learner.critic_input(following))
+    # The next step's value is that of the state after this one, but where an episode ends, or the batch.
+    next_value = value.roll(-1, 1)
+    last_steps = following["done"].squeeze(-1).clone()
+    last_steps[:, -1] = True
+    next_value[last_steps] = learner.critic(learner.critic_input(following)[last_steps])
     gamma = torch.tensor(learner.config.gamma)
     discount = gamma * ~following["terminated"].unsqueeze(-2)
     # `done` also where time is up: the next step is of another episode, so errors do not flow back across it. The value

@@ -60,7 +60,7 @@ class RecoverOptions(TargetOptions):
     success_distance: Float = Field(0.01, gt=0, description="[m] payload closer than this to its target ...")
     success_seconds: Float = Field(0.5, gt=0, description="[s] ... throughout the last seconds, and ...")
     success_tension: Float = Field(
-        50.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
+        65.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
     )
 
 
