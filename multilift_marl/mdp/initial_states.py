@@ -82,6 +82,8 @@ def set_equilibrium(e, v, goal, equilibrium, pose, velocity, moved):
         state.drone_body_rates[e, n] = 0.0
         cable_force = add(scale(tension, direction), half)
         hover_drone(e, n, state, cable_force, goal.drone_yaw[e] + rig.heading[n], equilibrium)
+        for k in range(4):
+            state.rotor_speed[e, n, k] /= sqrt(v.parameters.rotor_thrust_coefficient[e, n, k])
         place_at_hook(e, n, state, add(anchor, end), equilibrium.hooks)
 
 

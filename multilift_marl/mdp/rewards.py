@@ -224,8 +224,8 @@ def is_at_rest(e, v, bounds):
 @inlined
 def snatch(e, v):
     """Rise of the episode's largest tension in this step above 75 % of the limit, over that limit."""
-    # For tasks whose `own` has `peak_tension` and `counted_tension` (E,), brought into line by `Kernels.update`, and whose
-    # `settings` have the limit `tension`.
+    # For tasks whose `own` has `peak_tension` and `counted_tension` (E,), which `Kernels.update` brings into line, and
+    # whose `settings` have the limit `tension`.
     # Rises alone add up to the episode's peak, whatever the steps: an old snatch does not count again.
     counted = max(v.own.counted_tension[e], HARMLESS * v.settings.tension)
     return max(v.own.peak_tension[e] - counted, 0.0) / v.settings.tension

@@ -65,8 +65,8 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
     thrust *= ranges.weakest_rotor
     if np.any(hover > thrust):
         i = int(np.argmax(hover - thrust))
-        own = ("vehicle_mass", "vehicle_thrust_coefficient", "rotor_thrust_coefficient")
-        cure = "".join(f"randomization.{name}, " for name in own if getattr(ranges, name))
+        drawn = ("vehicle_mass", "vehicle_thrust_coefficient", "rotor_thrust_coefficient")
+        cure = "".join(f"randomization.{name}, " for name in drawn if getattr(ranges, name))
         raise RigError(
             f"drone {i} would need {hover[i]:.1f} N of its {thrust[i]:.1f} N to hover under the heaviest payload; "
             f"lower {cure}payload.mass, randomization.payload_mass or cable.angle, or share the load by "

@@ -314,9 +314,6 @@ class Task:
         """
         self.equilibrium = true_equilibrium(self.rig, parameters, env)
         self.start(env, rng, float(parameters.payload_mass[env]))
-        if "rotor_thrust_coefficient" in self.world.system.varied:
-            # Each turns as fast as its share of the thrust asks of it.
-            self.world.state.rotor_speed[env] /= np.sqrt(parameters.rotor_thrust_coefficient[env])
         self.numpy.start_goals(env, env + 1)
         self.equilibrium = self.rig
         for name in _HANDED_ON:

@@ -251,6 +251,9 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "train.observe",
         "eval.keep",
         "train.changes",
+        "randomization.rotor_thrust_coefficient",
+        "wind.turbulence_speed",
+        "task_options.success_tension",
         *(key for key in later if key.startswith(("train.diffmpc.", "train.dagger."))),
         *(key for key in later if key.startswith("env.obstacles.")),
     }

@@ -6,7 +6,7 @@ from math import cos, pi, sqrt
 
 import numpy as np
 import pytest
-from conftest import free_world, hover_thrust, make, make_system, mask, same, weightless, zeros
+from conftest import free_world, hover_thrust, make, make_system, mask, refuse_system, same, weightless, zeros
 
 from multilift_marl.sim import Air, World
 from multilift_marl.sim.gusts import advance_turbulence, dryden, gust_factor, start_turbulence, turbulence
@@ -110,6 +110,7 @@ def test_turbulence_may_be_as_strong_as_another_wind_than_there_is():
     none = World(make_system(1, **WINDY, **{"wind.turbulence_speed": 0.0}), 2, 1)
     none.step(hover_thrust(none), 10)
     assert not none.air.gust.any()
+    assert "means nothing with wind.turbulence=false" in refuse_system(wind__turbulence_speed=3.0)
 
 
 def test_without_wind_there_is_no_turbulence():

@@ -100,6 +100,19 @@ def test_success_limits_the_tension_of_the_whole_episode():
 
 
 @pytest.mark.slow
+def test_peaks_of_a_cord_are_those_of_a_finer_time_step():
+    means = []
+    for timestep in (0.004, 0.001):
+        vec = make("recover", num_envs=32, **{"sim.timestep": timestep})
+        vec.reset(seed=0)
+        for _ in range(30):
+            vec.step(zeros(vec))
+        means.append(vec.task.own.peak_tension.mean())
+    assert means[0] == pytest.approx(means[1], rel=0.08)  # rigid cables: in proportion to the step
+    assert 25 < means[1] < vec.task.options.success_tension
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("config", ["recover", "recover_crazymarl"])
 def test_the_formation_recovers_from_most_starts(config):
     vec = starts(config, 32)
