@@ -24,6 +24,7 @@ def true_equilibrium(rig: RigArrays, parameters: Parameters, e: int) -> RigArray
     return rig._replace(
         mass=p.vehicle_mass[e],
         thrust_coefficient=rig.thrust_coefficient * p.vehicle_thrust_coefficient[e],
+        rotor_strength=p.rotor_thrust_coefficient[e],
         cable_length=p.cable_length[e],
         cable_stiffness=p.cable_stiffness[e],
         cable_weight=rig.cable_weight * (p.cable_length[e] / rig.cable_length),
@@ -82,8 +83,6 @@ def set_equilibrium(e, v, goal, equilibrium, pose, velocity, moved):
         state.drone_body_rates[e, n] = 0.0
         cable_force = add(scale(tension, direction), half)
         hover_drone(e, n, state, cable_force, goal.drone_yaw[e] + rig.heading[n], equilibrium)
-        for k in range(4):
-            state.rotor_speed[e, n, k] /= sqrt(v.parameters.rotor_thrust_coefficient[e, n, k])
         place_at_hook(e, n, state, add(anchor, end), equilibrium.hooks)
 
 

@@ -42,6 +42,8 @@ class RigArrays(NamedTuple):
     """(N, 4, 4) inverse allocation matrices."""
     thrust_coefficient: np.ndarray
     """(N,) b [N s²]."""
+    rotor_strength: np.ndarray
+    """(N, 4) thrust of each rotor over that by b [-]: 1, unless these are the true numbers of an environment."""
     cable_length: np.ndarray
     """(N,) [m]."""
     cable_stiffness: np.ndarray
@@ -95,6 +97,7 @@ def make_rig(system: System) -> RigArrays:
         mass=system.drone_mass,
         allocation=np.stack([np.linalg.inv(vehicle.allocation) for vehicle in system.vehicles]),
         thrust_coefficient=_column(system, "thrust_coefficient"),
+        rotor_strength=np.ones((system.num_drones, 4)),
         cable_length=system.cable_length,
         cable_stiffness=system.cable_stiffness,
         cable_weight=system.cable_mass * GRAVITY,

@@ -158,4 +158,4 @@ def hover_drone(e, n, state, cable_force, yaw, drones):
             thrust = a[0] * total + a[1] * torque[0] + a[2] * torque[1] + a[3] * torque[2]
             # ω² = f/b; a rotor cannot push down.
             square = max(thrust, 0.0) / drones.thrust_coefficient[n]
-        state.rotor_speed[e, n, k] = sqrt(square)
+        state.rotor_speed[e, n, k] = sqrt(square / drones.rotor_strength[n, k])
