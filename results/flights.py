@@ -125,7 +125,7 @@ FLIGHTS: dict[str, Flight] = {
     "navigate_course": Flight(
         "navigate_course",
         {},
-        "navigate_course",
+        "navigate_senses",
         "navigate, unknown obstacles over 20 m",
         scripts=("formation", "formation_repelled"),
     ),

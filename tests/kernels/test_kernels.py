@@ -22,8 +22,8 @@ from multilift_marl.sim.state import SystemState, hover_drone
 state = SystemState.zeros(1, 1)
 one = np.ones(1)
 three = np.zeros((1, 3))
-four = np.ones((1, 4))
-rig = RigArrays(three, three, False, True, three, one, one, three, one, np.ones((1, 4, 4)), one, four, *[one] * 4, 1.0, 1.0)
+four, inverse = np.ones((1, 4)), np.ones((1, 4, 4))
+rig = RigArrays(three, three, False, True, three, one, one, three, one, inverse, one, four, *[one] * 4, 1.0, 1.0)
 hover_drone(0, 0, state, (0.0, 0.0, 0.0), 0.0, rig)
 print((state.rotor_speed**2).sum() / GRAVITY)
 """
