@@ -12,7 +12,7 @@ class EpisodeStatistics:
     """Follows the returns of the episodes in flight from batch to batch.
 
     Nothing counts before the length of the longest episodes has passed: until then those end that the staggered start
-    cut short, and of the whole ones that follow only the failures.
+    cut short, and of the whole ones that follow only the failures. Of rigs with shorter episodes more of them count.
 
     Args:
         vecs: environments like those of the rollouts, of each rig.

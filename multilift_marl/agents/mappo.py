@@ -20,6 +20,7 @@ from multilift_marl.agents.networks import (
     CentralCritic,
     LocalCritic,
     NoCritic,
+    Normalizer,
     TeamNet,
     build_actor,
     draw_action,
@@ -197,10 +198,10 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
     config, start = learner.config, time.perf_counter()
 
     # 0. The first statistics of the observations, or the first update would learn from inputs of another scale than all
-    # others. An untrained policy acts alike by any: its last layer is zero.
-    fresh = not learner.actor.normalizer.count
-    if fresh:
-        _update_statistics(learner, batches)
+    # others. An untrained policy acts alike by any: its last layer is zero. Its memory does not.
+    statistics = learner.actor.normalizer, learner.critic.normalizer
+    first = [each for each in statistics if not each.count and (each is not statistics[0] or not config.gru)]
+    _update_statistics(learner, batches, first)
 
     # 1. Advantages, from values of the critic before the update, normalised over all batches.
     estimates = [estimate_advantage(learner, batch) for batch in batches]
@@ -241,8 +242,7 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
 
     # 3. Statistics of the observations, for the next rollouts. After the update, or old log-probabilities would be of
     # other inputs than the new ones, and the ratios not 1 at first.
-    if not fresh:
-        _update_statistics(learner, batches)
+    _update_statistics(learner, batches, [each for each in statistics if each not in first])
 
     names = ("approx_kl", "clip_fraction", "loss_policy", "loss_critic", "gradient_norm")
     result = dict(zip(names, torch.stack(diagnostics).mean(0).tolist(), strict=True))
@@ -256,11 +256,13 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
     }
 
 
-def _update_statistics(learner: Learner, batches: Sequence[TensorDictBase]) -> None:
-    """Include the observations and states of rollouts in the statistics by which they are standardised."""
+def _update_statistics(learner: Learner, batches: Sequence[TensorDictBase], which: Sequence[Normalizer]) -> None:
+    """Include the observations and states of rollouts in those statistics of actor and critic."""
     for batch in batches:
-        learner.actor.normalizer.update(batch[_OBSERVATION])
-        learner.critic.normalizer.update(learner.critic_input(batch))
+        if learner.actor.normalizer in which:
+            learner.actor.normalizer.update(batch[_OBSERVATION])
+        if learner.critic.normalizer in which:
+            learner.critic.normalizer.update(learner.critic_input(batch))
 
 
 def _list_columns(

@@ -96,7 +96,7 @@ def check_possible(system: System, ranges: RandomizationConfig) -> None:
 
 
 def _check_turbulence(system: System, ranges: RandomizationConfig) -> None:
-    """Refuse turbulence of no strength, and a strength without turbulence."""
+    """Refuse turbulence whose strength nothing says, and a strength without turbulence."""
     air = system.air
     if air.turbulence and air.turbulence_speed is None and not system.wind[:2].any() and not ranges.wind:
         raise ConfigError(

@@ -59,9 +59,15 @@ class RecoverOptions(TargetOptions):
     grace: Float = Field(2.0, ge=0, description="[s] in which tilt and cable angle are no failure")
     success_distance: Float = Field(0.01, gt=0, description="[m] payload closer than this to its target ...")
     success_seconds: Float = Field(0.5, gt=0, description="[s] ... throughout the last seconds, and ...")
-    success_tension: Float = Field(
-        65.0, gt=1, description="[-] no cable's tension at any time, mean of a physics step, over its resting tension"
-    )
+    success_tension: Float | None = Field(
+        None, gt=1,
+        description="[-] no cable's tension at any time, mean of a physics step, over its resting tension; None: any",
+    )  # fmt: skip
+
+    @property
+    def tension(self) -> float:
+        """The same, infinite without limit."""
+        return np.inf if self.success_tension is None else self.success_tension
 
 
 class SlackStart(NamedTuple):
@@ -248,7 +254,7 @@ class Recover(Task):
         if option.start == "crazymarl":  # a quarter of its teams start on the ground
             self._early = ignore(TILT, CABLE, BELOW, GROUND, LOAD_GROUND)
         self.own = RecoverArrays(np.zeros(self.world.num_envs), np.zeros(self.world.num_envs))
-        self.settings = RecoverSettings(option.grace, RestBounds(option.success_distance), option.success_tension)
+        self.settings = RecoverSettings(option.grace, RestBounds(option.success_distance), option.tension)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw target and team; see `Task.start`."""
@@ -268,15 +274,17 @@ class Recover(Task):
             _turn_formation(env, state, goal, self.rig)
         rig = self.equilibrium
         carried = rig.mass + mass / self.world.num_drones
-        state.rotor_speed[env] = np.sqrt(carried * GRAVITY / 4 / rig.thrust_coefficient)[:, None]
+        each = (carried * GRAVITY / 4 / rig.thrust_coefficient)[:, None]
+        state.rotor_speed[env] = np.sqrt(each / rig.rotor_strength)
         state.payload_body_rates[env] = 0.0
 
     def succeeded(self) -> np.ndarray:
         """At the target throughout the last seconds, and never too large a tension."""
-        return super().succeeded() & (self.own.peak_tension <= self.options.success_tension)
+        return super().succeeded() & (self.own.peak_tension <= self.options.tension)
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
-        bound = self.options.success_tension
-        tension = Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False)
-        return (*super().criteria(), tension)
+        bound, others = self.options.tension, super().criteria()
+        if bound == np.inf:
+            return others
+        return (*others, Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False))

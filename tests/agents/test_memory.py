@@ -81,7 +81,6 @@ def test_learning_sees_the_memory_that_the_rollouts_had(tmp_path, overrides):
     trainer = make_trainer(tmp_path, **GRU, **short, **overrides)
     with torch.no_grad():
         nn.init.orthogonal_(trainer.learner.actor.team.net[-1].weight)
-    trainer.learner.actor.normalizer.update(torch.randn(100, trainer.env.vec.observation_size))  # as if trained
     ended = 0
     collect = trainer.rollouts.collect
     for i in range(4):

@@ -14,6 +14,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.value import MultiAgentGAE
 
+from multilift_marl.agents import mappo
 from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
 from multilift_marl.agents.logging import RunLog, read_metrics
 from multilift_marl.agents.mappo import estimate_advantage, surrogate_loss, value_loss
@@ -297,6 +298,21 @@ def test_the_first_update_learns_from_standardised_observations(tmp_path):
     trainer.rollouts.collect = collect
     trainer.step()
     assert normalizer.count == 2 * len(seen)
+
+
+def test_a_new_critic_of_a_trained_policy_learns_from_standardised_states(tmp_path):
+    trainer = make_trainer(tmp_path)
+    actor, critic = trainer.learner.actor.normalizer, trainer.learner.critic.normalizer
+    actor.update(torch.randn(100, len(actor.mean)))
+    [batch] = trainer.rollouts.collect(0)
+    trainer.rollouts.collect = lambda iteration: [batch]
+    known, estimate = [], mappo.estimate_advantage
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mappo, "estimate_advantage", lambda *args: known.append(float(critic.count)) or estimate(*args))
+        trainer.step()
+    states = batch["state"].flatten(0, -2)
+    assert known == [len(states)] and critic.count == len(states)
+    assert actor.count == 100 + batch["agents", "observation"].flatten(0, -2).shape[0]
 
 
 @pytest.mark.parametrize(("kl", "factor"), [(0.03, 1 / 1.5), (0.015, 1.0), (0.01, 1.0), (0.004, 1.5)])

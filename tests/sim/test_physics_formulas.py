@@ -126,6 +126,7 @@ def varied_rotors(state) -> record:
     return record(
         lag=rng.uniform(0.2, 0.9, (1, 2, 2, 3)), thrust=np.array([[0.9, 1.1]]), drag=np.array([[0.7, 1.3]]),
         center_varies=True, payload_center_of_mass=np.array([[0.02, -0.05, 0.03]]), payload_drag=np.array([1.4]),
+        rotor=rng.uniform(0.8, 1.2, (1, 2, 4)),
     )  # fmt: skip
 
 
@@ -167,7 +168,7 @@ def test_a_steps_loads_are_those_of_rotors_drag_gyroscopes_and_air(varies, blows
         after, mean = target + gap * decay, target + gap * first
         np.testing.assert_allclose(state.rotor_speed[0, n], after, rtol=1e-12)
         f = vehicle.thrust_coefficient * (target**2 + 2 * target * gap * first + gap**2 * second)
-        f *= variation.thrust[0, n] if varies else 1.0
+        f *= variation.thrust[0, n] * variation.rotor[0, n] if varies else 1.0
         moment = (np.cross(vehicle.rotor_positions, f[:, None] * [0, 0, 1])).sum(axis=0)
         spin = np.array(vehicle.rotor_spin)
         moment[2] = vehicle.torque_ratio * (spin * f).sum()
