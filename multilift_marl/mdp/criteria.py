@@ -55,6 +55,11 @@ def rest_criteria(bounds: Any, errors: Errors, state: SystemState) -> tuple[Crit
     return tuple(each for each in found if np.isfinite(each.bound))
 
 
+def tension_criterion(peak: np.ndarray, bound: float) -> Criterion:
+    """Return the bound of an episode's largest tension over that at rest, the live array `peak` (E,)."""
+    return Criterion("tension", bound, lambda: peak - bound, throughout=False)
+
+
 def length(vectors: np.ndarray) -> np.ndarray:
     """Return the lengths of vectors (E, 3)."""
     return np.asarray(np.sqrt((vectors**2).sum(axis=1)))

@@ -11,7 +11,7 @@ from pydantic import Field
 from multilift_marl.control.formation import place_formation
 from multilift_marl.kernels.jit import drawing, inlined, kernel
 from multilift_marl.math3d import add, ease, mat, matrow, mul, put, putmat, rot_z, row, sub, triple, vec
-from multilift_marl.mdp.criteria import ArrivalOptions, Criterion, rest_criteria
+from multilift_marl.mdp.criteria import ArrivalOptions, Criterion, rest_criteria, tension_criterion
 from multilift_marl.mdp.failures import WALL
 from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
 from multilift_marl.mdp.observations import Component, target_velocity
@@ -364,9 +364,9 @@ class Gate(Task):
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
-        bound, at_rest = self.options.success_tension, self.KERNELS.is_good is has_arrived
+        at_rest = self.KERNELS.is_good is has_arrived
         found = rest_criteria(self.settings.bounds, self.errors, self.world.state) if at_rest else ()
-        return (*found, Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False))
+        return (*found, tension_criterion(self.own.peak_tension, self.options.success_tension))
 
     def target_path(self, env: int) -> np.ndarray:
         """Return points of the path through the gaps; see `Task.target_path`."""

@@ -13,7 +13,7 @@ from multilift_marl.control.redistribution import RAMP, WAIT, plan_offset, redis
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import inlined
 from multilift_marl.math3d import scale
-from multilift_marl.mdp.criteria import CONDITION, Criterion
+from multilift_marl.mdp.criteria import CONDITION, Criterion, tension_criterion
 from multilift_marl.mdp.initial_states import StartOptions, make_ranges, start_near_target
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import (
@@ -277,9 +277,8 @@ class Loss(Task):
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
-        bound = self.options.success_tension
         return (
             *super().criteria(),
-            Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False),
+            tension_criterion(self.own.peak_tension, self.options.success_tension),
             Criterion("drone_lost", CONDITION, lambda: np.asarray(~self.mask.lost.any(axis=1) * 1.0), throughout=False),
         )

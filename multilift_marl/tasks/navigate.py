@@ -11,7 +11,7 @@ from multilift_marl.control.formation import place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import drawing, inlined
 from multilift_marl.math3d import IDENTITY, add, ease, norm, put, putmat, row, scale, sub
-from multilift_marl.mdp.criteria import ArrivalOptions, Criterion, rest_criteria
+from multilift_marl.mdp.criteria import ArrivalOptions, Criterion, rest_criteria, tension_criterion
 from multilift_marl.mdp.failures import RANGE
 from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
 from multilift_marl.mdp.observations import Component, target_velocity
@@ -290,9 +290,8 @@ class Navigate(Task):
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
-        bound = self.options.success_tension
         found = rest_criteria(self.settings.bounds, self.errors, self.world.state)
-        return (*found, Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False))
+        return (*found, tension_criterion(self.own.peak_tension, self.options.success_tension))
 
     def preview_targets(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `Task.preview_targets`."""

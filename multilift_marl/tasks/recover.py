@@ -27,7 +27,7 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
-from multilift_marl.mdp.criteria import Criterion
+from multilift_marl.mdp.criteria import Criterion, tension_criterion
 from multilift_marl.mdp.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
 from multilift_marl.mdp.initial_states import TargetOptions, check_heights, in_ball
 from multilift_marl.mdp.observations import Component, cable_vector
@@ -66,7 +66,7 @@ class RecoverOptions(TargetOptions):
 
     @property
     def tension(self) -> float:
-        """The same, infinite without limit."""
+        """`success_tension`, infinite where any will do."""
         return np.inf if self.success_tension is None else self.success_tension
 
 
@@ -285,6 +285,4 @@ class Recover(Task):
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
         bound, others = self.options.tension, super().criteria()
-        if bound == np.inf:
-            return others
-        return (*others, Criterion("tension", bound, lambda: self.own.peak_tension - bound, throughout=False))
+        return others if bound == np.inf else (*others, tension_criterion(self.own.peak_tension, bound))

@@ -12,7 +12,7 @@ from multilift_marl.control.formation import place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import inlined
 from multilift_marl.math3d import add, clip, mat, matrow, mul, norm, put, row, scale, sub, vec
-from multilift_marl.mdp.criteria import CONDITION, Criterion
+from multilift_marl.mdp.criteria import CONDITION, Criterion, tension_criterion
 from multilift_marl.mdp.failures import BROKEN, ignore
 from multilift_marl.mdp.initial_states import StartOptions, make_ranges, start_near_target
 from multilift_marl.mdp.observations import Component
@@ -243,10 +243,10 @@ class Regroup(Task):
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
-        own, bound = self.own, self.options.success_tension
+        own = self.own
         return (
             *super().criteria(),
-            Criterion("tension", bound, lambda: own.peak_tension - bound, throughout=False),
+            tension_criterion(own.peak_tension, self.options.success_tension),
             Criterion(
                 "held_before_events", CONDITION, lambda: np.asarray(1.0 * ~own.held.all(axis=1)), throughout=False
             ),

@@ -8,6 +8,7 @@ import torch
 from conftest import make_trainer, refusal
 
 from multilift_marl.agents.policy import LearnedPolicy
+from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.agents.trainer import resume_run
 from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import TRAINING_EVALUATION
@@ -42,6 +43,20 @@ def test_teams_of_different_sizes_learn_together(tmp_path):
     assert [len(batch) for batch in batches] == [trainer.config.env.num_envs // 2] * 2
     assert not torch.equal(weights(trainer), before)
     assert np.isfinite(list(values.values())).all()
+
+
+def test_rigs_may_fly_episodes_of_their_own_length(tmp_path):
+    rigs = [{"env.episode_seconds": 0.4}, {"env.episode_seconds": 0.8}]  # 20 and 40 steps
+    trainer = make_trainer(tmp_path, **{"train.rigs": rigs})
+    told, ends = [], []
+    for iteration in range(6):  # of 16 steps
+        batches = trainer.rollouts.collect(iteration)
+        ends.append([int(batch["next", "done"].sum()) for batch in batches])
+        told.append("return" in trainer.episodes.read(batches, iteration))
+    assert told[:2] == [False, False] and any(told[2:4])  # after the longest
+    short, long = np.sum(ends[3:], axis=0)
+    assert short > long > 0
+    assert [rig.env.episode_seconds for rig in evaluated_rigs(trainer.config)] == [0.4, 0.8]
 
 
 @pytest.mark.slow

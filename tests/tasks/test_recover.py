@@ -81,6 +81,24 @@ def test_success_is_within_a_centimetre_at_the_end():
     assert vec.task.succeeded().tolist() == [True, False]
 
 
+def test_weak_rotors_turn_faster_at_the_start():
+    vec = make("recover", num_envs=4, **{"randomization.rotor_thrust_coefficient": 0.2})
+    _, info = vec.reset(seed=0)
+    squares = info["randomization"]["rotor_thrust_coefficient"] * vec.world.state.rotor_speed**2
+    np.testing.assert_allclose(squares, squares[..., :1].repeat(4, 2), rtol=1e-12)
+    assert np.ptp(vec.world.state.rotor_speed, axis=2).min() > 0
+
+
+def test_without_a_limit_any_tension_will_do():
+    vec = make("recover", num_envs=2, **{"task_options.success_tension": None, "reward.snatch": -2.0})
+    vec.reset(seed=0)
+    for _ in range(40):
+        vec.step(zeros(vec))
+    assert vec.task.own.peak_tension.min() > 10 and not vec.task.terms[:, vec.reward_terms.index("snatch")].any()
+    vec.task.good_time[:] = 1.0
+    assert vec.task.succeeded().all() and "tension" not in [each.name for each in vec.task.criteria()]
+
+
 def test_success_limits_the_tension_of_the_whole_episode():
     vec = make("recover", num_envs=8, **{"reward.snatch": -2.0})
     vec.reset(seed=0)
