@@ -46,7 +46,7 @@ def test_teams_of_different_sizes_learn_together(tmp_path):
 
 
 def test_rigs_may_fly_episodes_of_their_own_length(tmp_path):
-    rigs = [{"env.episode_seconds": 0.4}, {"env.episode_seconds": 0.8}]  # 20 and 40 steps
+    rigs = [{"env.episode_seconds": 0.2}, {"env.episode_seconds": 0.8}]  # 10 and 40 steps
     trainer = make_trainer(tmp_path, **{"train.rigs": rigs})
     told, ends = [], []
     for iteration in range(6):  # of 16 steps
@@ -56,7 +56,7 @@ def test_rigs_may_fly_episodes_of_their_own_length(tmp_path):
     assert told[:2] == [False, False] and any(told[2:4])  # after the longest
     short, long = np.sum(ends[3:], axis=0)
     assert short > long > 0
-    assert [rig.env.episode_seconds for rig in evaluated_rigs(trainer.config)] == [0.4, 0.8]
+    assert [rig.env.episode_seconds for rig in evaluated_rigs(trainer.config)] == [0.2, 0.8]
 
 
 @pytest.mark.slow
