@@ -41,7 +41,7 @@ class Clip(NamedTuple):
 
 CLIPS = {
     "navigate_senses": Clip(
-        "navigate_course", "navigate_senses", 3, 5.0, 27.0, {}, "chase", 3.0, 600, 338, 10, 2_300_000
+        "navigate_course", "navigate_senses", 3, 5.0, 27.0, {}, "chase", 3.0, 520, 292, 10, 1_900_000
     ),
     "navigate_slots": Clip("navigate_slots", "navigate_slots", 8, 13.0, 10.0, {}, "chase", 2.0, 480, 270, 10, 900_000),
     "clip_gate": Clip("gate_two", "formation_narrow", 0, 2.0, 8.0, {}, "chase", 2.0),
