@@ -15,7 +15,7 @@ UNPAID = 0.1  # a weight for terms that have none by default
 
 def unpaid(task: str) -> dict[str, float]:
     """Return weights of the terms without, and bounds which episodes of random actions exceed."""
-    exceeded = {"task_options.success_tension": 3.0} if task == "loss" else {}
+    exceeded = {"task_options.success_tension": 3.0} if task in ("loss", "recover") else {}
     return {f"reward.{name}": UNPAID for name, term in find_task(task).REWARD.items() if term.weight == 0} | exceeded
 
 

@@ -20,6 +20,7 @@ from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.cli.export import main as export
 from multilift_marl.cli.plan import main as plan
 from multilift_marl.cli.train import main as train
+from multilift_marl.config.load import list_configs
 from multilift_marl.errors import pip_install
 from multilift_marl.evaluation import plots
 from multilift_marl.kernels.cache import cache_folder
@@ -200,8 +201,6 @@ def commands_of(block):
 
 
 SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 train.diffmpc.window=4 eval.episodes=2"  # one iteration
-# One environment of each of six rigs.
-SIX = SHORT.replace("num_envs=4", "num_envs=6").replace("frames=32", "frames=48")
 SHORTER = {  # of each script: keys that go, and what is added
     "train.py": (re.findall(r"(\S+)=", SHORT), SHORT),
     "evaluate.py": (["episodes"], "episodes=1 env.episode_seconds=0.4"),
@@ -245,8 +244,9 @@ def shorter(command):
     dropped, more = SHORTER.get(script, ([], ""))
     kept = [part for part in arguments if part.split("=")[0] not in dropped or "resume" in command]
     kept = [part.replace("=examples/", f"={ROOT}/examples/") for part in kept]
-    if "config=navigate_senses" in arguments and more == SHORT:
-        more = SIX
+    for name in set(re.findall(r"config=(\S+)", command)) & set(list_configs()):
+        envs = max(4, len(ml.load_config(name).train.rigs))  # at least one of each rig
+        more = more.replace("num_envs=4", f"num_envs={envs}").replace("frames=32", f"frames={8 * envs}")
     return script, kept + ("" if "resume" in command else more).split()
 
 
