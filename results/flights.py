@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from multilift_marl.config.load import load_config
+from multilift_marl.tasks import find_task
+
 HERE = Path(__file__).parent
 ROOT = Path(__file__).parents[1]
 EPISODES = 1000
@@ -202,4 +205,4 @@ def episodes_of(team: str) -> int:
 
 def error_metric(flight: Flight) -> str:
     """Return the metric by which the teams of a flight are compared."""
-    return "payload_rmse_m" if flight.config.startswith("track") else "payload_position_error_m"
+    return find_task(load_config(flight.config).task).ERROR

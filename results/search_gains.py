@@ -32,6 +32,7 @@ from multilift_marl.policies.baselines import LINEAR
 from multilift_marl.policies.formation import Formation
 from multilift_marl.policies.hold import STIFFNESS
 from multilift_marl.schema.values import Positive, Section
+from multilift_marl.tasks import find_task
 
 LEVEL = ((0, 0), (1, 1))
 TANGENT = ((2, 1),)
@@ -128,7 +129,7 @@ def fly(config: Config, script: type[Formation], seed: int, cost: Cost = "errors
     parts = [run_episodes(rig, script, each, seed, TRAINING_EVALUATION) for rig in rigs]
     flown = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tracks = config.task == "track"
-    error, success = flown["payload_rmse_m" if tracks else "payload_position_error_m"], flown["success_rate"].mean()
+    error, success = flown[find_task(config.task).ERROR], flown["success_rate"].mean()
     turned = np.zeros_like(error) if tracks else flown["payload_attitude_error_deg"]
     lost = 1 - success + np.mean(np.minimum(0.25 * error / ERROR, 1) + np.minimum(0.25 * turned / ANGLE, 1))
     failed = (flown["failure_cause"] > 0).mean()

@@ -22,8 +22,12 @@ from multilift_marl.evaluation.metrics import is_better, summarize
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_base_policy
 from multilift_marl.policies.policy import Policy
+from multilift_marl.tasks import find_task
 
-_METRICS = ("success_rate", "payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")
+_METRICS = (
+    "success_rate", "payload_position_error_m", "payload_rmse_m", "payload_attitude_error_deg", "settling_time_s",
+    "return",
+)  # fmt: skip
 _BLOCK = 2**20  # episodes
 
 
@@ -53,6 +57,7 @@ class Evaluator:
         config: of the training.
 
     Attributes:
+        error: metric by which policies that succeed alike are compared, the task's `ERROR`.
         best: what a checkpoint holds of the policy that is kept, its `iteration`, and its `score` in its evaluation,
             success and negative error; None before the first.
         initial: the same of the policy of `train.init`, without score; None where there is none.
@@ -60,6 +65,7 @@ class Evaluator:
 
     def __init__(self, config: Config):
         self.config = config
+        self.error = find_task(config.task).ERROR
         self.best: dict[str, Any] | None = None
         self.initial: dict[str, Any] | None = None
 
@@ -74,8 +80,8 @@ class Evaluator:
         """
         start, policy = time.perf_counter(), LearnedPolicy(content, "the run")
         summary = summarize(self._fly(policy.bind, 0))
-        values = {f"eval/{name}": summary[name]["mean"] for name in _METRICS}
-        score = [values["eval/success_rate"], -values["eval/payload_position_error_m"]]
+        values = {f"eval/{name}": summary[name]["mean"] for name in self._metrics}
+        score = [values["eval/success_rate"], -values[f"eval/{self.error}"]]
         best, keep_last = self.best, self.config.eval.keep == "last"
         if best is None or keep_last or (score > best["score"] and self._confirm(policy, content["iteration"])):
             weights = {name: tensor.clone() for name, tensor in content["actor"].items()}  # learning changes them
@@ -95,9 +101,13 @@ class Evaluator:
         """Fly the best policy and the one that training of so many iterations began with."""
         learned = self._fly(self.best_policy().bind, iterations + 1)
         script = self._fly(self._beginning(), iterations + 1)
-        before = {name: float(script[name].mean()) for name in _METRICS}
-        after = {name: float(learned[name].mean()) for name in _METRICS}
-        return Gain(before, after, is_better(learned, script), is_better(script, learned))
+        before = {name: float(script[name].mean()) for name in self._metrics}
+        after = {name: float(learned[name].mean()) for name in self._metrics}
+        return Gain(before, after, is_better(learned, script, self.error), is_better(script, learned, self.error))
+
+    @property
+    def _metrics(self) -> tuple[str, ...]:
+        return _METRICS if self.error in _METRICS else (*_METRICS, self.error)
 
     def _beginning(self) -> Callable[[MultiliftVec], Policy]:
         if self.initial is None:
@@ -117,7 +127,7 @@ class Evaluator:
         """
         untrained = self.best_policy().frames == 0
         flown, best = self._fly(candidate.bind, iteration), self._fly(self.best_policy().bind, iteration)
-        return is_better(flown, best, beyond_noise=untrained)
+        return is_better(flown, best, self.error, beyond_noise=untrained)
 
     def _fly(
         self, make_policy: Callable[[MultiliftVec], Policy], block: int, environment: Config | None = None

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from multilift_marl._files import write_whole
 from multilift_marl._platform import cpu_name
+from multilift_marl.evaluation.metrics import name_error
 
 if TYPE_CHECKING:
     from multilift_marl.agents.loggers import Logger
@@ -138,12 +139,20 @@ def say(text: str) -> None:
     quietly(tqdm.write, text)
 
 
-def describe_evaluation(frames: int, values: dict[str, float], header: bool) -> str:
-    """Return an evaluation's row of the table that a training shows, below its header where that is asked for."""
-    success, error = values["eval/success_rate"], 100 * values["eval/payload_position_error_m"]
+def describe_evaluation(frames: int, values: dict[str, float], metric: str, header: bool) -> str:
+    """Return an evaluation's row of the table that a training shows, below its header where that is asked for.
+
+    Args:
+        frames: of the training so far.
+        values: of the evaluation, by name.
+        metric: the error that is shown.
+        header: whether it is the first.
+    """
+    success, error = values["eval/success_rate"], 100 * values[f"eval/{metric}"]
     bar = f"{success:>6.0%}  {'#' * round(20 * success):<20}"
     row = f"{frames:>11,}  {bar}  {error:>8.2f} cm  {values['eval/return']:>7.0f}"
-    return f"{'steps':>11}  {'evaluation: success':<28}  {'error':>11}  {'return':>7}\n{row}" if header else row
+    name = name_error(metric).removeprefix("position ")
+    return f"{'steps':>11}  {'evaluation: success':<28}  {name:>11}  {'return':>7}\n{row}" if header else row
 
 
 def quietly(show: Callable[..., object], *arguments: Any) -> None:

@@ -165,7 +165,7 @@ class Trainer:
                 quietly(bar.set_description, f"{name}, evaluating")
                 values |= self.evaluate()
                 quietly(bar.set_description, name)
-                say(describe_evaluation(self.frames, values, header=not tabled))
+                say(describe_evaluation(self.frames, values, self.evaluator.error, header=not tabled))
                 tabled = True
                 shown["best"] = f"{values['eval/best_iteration']:.0f}"
             if last:

@@ -148,6 +148,8 @@ def _beginning(config: Config) -> str:
 
 def _compare(trainer: Trainer) -> str:
     """Return a table of what training gained over the policy that it began with, and the verdict."""
+    from multilift_marl.evaluation.metrics import name_error
+
     gain, best = trainer.gain, trainer.evaluator.best
     assert gain is not None and best is not None
     names = {
@@ -155,9 +157,10 @@ def _compare(trainer: Trainer) -> str:
         f"learned (iteration {best['iteration']})": gain.learned,
     }
     width = max(len(name) for name in names)
-    rows = [f"{'':{width}}  success  position error"]
+    metric = trainer.evaluator.error
+    rows = [f"{'':{width}}  success  {name_error(metric):>14}"]
     for name, team in names.items():
-        error = f"{100 * team['payload_position_error_m']:.2f} cm"
+        error = f"{100 * team[metric]:.2f} cm"
         rows.append(f"{name:{width}}  {team['success_rate']:>7.1%}  {error:>14}")
     if best["iteration"] == 0:
         verdict = "no significant difference: no policy was better than the one that training began with"

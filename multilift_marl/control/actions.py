@@ -27,6 +27,7 @@ from multilift_marl.control.gains import drone_gains
 from multilift_marl.control.geometric import fly, fly_rates, hook_moment
 from multilift_marl.control.obstacle_margin import Margins, keep_clear
 from multilift_marl.control.setpoints import smooth_velocity, track_own_state, track_own_state_to_yaw
+from multilift_marl.control.swing import shift_with_swing
 from multilift_marl.kernels.jit import bind, kernel
 from multilift_marl.math3d import add, heading, mat, norm, put, scale, thrust_frame, vec
 from multilift_marl.physical import GRAVITY
@@ -64,7 +65,10 @@ class ReferenceAction(Interface):
 
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
-        return bind(_command_offset, lo, hi, action, team, self.settings.max_offset, self.settings.max_yaw)
+        ranges = (self.settings.max_offset, self.settings.max_yaw)
+        if shift := self.settings.swing_shift:
+            return bind(_command_offset_with_swing, lo, hi, action, team, *ranges, shift)
+        return bind(_command_offset, lo, hi, action, team, *ranges)
 
     def control_step(self, lo: int, hi: int, team: ControlContext) -> tuple[Call, ...]:
         """See `Interface.control_step`."""
@@ -232,6 +236,12 @@ def _command_offset(lo, hi, action, team, max_offset, max_yaw):
         for n in range(action.shape[1]):
             put(team.reference.command[e, n], add(vec(goal.slots, e, n), in_world(e, n, action, goal, max_offset)))
             team.reference.command_yaw[e, n] = goal.drone_yaw[e] + g.heading[n] + max_yaw * action[e, n, 3]
+
+
+@kernel
+def _command_offset_with_swing(lo, hi, action, team, max_offset, max_yaw, shift):
+    _command_offset(lo, hi, action, team, max_offset, max_yaw)
+    shift_with_swing(lo, hi, team, shift)
 
 
 @kernel

@@ -44,6 +44,8 @@ class Surroundings(NamedTuple):
     """(E, L, 3, 3)."""
     planes: np.ndarray
     """(N, 2, 2) normals of those beside each drone's sector, into it, in the payload's heading frame."""
+    anchor_line: np.ndarray
+    """(3,) direction of the line on which all anchors lie, payload frame; zero if on none."""
 
 
 class Margins(NamedTuple):
@@ -63,17 +65,17 @@ class Margins(NamedTuple):
 
 
 def check_margins(config: Config) -> None:
-    """Refuse, by a ConfigError, margins that keep nothing."""
+    """Refuse, by a ConfigError, margins that keep nothing, and shifts of nothing."""
     settings, seen = config.control, config.env.obstacle_sensing
-    for key in ("obstacle_margin", "payload_margin", "sector_margin"):
+    for key in ("obstacle_margin", "payload_margin", "sector_margin", "swing_shift"):
         if not (value := getattr(settings, key)):
             continue
         if settings.action != "reference":
             raise ConfigError(
-                f"control.{key}={value:g} keeps set-points of control.action=reference clear, not those of "
+                f"control.{key}={value:g} moves set-points of control.action=reference, not those of "
                 f"{settings.action}; take that one, or leave it out"
             )
-        if key != "sector_margin" and seen not in ("map", "local"):
+        if key in ("obstacle_margin", "payload_margin") and seen not in ("map", "local"):
             raise ConfigError(
                 f"control.{key}={value:g} needs drones that see points of obstacles, not "
                 f"env.obstacle_sensing={seen}; set env.obstacle_sensing=local, or leave it out"

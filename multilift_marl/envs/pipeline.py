@@ -13,6 +13,7 @@ import numpy as np
 
 from multilift_marl.control.controller import Controller
 from multilift_marl.control.obstacle_margin import Surroundings, sector_planes
+from multilift_marl.control.swing import anchor_line
 from multilift_marl.envs.history import History
 from multilift_marl.kernels.jit import kernel_name
 from multilift_marl.sensing.estimator import StateEstimator
@@ -62,7 +63,8 @@ def build_stages(teams: StageContext, shard: Shard, ticks: int) -> tuple[list[St
     plan = on_shard.get("plan")
     seen, load = sensing.obstacles, sensing.load
     points = np.zeros((world.num_envs, world.num_drones, 0, 3)) if seen is None else seen.readings.placed
-    around = Surroundings(points, load.position, load.rotation, sector_planes(world.system.slot_azimuth))
+    planes, line = sector_planes(world.system.slot_azimuth), anchor_line(world.system.anchors)
+    around = Surroundings(points, load.position, load.rotation, planes, line)
     set_action, control = controller.bind(lo, hi, arriving, task.planned, plan, around)
     if sensing.delays_action:
         before.append(Stage("delay action", partial(sensing.bind_send(commands), lo, hi)))

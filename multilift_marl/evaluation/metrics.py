@@ -45,6 +45,11 @@ _ROWS = (  # metric, heading, factor, digits
 )
 
 
+def name_error(metric: str) -> str:
+    """Return what an error in metres is called above a column, such as "position error"."""
+    return next((heading.partition(" [")[0] for name, heading, *_ in _ROWS if name == metric), metric)
+
+
 def wilson(successes: int, trials: int) -> tuple[float, float]:
     """Return the 95 % Wilson score interval of the rate of `successes` in `trials`, at least one (Wilson 1927)."""
     rate, square = successes / trials, _Z**2 / trials
@@ -121,14 +126,17 @@ def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> d
     }
 
 
-def is_better(policy: dict[str, np.ndarray], other: dict[str, np.ndarray], beyond_noise: bool = True) -> bool:
+def is_better(
+    policy: dict[str, np.ndarray], other: dict[str, np.ndarray], metric: str, beyond_noise: bool = True
+) -> bool:
     """Return whether a policy is better than another one on the same episodes: in success first, then in error.
 
     Args:
         policy, other: what `run_episodes` measured of both.
+        metric: the error, see `Task.ERROR`.
         beyond_noise: by `is_gain`; else by the means alone.
     """
-    names = ("success_rate", "payload_position_error_m")
+    names = ("success_rate", metric)
     success, error = (policy[name].astype(float) - other[name].astype(float) for name in names)
     if beyond_noise:
         return is_gain(success, error)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
 from multilift_marl.schema.yaml_text import read_yaml
+from multilift_marl.tasks import find_task
 
 DEFINITION = Path(__file__).with_name("benchmark_v1.yaml")
 SUITES = ("standard", "realistic", "shifts")
@@ -109,7 +110,7 @@ def _read() -> dict[str, Any]:
 
 def _make_task(name: str, values: Mapping[str, Any], change: Shift) -> BenchmarkTask:
     config = load_config(values["config"], values.get("overrides", {}) | change.overrides)
-    error = "payload_rmse_m" if config.task == "track" else "payload_position_error_m"
+    error = find_task(config.task).ERROR
     return BenchmarkTask(name, config, change.factors, error, values["baseline"], values.get("shipped"))
 
 

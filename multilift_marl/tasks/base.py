@@ -93,6 +93,7 @@ class Task:
             them, or a dict with what finds each: an inlined kernel of (e, View) that returns a truth value, or a NumPy
             function of (View) that returns truth values (E,). They count where nothing else has failed.
         MIN_DRONES: with fewer it makes no sense.
+        ERROR: metric of `run_episodes` by which policies that succeed alike are compared, a length [m].
         MAX_DISTANCE: of the payload from its target, beyond which it is out of range [m].
         CAN_PLAN: whether planners can fly it: all cables taut throughout, no drone lost, nothing in the way.
         CHAINS: whether cables may be chains.
@@ -127,6 +128,7 @@ class Task:
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = ()
     FAILURES: ClassVar[tuple[str, ...] | dict[str, Callable[..., Any]]] = ()
     MIN_DRONES: ClassVar[int] = 1
+    ERROR: ClassVar[str] = "payload_position_error_m"
     MAX_DISTANCE: ClassVar[float] = MAX_DISTANCE
     CAN_PLAN: ClassVar[bool] = True
     CHAINS: ClassVar[bool] = True

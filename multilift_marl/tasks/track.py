@@ -283,6 +283,7 @@ class Track(Task):
         "failure": Term(0.0, failure),
         "action_rate": Term(-0.05, action_rate),
     }
+    ERROR: ClassVar[str] = "payload_rmse_m"
     KERNELS: ClassVar[Kernels] = Kernels(never, plan=advance_target, update=update_max_error, preview=preview_target)
     EXTRA: ClassVar[tuple[Component, ...]] = _components("slot")
     EXTRA_STATE: ClassVar[tuple[Component, ...]] = _components("target")

@@ -11,8 +11,8 @@ from conftest import SMALL, make_trainer
 from multilift_marl.agents import evaluator
 from multilift_marl.agents.checkpoint import load_checkpoint
 from multilift_marl.agents.evaluator import Gain
-from multilift_marl.agents.logging import read_metrics
-from multilift_marl.agents.trainer import Trainer
+from multilift_marl.agents.logging import describe_evaluation, read_metrics
+from multilift_marl.agents.trainer import Trainer, new_run
 from multilift_marl.cli.train import _compare
 from multilift_marl.cli.train import main as train
 from multilift_marl.config.load import load_config
@@ -22,12 +22,13 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import LINEAR
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "errors.png"
+ERROR = "payload_position_error_m"
 EVALUATED = (0, 4, 8, 10)  # iterations of SMALL
 
 
 def flight(errors, success=True):
     """Return what `run_episodes` measures of episodes with these position errors [m], as far as training looks."""
-    names = ("payload_position_error_m", "payload_attitude_error_deg", "settling_time_s", "return")
+    names = (ERROR, "payload_rmse_m", "payload_attitude_error_deg", "settling_time_s", "return")
     flown = {name: np.array(errors, float) for name in names}
     return flown | {"success_rate": np.full(len(errors), success), "failure_cause": np.zeros(len(errors), int)}
 
@@ -107,17 +108,18 @@ def test_better_is_in_success_first_and_beyond_noise(success, errors, expected):
     for rate, error in zip(success, errors, strict=True):
         flown.append(flight(error + rng.normal(0, 0.01, 100)))
         flown[-1]["success_rate"] = np.arange(100) < 100 * rate
-    assert is_better(*flown) == expected
+    assert is_better(*flown, ERROR) == expected
 
 
 def test_by_the_means_alone_any_difference_counts_success_first():
     rng = np.random.default_rng(1)
     flown = [flight(error + rng.normal(0, 0.3, 100)) for error in (0.98, 1.0)]
     assert flown[0]["payload_position_error_m"].mean() < flown[1]["payload_position_error_m"].mean()
-    assert not is_better(*flown) and is_better(*flown, beyond_noise=False)
-    assert not is_better(*reversed(flown), beyond_noise=False) and not is_better(flown[0], flown[0], beyond_noise=False)
+    assert not is_better(*flown, ERROR) and is_better(*flown, ERROR, beyond_noise=False)
+    assert not is_better(*reversed(flown), ERROR, beyond_noise=False)
+    assert not is_better(flown[0], flown[0], ERROR, beyond_noise=False)
     flown[0]["success_rate"] = np.arange(100) > 0
-    assert not is_better(*flown, beyond_noise=False) and is_better(*reversed(flown), beyond_noise=False)
+    assert not is_better(*flown, ERROR, beyond_noise=False) and is_better(*reversed(flown), ERROR, beyond_noise=False)
 
 
 def test_the_first_trained_policy_must_beat_the_script_beyond_noise_later_ones_by_the_means(tmp_path, monkeypatch):
@@ -129,13 +131,33 @@ def test_the_first_trained_policy_must_beat_the_script_beyond_noise_later_ones_b
     assert asked == [True, False, False]
 
 
+def test_a_team_that_tracks_is_judged_by_its_error_along_the_path(tmp_path, monkeypatch):
+    trainer = new_run(load_config("track", SMALL), "test", tmp_path)
+
+    def fly(*args, **kwargs):
+        flown = flight(np.full(3, 0.01 * (1 + trainer.iteration)))  # where it ends: worse and worse
+        return flown | {"payload_rmse_m": np.full(3, (0.07, 0.05, 0.06)[trainer.iteration])}
+
+    asked = []
+    monkeypatch.setattr(evaluator, "run_episodes", fly)
+    monkeypatch.setattr(evaluator, "is_better", lambda *flown, **kinds: asked.append(flown[2]) or True)
+    for trainer.iteration in range(2):
+        values = trainer.evaluator.evaluate(trainer._content())
+    assert values["eval/best_iteration"] == 1 and trainer.evaluator.best["score"] == pytest.approx([1.0, -0.05])
+    assert "RMSE" in describe_evaluation(0, values, trainer.evaluator.error, header=True)
+    assert " 5.00 cm" in describe_evaluation(0, values, trainer.evaluator.error, header=True)
+    trainer.gain = trainer.evaluator.measure_gain(2)
+    assert "RMSE" in _compare(trainer) and "5.00 cm" in _compare(trainer)
+    assert set(asked) == {"payload_rmse_m"}
+
+
 def test_one_lost_payload_on_each_side_does_not_hide_a_smaller_error():
     rng, flown = np.random.default_rng(0), []
     for error, lost in ((0.03, 3), (0.04, 5)):
         flown.append(flight(error + rng.normal(0, 0.001, 100)))
         flown[-1]["success_rate"] = np.arange(100) != lost
         flown[-1]["payload_position_error_m"][lost] = 3.0
-    assert is_better(*flown) and not is_better(*reversed(flown))
+    assert is_better(*flown, ERROR) and not is_better(*reversed(flown), ERROR)
 
 
 def test_the_untrained_policy_flies_the_script_and_is_evaluated(tmp_path):
@@ -168,7 +190,7 @@ VERDICTS = {"better": (True, False), "worse": (False, True), "no significant dif
 def test_a_training_ends_with_one_of_three_verdicts(verdict):
     metrics = {"success_rate": 0.5, "payload_position_error_m": 0.1}
     trainer = SimpleNamespace(
-        gain=Gain(metrics, metrics, *VERDICTS[verdict]), evaluator=SimpleNamespace(best={"iteration": 7}),
+        gain=Gain(metrics, metrics, *VERDICTS[verdict]), evaluator=SimpleNamespace(best={"iteration": 7}, error=ERROR),
         config=load_config("hover"),
     )  # fmt: skip
     assert _compare(trainer).splitlines()[-1].startswith(verdict)

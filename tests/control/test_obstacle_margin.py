@@ -35,7 +35,7 @@ def keep(place, command, points=(), margin=0.0, velocity=(0.0, 0.0, 0.0), payloa
     c, s = np.cos(yaw), np.sin(yaw)
     around = Surroundings(
         np.array(points, float).reshape(1, 1, -1, 3), np.array(position, float).reshape(1, 1, 3),
-        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).reshape(1, 1, 3, 3), sector_planes(AZIMUTHS),
+        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).reshape(1, 1, 3, 3), sector_planes(AZIMUTHS), np.zeros(3),
     )  # fmt: skip
     team = SimpleNamespace(goal=goal, reference=reference, state=state, around=around)
     kept = Margins(margin, margins.get("load", 0.0), margins.get("sector", 0.0))
@@ -166,12 +166,12 @@ def test_it_knows_what_drones_observe_from_where_they_took_themselves_to_be_when
     assert np.abs(own.drone_position[0] - vec.world.state.drone_position[0]).max() > 1e-4
 
 
-@pytest.mark.parametrize("key", ["obstacle_margin", "payload_margin", "sector_margin"])
+@pytest.mark.parametrize("key", ["obstacle_margin", "payload_margin", "sector_margin", "swing_shift"])
 def test_margins_that_keep_nothing_are_refused(key):
     given = {f"control.{key}": 0.3}
-    if key != "sector_margin":
+    if key in ("obstacle_margin", "payload_margin"):
         for seen in ("none", "ranges"):
             with pytest.raises(ConfigError, match=rf"{key}=0\.3 needs .*not env\.obstacle_sensing={seen}"):
                 ml.make_vec("navigate", **given, **{"env.obstacle_sensing": seen})
-    with pytest.raises(ConfigError, match=rf"{key}=0\.3 .*control\.action=reference clear, not those of velocity"):
+    with pytest.raises(ConfigError, match=rf"{key}=0\.3 .*control\.action=reference, not those of velocity"):
         ml.make_vec("navigate", **given, **{"control.action": "velocity"})

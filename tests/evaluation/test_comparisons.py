@@ -107,13 +107,16 @@ CASES = {  # differences of success and error: whether that is a gain, also by t
 }
 
 
+ERROR = "payload_position_error_m"
+
+
 @pytest.mark.parametrize("success, error, gain, by_means", CASES.values(), ids=CASES)
 def test_a_gain_is_in_success_first_and_then_in_the_error_of_episodes_that_end_alike(success, error, gain, by_means):
     success, error = np.array(success, float), np.array(error)
     assert is_gain(success, error) == gain
     other = {"success_rate": success < 0, "payload_position_error_m": np.full(40, 5.0)}
     policy = {"success_rate": success > 0, "payload_position_error_m": 5.0 + error}
-    assert is_better(policy, other) == gain and is_better(policy, other, beyond_noise=False) == by_means
+    assert is_better(policy, other, ERROR) == gain and is_better(policy, other, ERROR, beyond_noise=False) == by_means
 
 
 def test_a_table_has_means_and_intervals_in_its_units():

@@ -220,6 +220,7 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "control.obstacle_margin",
         "control.payload_margin",
         "control.sector_margin",
+        "control.swing_shift",
         "train.rigs",
         "env.communication",
         "env.communication_delay",
