@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float32MultiArray, Int32, Int64
 from visualization_msgs.msg import MarkerArray
 
-WAIT = 40.0  # [s] for the other side to start
+WAIT = 150.0  # [s] for the other side to start
 HEARD = {
     "/payload/odom": Odometry, "/drone_0/odom": Odometry, "/target": PoseStamped, "/drone_0/reference": PoseStamped,
     "/cables": JointState, "/markers": MarkerArray, "/drone_0/action": Float32MultiArray,
@@ -116,10 +116,13 @@ def release(node):
     spin(node, lambda: sender.get_subscription_count() > 0, 10.0)
     sender.publish(Bool(data=True))
     count = len(flown)
-    done = spin(node, lambda: len(flown) > count + 250 and target)
-    last, goal = waiting[-1].pose.pose.position, target[-1].pose.position
-    off = ((last.x - goal.x) ** 2 + (last.y - goal.y) ** 2 + (last.z - goal.z) ** 2) ** 0.5
-    return {"ready": ready, "complete": bool(done), "still": still, "off": off}
+
+    def off():
+        last, goal = waiting[-1].pose.pose.position, target[-1].pose.position
+        return ((last.x - goal.x) ** 2 + (last.y - goal.y) ** 2 + (last.z - goal.z) ** 2) ** 0.5
+
+    done = spin(node, lambda: len(flown) > count + 250 and target and off() < 0.15, 2 * WAIT)
+    return {"ready": ready, "complete": bool(done), "still": still, "off": off() if target else None}
 
 
 def pipeline(node):

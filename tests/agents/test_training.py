@@ -76,7 +76,7 @@ def test_a_few_iterations_improve_the_return(tmp_path):
     trainer = make_trainer(
         tmp_path,
         **{
-            "seed": 1, "env.num_envs": 64, "env.num_threads": 0, "env.episode_seconds": 4.0, "train.horizon": 128,
+            "seed": 1, "env.num_envs": 64, "env.num_threads": 1, "env.episode_seconds": 4.0, "train.horizon": 128,
             "train.frames": 64 * 128 * 20, "eval.episodes": 64, "train.residual": "formation", "train.overrides": {},
             "train.initial_std": 0.5, "train.learning_rate": 3e-4, "train.critic_learning_rate": None,
             "train.epochs": 4, "train.gae_lambda": 0.97, "train.hidden": [128, 128],

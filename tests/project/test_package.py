@@ -212,8 +212,8 @@ SHORTER = {  # of each script: keys that go, and what is added
     "bench/peers.py": (["cache", "repeats", "seconds", "save"], "peers=multilift_marl repeats=1 seconds=0.05"),
     "bench/randomization.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
     "bench/route_search.py": (["maps", "drones"], "maps=1 drones=2"),
-    "bench/start.py": (["repeats", "task", "num_envs"], "repeats=1 num_envs=2"),
-    "bench/soak.py": (["minutes", "iterations", "steps", "num_envs"], "minutes=0.01 iterations=8"),
+    "bench/start.py": (["repeats", "task", "num_envs", "install"], "repeats=1 num_envs=2"),
+    "bench/soak.py": (["minutes", "iterations", "steps", "num_envs"], "minutes=0.01 iterations=8 task=hover"),
     "bench/tasks.py": (["repeats", "seconds"], "repeats=1 seconds=0.02 env.num_envs=4"),
     "bench/workers.py": (["repeats", "workers"], "repeats=1 workers=0,1 env.num_envs=4 train.horizon=8"),
     "bench/training.py": (["repeats"], f"repeats=1 {SHORT} train.minibatches=2"),
@@ -265,8 +265,8 @@ def run(command, folder, monkeypatch):
 def of_documents():
     """Commands that train, those that follow one another after a training, and those that stand alone."""
     train, follow, alone = [], [], []
-    for command in sorted(set(commands())):
-        script = shorter(command)[0]
+    once = {(script, *arguments): command for command in sorted(commands()) for script, arguments in [shorter(command)]}
+    for (script, *_), command in once.items():
         if (script.endswith(".py") or script in MAINS) and script != "results/reproduce.py":  # which tests compare
             follows = script == "multilift_marl.export" or "=latest" in command or "runs/" in command
             kind = follow if follows else train if script == "train.py" else alone
