@@ -11,6 +11,8 @@ from conftest import GRAVITY, load_script, make, refusal, same, zeros
 import multilift_marl as ml
 from multilift_marl.control.disturbance import Disturbance, make_rejection
 from multilift_marl.control.gains import make_gains
+from multilift_marl.control.setpoints import track_own_state
+from multilift_marl.kernels.jit import bind, kernel_name
 
 KINDS = ("integral", "indi")
 RIGS = ("falcon4", "report4", "crazyflie2", "auto6")
@@ -173,6 +175,20 @@ def test_estimates_are_forgotten_at_a_reset_and_saved_with_the_rest(kind):
     again = make(num_envs=3, **options)
     again.reset(seed=4)
     assert all(same(vec.step(zeros(vec)), again.step(zeros(again))) for _ in range(5))
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_all_else_of_a_control_step_is_done_before_the_estimate_and_thrusts_after_it(moves):
+    named = {}
+    for kind in ("none", "integral"):
+        vec, action = make("hover", 1, 2, **{"control.disturbance": kind}), np.zeros((1, 2, 4))
+        plan = bind(track_own_state, 0, 1, vec.world.state, vec.reference, 0.0) if moves else None
+        _, calls = vec.controller.bind(0, 1, action, vec.task.goal, plan)
+        named[kind] = [kernel_name(call) for call in calls]
+    before, thrusts = named["none"][:-1], named["none"][-1]
+    assert len(before) == (4 if moves else 1)
+    assert named["integral"][:-2] == before and named["integral"][-1] == thrusts
+    assert named["integral"][-2] not in named["none"]
 
 
 def test_without_rejection_nothing_is_kept():

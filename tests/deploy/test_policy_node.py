@@ -61,6 +61,25 @@ def test_a_measured_team_observes_what_the_simulated_one_does(task):
             np.testing.assert_allclose(array, getattr(vec.reference, name), atol=1e-9, err_msg=name)
 
 
+def test_rotors_that_nobody_measures_close_their_gap_by_the_motors_lags():
+    lags = {"vehicle.rotor_time_constant_up": [0.03, 0.06], "vehicle.rotor_time_constant_down": [0.05, 0.1]}
+    config = config_of(**lags)
+    vec, team = MultiliftVec(config, EVALUATION), MeasuredTeam(config)
+    vec.reset(seed=7)
+    team.begin(measure(vec), 7)
+    speed, vehicles = team.world.state.rotor_speed, config.system.vehicles
+    team.command(np.zeros((1, 2, 4)))
+    for start in (100.0, 3000.0):  # both far from any that carries it
+        speed[:] = start
+        team.advance()
+        for n, vehicle in enumerate(vehicles):
+            asked = np.sqrt(team.world.thrust[0, n] / vehicle.thrust_coefficient)
+            assert ((asked > start) == (start == 100.0)).all()
+            lag = vehicle.rotor_time_constant_up if start == 100.0 else vehicle.rotor_time_constant_down
+            expected = asked + (start - asked) * np.exp(-team.task.control_dt / lag)
+            np.testing.assert_allclose(speed[0, n], expected, rtol=1e-12)
+
+
 def test_a_measured_team_simulates_neither_noise_nor_delay():
     config = config_of(**{"randomization.observation_noise": 1.0, "randomization.action_delay": [2, 2]})
     vec, team = MultiliftVec(build_config(config.model_dump(), {}), EVALUATION), MeasuredTeam(config)

@@ -24,6 +24,9 @@ def test_default_starts_are_as_documented():
     tilt = np.rad2deg(np.arccos(np.clip(state.drone_rotation[..., 2, 2], -1, 1)))
     assert tilt.max() <= 90 + 1e-9 and tilt.max() > 80
     assert np.rad2deg(vec.task.errors.angle).max() <= 90
+    # The payload is tilted half as far, about an axis of its own.
+    payload = np.rad2deg(np.arccos(np.clip(state.payload_rotation[:, 2, 2], -1, 1)))
+    assert 40 < payload.max() <= 45 + 1e-9
     for speed in (np.linalg.norm(state.drone_velocity, axis=-1), np.linalg.norm(state.payload_velocity, axis=-1)):
         assert 0.9 < speed.max() <= 1
     anchors = state.payload_position[:, None] + np.einsum("eij,nj->eni", state.payload_rotation, system.anchors)
