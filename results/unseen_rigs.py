@@ -1,23 +1,22 @@
 """The shipped policy of `hover`, trained on one rig, and baselines on rigs that it has not seen, on the same episodes.
 
-  python results/unseen_rigs.py [episodes=20]     all rigs -> results/hover/unseen_rigs.json (fewer episodes: not kept)
+  python results/unseen_rigs.py [episodes=20]     all rigs -> docs/data/unseen_rigs.csv (fewer episodes: not kept)
 
 The policy was trained with four falcons, cables of equal length and a plate of 1.2 kg. A hidden mass (± 20 %) and force
-(to 0.12 of the payload's weight) are drawn on every rig. `python results/reproduce.py table` writes the table.
+(to 0.12 of the payload's weight) are drawn on every rig.
 """
 
 from __future__ import annotations
 
-import json
+import csv
 import sys
 import tempfile
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flights import HERE
+from flights import ROOT
 
-from multilift_marl._files import write_whole
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.config.load import load_config
 from multilift_marl.evaluation.metrics import bootstrap
@@ -26,6 +25,7 @@ from multilift_marl.evaluation.suites import list_shifts
 from multilift_marl.policies.baselines import make_scripted
 
 EPISODES, SEED = 250, 2000
+TABLE = ROOT / "docs" / "data" / "unseen_rigs.csv"
 BASELINES = ("formation", "formation_integral", "formation_feedback", "payload_geometric")
 L_SHAPE = [(0, 0), (0.9, 0), (0.9, 0.3), (0.3, 0.3), (0.3, 0.7), (0, 0.7)]  # [m] counter-clockwise, 0.1 m thick
 
@@ -53,18 +53,24 @@ def write_prism(path: Path, outline: list[tuple[float, float]], height: float) -
     path.write_text("\n".join(lines) + "\n")
 
 
-def evaluate(overrides: dict[str, Any], episodes: int) -> dict[str, Any]:
-    """Return success and error [m] of the policy and of each baseline, and the policy's interval of the error."""
+def evaluate(rig: str, overrides: dict[str, Any], episodes: int) -> list[dict[str, str]]:
+    """Return a row for the policy and one for each baseline."""
     mass = overrides.get("payload.mass", 1.2)
     config = load_config("hover", overrides | {"randomization.payload_force": 0.12 * 9.81 * mass})
-    row: dict[str, Any] = {}
+    rows = []
     makers = {"learned": load_policy("hover").bind} | {name: partial(make_scripted, name) for name in BASELINES}
     for name, maker in makers.items():
         flown = run_episodes(config, maker, episodes, SEED)
         error = flown["payload_position_error_m"]
-        row[name] = {"success": float(flown["success_rate"].mean()), "error": float(error.mean())}
-        row[name]["error_ci95"] = [float(bound) for bound in bootstrap(error)]
-    return row
+        low, high = bootstrap(error)
+        row = {"rig": rig, "team": name, "episodes": str(episodes)}
+        row |= {
+            "success_percent": f"{100 * flown['success_rate'].mean():.1f}",
+            "position_error_cm": f"{100 * error.mean():.2f}",
+        }
+        rows.append(row | {"position_error_ci95_cm": f"{100 * low:.2f}-{100 * high:.2f}"})
+        print(" ".join(f"{key}={value}" for key, value in rows[-1].items()), flush=True)
+    return rows
 
 
 def main(episodes: int = EPISODES) -> None:
@@ -75,11 +81,12 @@ def main(episodes: int = EPISODES) -> None:
         rows = []
         for title, overrides in RIGS.items():
             own = overrides | ({"payload.mesh": str(mesh)} if overrides.get("payload.shape") == "mesh" else {})
-            rows.append({"rig": title} | evaluate(own, episodes))
-            print(json.dumps(rows[-1]), flush=True)
+            rows += evaluate(title, own, episodes)
     if episodes == EPISODES:
-        content = {"episodes": episodes, "seed": SEED, "rows": rows}
-        write_whole(HERE / "hover" / "unseen_rigs.json", f"{json.dumps(content, indent=1)}\n".encode())
+        with open(TABLE, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 if __name__ == "__main__":

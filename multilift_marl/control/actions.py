@@ -259,6 +259,7 @@ def _command_acc_rates(lo, hi, action, team, max_acceleration, max_tilt_rate):
         for n in range(action.shape[1]):
             put(reference.acceleration[e, n], in_world(e, n, action, goal, max_acceleration))
             asked = (max_tilt_rate * action[e, n, 3], max_tilt_rate * action[e, n, 4], 0.0)
+            # By the yaw that the reference has now, not by the one commanded below.
             put(team.setpoint.rates[e, n], from_slot_body(asked, reference.yaw[e, n], goal.slot_frame[e, n]))
             reference.command_yaw[e, n] = goal.drone_yaw[e] + team.gains.heading[n]
 
@@ -301,6 +302,7 @@ def _command_moments(lo, hi, action, team, max_angular_acceleration):
             team.setpoint.thrust[e, n] = total
             asked = scale(max_angular_acceleration, (action[e, n, 1], action[e, n, 2], action[e, n, 3]))
             asked = from_slot_body(asked, heading(attitude), team.goal.slot_frame[e, n])
+            # No term ω × J ω: the policy commands what turns a drone that does not turn yet.
             moment = (d.inertia[0] * asked[0], d.inertia[1] * asked[1], d.inertia[2] * asked[2])
             moment = add(moment, hook_moment(n, attitude, cable, (0.0, 0.0, 0.0), g))
             rotors = allocate(total, moment, d.allocation, d.thrust_min, d.thrust_max)

@@ -109,6 +109,7 @@ def keep_clear(lo, hi, team, margins, smoothing):
     """
     goal, command, around = team.goal, team.reference.command, team.around
     for e in range(lo, hi):
+        # References are smoothed beside a goal that moves: a command is kept where its reference will come to be.
         lead = scale(LAG / smoothing.frequency, row(goal.velocity, e))
         for n in range(command.shape[1]):
             place, load = vec(team.state.drone_position, e, n), min(n, around.payload_position.shape[1] - 1)
@@ -116,6 +117,7 @@ def keep_clear(lo, hi, team, margins, smoothing):
             yaw = heading(mat(around.payload_rotation, e, load))
             c, s = cos(yaw), sin(yaw)
             way = sub(add(vec(command, e, n), lead), place)
+            # Projections in turn converge to a point of all half-spaces, if there is one (Bregman 1965).
             for _ in range(SWEEPS):
                 for j in range(around.points.shape[2]):
                     point = vec(around.points[e], n, j)
@@ -125,6 +127,7 @@ def keep_clear(lo, hi, team, margins, smoothing):
                         level = abs(away[2]) < BESIDE * distance
                         way = _stay_beyond(way, (away[0], away[1], 0.0) if level else away, margins.drone)
                     if margins.payload > 0.0 and -away[2] < STEEP * distance:
+                        # The payload moves as its drone's set-point does: the team's formation is kept.
                         beside = sub(payload, point)
                         way = _stay_beyond(way, (beside[0], beside[1], 0.0), margins.payload)
                 if margins.sector > 0.0:

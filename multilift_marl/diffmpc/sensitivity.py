@@ -203,6 +203,8 @@ def pull_plan_back(t, e, slope, h, objective, tape, w, gradient):
     weights, end, rate = objective
     nu, size, steps = slope.shape[0], weights.shape[0], tape.gain.shape[2]
     f, factor, moved = size - nu, tape.factor[t, e], w.force
+    # By the implicit function theorem the plan answers to its cost as the linear-quadratic problem about it does: its
+    # first input moves by -H⁻¹ slope, with H the factorised Hessian of the first step, the rest by the gains.
     solve_factorised(factor, slope.reshape((nu, 1)), nu, 1)
     moved[:] = 0.0
     for k in range(steps):
@@ -224,6 +226,7 @@ def pull_plan_back(t, e, slope, h, objective, tape, w, gradient):
                 by, gained = tape.tension_slope[t, e, k, n], 0.0
                 for i in range(size):
                     gained += by[i] * moved[i]
+                # A tension counts in the middle of its step, where half of the change of thrust has come.
                 for i in range(nu):
                     gained += 0.5 * h * by[f + i] * slope[i]
                 gradient.tension[t, e, n] += pushing * gained
@@ -276,6 +279,7 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
         for i in range(size):
             costate[i] = costs[e, steps, i]
         for t in range(steps - 1, -1, -1):
+            # An episode has ended here: what comes after owes nothing to what was before.
             if tape.cut[t, e]:
                 by_input[:] = 0.0
                 for i in range(size):
@@ -285,6 +289,7 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
             one = Problem(states, inputs, dt, model, tape.loads[e, t : t + 1], objective, around)
             linearise(0, states, inputs, one, w)
             pull_back(0, costate, before, q, size, dt, w)
+            # A command arrives some steps late; what it changes is known, as the flight is gone through backwards.
             arrives = t + tape.late[t, e]
             for i in range(nu):
                 by_input[t, i] = 0.5 * dt * (before[f + i] + costate[f + i])

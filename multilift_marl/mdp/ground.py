@@ -67,6 +67,7 @@ def resting_distance(system: System, spread: float) -> np.ndarray:
     distance = np.maximum(np.hypot(system.slots[:, 0], system.slots[:, 1]), least)
     place = distance[:, None] * np.stack([np.cos(system.slot_azimuth), np.sin(system.slot_azimuth)], axis=1)
     level = np.hypot(*(place - system.anchors[:, :2]).T) + spread
+    # From the anchor on the lying payload to the drone that stands: across, and down or up.
     reach = np.hypot(level, ground.payload + system.anchors[:, 2] - ground.drone) / system.cable_length
     if np.any(reach > _SLACK_REACH):
         i = int(reach.argmax())
@@ -137,6 +138,7 @@ def scale_cable_force(e, n, v, fraction, cable_weight):
     """
     goal, rig = v.goal, v.rig
     cable_force = scale(fraction, vec(goal.cable_force, e, n))
+    # The mass that a nominal cable force lifts, times the slot's acceleration.
     idle = scale(-rig.force[n, 2] / GRAVITY, vec(goal.slot_acceleration, e, n))
     carried = (0.0, 0.0, 0.5 * (1.0 - fraction) * cable_weight[n])
     put(goal.cable_force[e, n], add(add(cable_force, idle), carried))

@@ -97,6 +97,7 @@ def smooth_knots(knots: np.ndarray, band: Band) -> np.ndarray:
     works = [make_work(knots, band) for _ in range(2)]
     fixed = len(knots) - 2
     cost = assemble(knots, band, works[0])
+    # Levenberg-Marquardt: a trial that costs more is dropped, and the next step is shorter and steeper.
     damping = 1e-3
     for _ in range(ITERATIONS):
         change = np.zeros_like(knots)
@@ -152,6 +153,8 @@ def assemble(knots, band, w):
                 else:
                     value = knots[k + 2, i] - 2.0 * knots[k + 1, i] + knots[k, i]
                 cost += 0.5 * pull * value * value
+                # The coefficients of a difference, -1, 1 or 1, -2, 1, are its derivatives by the knots. The first and
+                # the last knot stay, and have no unknowns. Rows of the Hessian go from the diagonal to the left.
                 for a in range(order + 1):
                     p = k + a
                     share = (2.0 * a - 1.0) if order == 1 else (1.0 - 3.0 * (a % 2))
@@ -179,6 +182,7 @@ def assemble(knots, band, w):
         for i in range(size):
             low, high, pull = 0.0, 1.0, SAFETY * h * RELAX
             value = knots[k, i]
+            # Positions stay in the payload's space, yaw is free, a mode is between 0 and 1 and drawn to 0: at rest.
             if i < 3:
                 low, high, pull = band.space[0, i], band.space[1, i], SAFETY * h
             elif i == 3:
@@ -213,6 +217,7 @@ def _keep_shape(knot, first, band, w):
         put(w.arms[n], scale(body.length[n], u))
         for j in range(modes):
             m = (body.modes[j, n, 0], body.modes[j, n, 1], body.modes[j, n, 2])
+            # d(f/|f|) = (1 - u uᵀ) df / |f|: the cable turns, its length stays.
             put(w.slope[j, n], scale(body.length[n] / size, sub(m, scale(dot(u, m), u))))
     if modes == 0:
         return 0.0
@@ -272,7 +277,7 @@ def _set_row(normal, offset, n, share, c, s, w):
     """Write the derivative of a distance: of a point at an offset from the payload, at a share of cable n if any."""
     for i in range(3):
         w.row[i] = normal[i]
-    w.row[3] = normal[1] * offset[0] - normal[0] * offset[1]
+    w.row[3] = normal[1] * offset[0] - normal[0] * offset[1]  # normal · (ẑ × offset), by yaw
     for j in range(w.slope.shape[0]):
         w.row[4 + j] = 0.0
         if n >= 0:

@@ -104,6 +104,8 @@ def segment_clearance(kind, size, a, b, enough):
     along = sub(b, a)
     left, here = local_distance(kind, size, a)
     down = dot(here, along)
+    # The distance is convex along the segment: where it does not fall at the first end, nothing is nearer; where its
+    # tangent is still far at the other end, all is.
     if down >= 0.0 or left + down >= enough:
         return (left, here, 0.0) if down >= 0.0 else (left + down, here, 0.0)
     right, there = local_distance(kind, size, b)
@@ -112,6 +114,7 @@ def segment_clearance(kind, size, a, b, enough):
         return right, there, 1.0
     low, high = 0.0, 1.0
     for _ in range(_ITERATIONS):
+        # Where the two tangents meet: left + down (s - low) = right + up (s - high).
         share = (left - right + up * high - down * low) / (up - down)
         share = min(max(share, low), high)
         bound = left + down * (share - low)
@@ -119,6 +122,7 @@ def segment_clearance(kind, size, a, b, enough):
             return (bound, here, low) if left < right else (bound, there, high)
         value, normal = local_distance(kind, size, add(a, scale(share, along)))
         slope = dot(normal, along)
+        # The least distance stays between a point where it falls and one where it rises.
         if slope < 0.0:
             left, down, low, here = value, slope, share, normal
         else:
@@ -144,12 +148,14 @@ def box_clearance(kind, size, middle, axes, half, enough):
     for _ in range(_ITERATIONS):
         far, n = local_distance(kind, size, x)
         local = tmul(axes, n)
+        # d(z) ≥ d(x) + n · (z - x) for all z of the box; the box reaches `reach` beyond its middle towards -n.
         reach = abs(local[0]) * half[0] + abs(local[1]) * half[1] + abs(local[2]) * half[2]
         bound = far + dot(n, sub(middle, x)) - reach
         if bound > best:
             best, normal, point = bound, n, x
         if best >= enough or far - best < TOLERANCE or far <= 0.0:
             break
+        # The obstacle's nearest point to x, and the box's nearest point to that.
         back = tmul(axes, sub(sub(x, scale(far, n)), middle))
         inside = (
             min(max(back[0], -half[0]), half[0]),
@@ -259,6 +265,7 @@ def team_clearance(place, arms, body, scene, reach, enough):
     here, c, s = (place[0], place[1], place[2]), cos(place[3]), sin(place[3])
     least = enough
     for m in range(scene.kind.shape[0]):
+        # Most obstacles are farther than the team's own sphere reaches.
         far = local_distance(scene.kind[m], scene.size[m], local_point(scene, m, here))[0]
         if far > reach + least:
             continue

@@ -64,6 +64,7 @@ def solve_team(start, path, task, m, settings, w, residual):
     status, iterations = STOPPED if np.isfinite(cost) else NOT_FINITE, 0
     while status == STOPPED:
         merit = cost + set_push(rho, m)
+        # The step of Newton's method for these multipliers; the last damping is where the next search for one begins.
         exact, damping, steepest, slope = _find_convex_step(iterations < EARLY, damped, path, task, m, w)
         if damping > 0.0:
             damped = damping
@@ -83,9 +84,11 @@ def solve_team(start, path, task, m, settings, w, residual):
             status = STALLED
             break
         _take_trial(path, m, w)
+        # Near the minimum for these multipliers; earlier updates would chase a plan that is still far from it.
         if length == 1.0 and -slope < NEAR:
             _update(rho, m)
             last, excess = excess, _exceed(m)[0]
+            # Multipliers alone should halve what is exceeded; where they do not, limits get stiffer.
             if 0.5 * last < excess < 0.01:
                 rho = min(4.0 * rho, LARGEST_PENALTY)
     if (status == STOPPED or status == STALLED) and residual[1] > EXCEEDED:
@@ -113,6 +116,7 @@ def _begin(start, path, task, m, w):
 def _hold(start, path, task, w):
     """Write the trajectory of steady thrusts to the trial, and return its cost."""
     inputs = path.inputs
+    # `follow` adds gains and changes to the inputs of the path: these cancel them.
     w.iteration.gain[:] = 0.0
     for k in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
@@ -126,6 +130,7 @@ def _find_convex_step(early, damped, path, task, m, w):
     convex, steepest, slope = find_step(path, task, m, True, 0.0, w)
     if convex:
         return True, 0.0, steepest, slope
+    # Less than what was enough before, so that damping falls again where less will do.
     damping = max(DAMPING, 0.3 * damped)
     for _ in range(0 if early else DAMPING_TRIALS):
         convex, steepest, slope = find_step(path, task, m, True, damping, w)
@@ -146,6 +151,7 @@ def _search(start, path, line, task, m, w):
     length = 1.0
     while length >= SHORTEST:
         cost = follow(start, path, length, task, w)
+        # The last part is round-off, which near a minimum exceeds what a step can gain.
         if cost + penalty(w.values, m.dual, rho) <= merit + 1e-4 * length * slope + 1e-12 * abs(merit):
             return length, cost
         length *= 0.5

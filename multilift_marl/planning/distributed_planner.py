@@ -130,6 +130,7 @@ class DistributedPlanner(TeamPlanner):
         """Say loads (E N, 7) as each drone estimates them, and return the means of its own and those it has heard."""
         post, n = self.post, self.post.loads.shape[1]
         own = loads.reshape(-1, n, 7)
+        # What was heard in an earlier episode is of another payload.
         begins = self.plans.fresh[::n]
         post.has_loads[begins] = False
         now = np.where(begins, 0, post.steps) % post.sent.shape[1]
@@ -165,6 +166,7 @@ def set_others(n, states, inputs, h, model, load, work):
             if m == n:
                 continue
             pull_payload(work.middle, m, 6 + 2 * count, model, work.team)
+            # To the payload a drone on a taut cable is a force and, along that cable, its mass: m a aᵀ with the arm a.
             arm = work.team.arm[m]
             for i in range(6):
                 into[7 + i] += arm[i] * work.team.pull[m]
@@ -182,6 +184,7 @@ def place_others(n, states, model, separation, work):
             if m == n:
                 continue
             pull_payload(states[k], m, 6 + 2 * count, model, work.team)
+            # Rows of the others alone: those after the own one move up.
             at, rotation = work.others[k, m - (m > n)], work.team.rotation
             for i in range(3):
                 arm = 0.0
@@ -270,18 +273,21 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
         now = post.steps[e]
         if links.delay > 0 and now >= links.delay:
             hear(e, (now - links.delay) % kept, later, links, post, plans, h)
+        # Momentum is of the sweeps of one policy step.
         apart.change[:] = 0.0
         apart.input_change[:] = 0.0
         for sweep in range(sweeps):
             for n in range(count):
                 t = first + n
                 states, inputs = plans.states[t], plans.inputs[t]
+                # The drone knows the payload and itself as they are, the others as they said they would be.
                 set_start(n, given[0][t], states, begins)
                 follow_load(states, inputs, h, flat.model, given[1][t], apart.team, work.before[0])
                 loads = given[1][t : t + 1]
                 own = weigh(t, weights, objective)
                 problem = Problem(apart.all_targets[n], apart.all_asked[n], h, flat.model, loads, own, here)
                 improve_own(n, states[0], states, inputs, problem, apart)
+                # All move at once, each as if the others stayed: a whole step of all would overshoot N times.
                 move_own(n, states, inputs, 1.0 / count, MOMENTUM * (sweep > 0), apart)
                 for k in range(states.shape[0]):
                     for i in range(SAID):

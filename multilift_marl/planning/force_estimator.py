@@ -154,7 +154,7 @@ def update_forces(states, dt, known, model, priors, estimate, work):
         if estimate.fresh[e]:
             estimate.fresh[e], estimate.stale[e] = False, True
             estimate.unknowns[e] = 0.0
-            p[:] = 0.0
+            p[:] = 0.0  # what is first thought of one unknown says nothing of the others
             for i in range(p.shape[0]):
                 p[i, i] = own.first[i]
         if not estimate.stale[e] and known[e]:
@@ -179,6 +179,7 @@ def _find_effects(x, before, dt, unknowns, model, priors, work):
     accelerations(middle, model, load, w)
     for i in range(q):
         missing[i] = w.acceleration[i]
+    # Accelerations are almost linear in the unknowns: one-sided differences will do.
     for k in range(unknowns.shape[0]):
         step = _STEP * priors.scale[k]
         changed, at = (load, k) if k < PAYLOAD else (middle, 2 * q + k - PAYLOAD)
@@ -198,6 +199,7 @@ def _correct(unknowns, p, priors, work):
     count, gain = unknowns.shape[0], work.gain
     for m in range(work.missing.shape[0]):
         h, wrong, total = work.effect[m], work.missing[m], priors.noise[m]
+        # Kalman's update by a scalar: gain P h / (hᵀ P h + r), then P - P h hᵀ P / (hᵀ P h + r).
         for k in range(count):
             gain[k] = 0.0
             for j in range(count):

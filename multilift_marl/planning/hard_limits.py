@@ -98,6 +98,8 @@ def add_limits(x, push, stiffness, exact, task, w, costate):
         most, least, tilt = unit * push[count + n], unit * push[2 * count + n], unit * push[3 * count + n]
         stiff = unit * unit * (stiffness[count + n] + stiffness[2 * count + n])
         upright = unit * unit * stiffness[3 * count + n]
+        # The gradients are -e of the largest thrust, e of the least, ẑ - upright e of the tilt, with e = f/|f|; the
+        # curvature of |f| is (1 - e eᵀ)/|f|. That of the least thrust is negative: it is left out unless exact.
         along = most - least + limits.upright * tilt  # by which the limits push against the thrust
         curved = along + (0.0 if exact else least)
         for i in range(3):
@@ -144,6 +146,7 @@ def _add_pair(pair, weights, exact, x, model, w, costate):
             second, r = _slope(j, n, o, s, t, w)
             other = dot(e, r)
             w.value[first, second] += stiff * slope * other
+            # A distance |a| has the second derivatives (p · r - (e · p)(e · r))/|a|, and those of a along e below.
             if exact:
                 w.value[first, second] -= z / distance * (dot(p, r) - slope * other)
     if exact:

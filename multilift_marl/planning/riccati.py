@@ -156,6 +156,7 @@ def _to_start(row, middle, q, size, half, euler):
     """Write derivatives by the state at the start of a step, from those by the state in its middle."""
     for i in range(size):
         row[i] = middle[i]
+    # The middle is half a step of the velocities on: x + h/2 v, and for the angles h/2 T ω.
     for i in range(q):
         row[q + i] += half * middle[i]
     e0, e1, e2 = middle[3], middle[4], middle[5]
@@ -193,6 +194,8 @@ def recur(k, states, inputs, problem, damping, w):
     pull_back(k, force, linear, q, size, h, w)
     right, curvature = w.right, w.input
     for i in range(nu):
+        # An input adds h to its thrust at the end and, on average, half of that within the step: B is h times the mean
+        # of A's columns by thrust and of unit vectors.
         right[i, size] = 0.5 * h * (linear[f + i] + force[f + i])
         for j in range(size):
             right[i, j] = 0.5 * h * (quadratic[f + i, j] + moved[f + i, j])
@@ -214,6 +217,7 @@ def recur(k, states, inputs, problem, damping, w):
     add_neighbours(k, q, problem, w)
     add_clearances(k, states[k], q, problem, w)
 
+    # V ← Q_xx - Q_ux' Q_uu⁻¹ Q_ux, whose parts are kept while `right` becomes Q_uu⁻¹ (Q_ux, Q_u).
     factorise(curvature, nu)
     for i in range(nu):
         for j in range(size):
@@ -334,6 +338,7 @@ def take_step(start, states, inputs, problem, w):
         states, inputs: of the trajectory, overwritten.
         problem, w: see `recur`.
     """
+    # The gap, which a linearised step leaves between what it leads to and the next state, closes along the way.
     size, moved = states.shape[1], w.force  # deviation of the present state
     for i in range(size):
         moved[i] = start[i] - states[0, i]

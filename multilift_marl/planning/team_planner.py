@@ -199,6 +199,7 @@ def prepare_team(e, given, times, flat, plans, work):
     for k in range(steps + 1):
         at = min(k, shape.shape[0] - 1)
         set_flat_state(positions[e, k], rotations[e, k], shape[at], starts[e, 5], loads[e], flat, work.flat, targets[k])
+    # Numbers of a state: 6 of the payload's pose, 2 N of the cables' directions, their rates, then 3 N of thrust.
     q = 6 + 2 * (nu // 3)
     for k in range(steps + 1):
         for i in range(6):
@@ -210,6 +211,7 @@ def prepare_team(e, given, times, flat, plans, work):
     if plans.fresh[e]:
         take_targets(states, inputs, targets, asked)
         return
+    # Inputs are rates of thrust: those of the guess follow from its states.
     _move_on(states, plans.targets[e], targets, elapsed / h, work.before)
     for k in range(steps):
         for i in range(nu):
@@ -246,6 +248,7 @@ def take_targets(states, inputs, targets, asked):
 @kernel
 def is_finite(states, inputs):
     """Return whether a plan is finite."""
+    # One number that is not finite makes the sum so; inputs after the first show in the states.
     total = 0.0
     for k in range(states.shape[0]):
         for i in range(states.shape[1]):

@@ -169,6 +169,7 @@ def measure_way(e, v):
     """Add to the length of the payload's way; count leaving the map as a failure."""
     here = row(v.state.payload_position, e)
     moved = norm(sub(here, row(v.own.place, e)))
+    # At the first check, of the reset, no way has been made.
     v.own.travelled[e] = v.own.travelled[e] + moved if v.time[e] > 0.0 else 0.0
     put(v.own.place[e], here)
     for i in range(3):
@@ -205,6 +206,7 @@ def given_map(option: NavigateOptions, system: System, obstacles: Obstacles) -> 
         raise ConfigError("task_options.level=given needs task_options.start and task_options.goal, x, y, z [m] each")
     start, goal = np.array(option.start), np.array(option.goal)
     used = obstacles.kind[0] != NONE
+    # Spheres about them, whatever way they are turned.
     far = np.linalg.norm(obstacles.size[0, used], axis=1, keepdims=True)
     points = np.vstack([start, goal, obstacles.center[0, used] - far, obstacles.center[0, used] + far])
     low = points.min(axis=0) - ROOM if option.low is None else np.array(option.low)
@@ -298,6 +300,7 @@ class Navigate(Task):
         way = self.own.goal - self.own.start
         duration = PEAK * np.linalg.norm(way, axis=1, keepdims=True) / self.settings.speed
         s = np.clip(times / duration, 0.0, 1.0)
+        # `math3d.ease` of whole arrays: rest to rest, smooth to the third derivative.
         share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
         position = self.own.start[:, None] + share[..., None] * way[:, None]
         return position, np.broadcast_to(np.eye(3), (*times.shape, 3, 3))

@@ -98,6 +98,7 @@ def change_team(e, v):
     event = own.event[e]
     if event < own.when.shape[1] and v.time[e] >= own.when[e, event]:
         who = own.who[e, event]
+        # The time is a sum of steps, whose round-off must not decide.
         own.held[e, event] = v.good_time[e] >= v.settings.seconds - 1e-9
         own.waiting[e, who] = own.joins[e, event]
         own.attached[e, who] = False  # who is to join is not attached either
@@ -119,6 +120,7 @@ def change_team(e, v):
         own.slack[e, n] += change
         goal.slots[e, n, 2] -= own.slack[e, n]
         goal.slot_velocity[e, n, 2] = -change / v.control_dt
+        # What is fed forward comes and goes with the slot.
         put(goal.cable_force[e, n], scale(1.0 - own.slack[e, n] / lowered, vec(goal.cable_force, e, n)))
     update_peak_tension(e, v, own.peak_tension)
 
@@ -208,6 +210,7 @@ class Regroup(Task):
         absent = int(rng.integers(n)) if rng.random() < option.absent else None
         if absent is not None:
             self._detach(env, absent)
+        # One drone at most is away at a time: after one has left, the next event is that it joins again.
         for k, earliest in enumerate(option.events):
             own.when[env, k] = earliest + rng.uniform(0.0, option.event_spread)
             own.joins[env, k] = absent is not None
