@@ -204,7 +204,9 @@ def test_a_tumbling_body_turns_as_eulers_equations_say(body):
     assert np.rad2deg(off) < 3.0  # was 30 to 40 degrees
 
 
-def test_a_payload_that_tumbles_about_a_shifted_centre_of_mass_keeps_its_energy():
+@pytest.mark.parametrize("force", [(0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (0.0, -5.0, 0.0), (3.0, -5.0, 4.0)])
+def test_a_payload_that_tumbles_about_a_shifted_centre_of_mass_keeps_its_energy(force):
+    """Also where a force acts at the centre of mass, which turns nothing."""
     world = free_world(**{"randomization.payload_center_of_mass": [0.05, 0.05, 0.05]})
     center = np.array([0.03, -0.02, 0.01])
     world.set_parameters(np.ones(1, bool), payload_center_of_mass=center[None])
@@ -214,6 +216,7 @@ def test_a_payload_that_tumbles_about_a_shifted_centre_of_mass_keeps_its_energy(
     state.payload_body_rates[0] = OBLIQUE
     state.payload_velocity[0] = -np.cross(OBLIQUE, center)
     load(world)
+    world.hidden_loads.payload_force[0] = force
     world.step(np.zeros((1, 1, 4)), 250)
     after = float(moments @ state.payload_body_rates[0] ** 2)
     assert after == pytest.approx(float(moments @ OBLIQUE**2), rel=2e-4)
