@@ -245,7 +245,8 @@ def _describe_action(policy: LearnedPolicy) -> dict[str, Any]:
         numbers.append({"name": name, "frame": frame, "unit": unit, "meaning": meaning, **scale})
     margins = Margins.of(control)
     kept = {"margins": margins._asdict()} if any(margins) else {}
-    return kept | {
+    swing = {"swing_shift": control.swing_shift} if control.swing_shift else {}
+    return kept | swing | {
         "interface": control.action,
         "shape": ["batch", "drones", len(numbers)],
         "dtype": "float32",

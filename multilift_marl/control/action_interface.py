@@ -85,7 +85,7 @@ class ControlContext(NamedTuple):
     """(E, N, 4) rotor thrusts, written [N]."""
     gains: Gains
     around: Surroundings | None = None
-    """What drones know of it; None where no set-point is kept clear."""
+    """What drones know of it; None: no set-point is moved by it."""
 
 
 class Interface:

@@ -66,7 +66,7 @@ class ReferenceAction(Interface):
     def set_action(self, lo: int, hi: int, action: np.ndarray, team: ControlContext) -> Call:
         """See `Interface.set_action`."""
         ranges = (self.settings.max_offset, self.settings.max_yaw)
-        if shift := self.settings.swing_shift:
+        if (shift := self.settings.swing_shift) and team.around is not None:
             return bind(_command_offset_with_swing, lo, hi, action, team, *ranges, shift)
         return bind(_command_offset, lo, hi, action, team, *ranges)
 

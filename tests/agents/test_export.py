@@ -341,3 +341,8 @@ def test_a_contract_says_what_margins_the_drones_keep_beside_the_network():
     told = make_contract(policy("navigate_senses", **{"train.observe": None}))["action"]
     assert told["margins"] == {"drone": 0.4, "payload": 0.5, "sector": 0.1}
     assert "margins" not in make_contract(policy())["action"]
+
+
+def test_a_contract_says_by_how_much_set_points_move_with_the_swing():
+    told = make_contract(policy(**{"env.num_drones": 2, "control.swing_shift": 0.06}))["action"]
+    assert told["swing_shift"] == 0.06 and "swing_shift" not in make_contract(policy())["action"]
