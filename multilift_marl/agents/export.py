@@ -246,13 +246,17 @@ def _describe_action(policy: LearnedPolicy) -> dict[str, Any]:
     margins = Margins.of(control)
     kept = {"margins": margins._asdict()} if any(margins) else {}
     swing = {"swing_shift": control.swing_shift} if control.swing_shift else {}
-    return kept | swing | {
-        "interface": control.action,
-        "shape": ["batch", "drones", len(numbers)],
-        "dtype": "float32",
-        "range": [-1.0, 1.0],
-        "numbers": numbers,
-    }
+    return (
+        kept
+        | swing
+        | {
+            "interface": control.action,
+            "shape": ["batch", "drones", len(numbers)],
+            "dtype": "float32",
+            "range": [-1.0, 1.0],
+            "numbers": numbers,
+        }
+    )
 
 
 def _measure_thrusts(config: Config) -> np.ndarray:
