@@ -35,7 +35,7 @@ def fly_trial(values: dict[str, Any], recipe: str, iterations: int, folder: str)
         if trainer.iteration % EVERY == 0 or trainer.iteration == last:
             found = trainer.evaluate()
             trainer.save("last")
-            success, error = found["eval/success_rate"], found["eval/payload_position_error_m"]
+            success, error = found["eval/success_rate"], found[f"eval/{trainer.evaluator.error}"]
             tune.report({"success": success, "error": error, "score": success - error, "run": str(trainer.folder)})
     torch.save((start, weights(trainer)), trainer.folder / "weights.pt")
     trainer.rollouts.close()

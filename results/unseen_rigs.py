@@ -19,7 +19,7 @@ from flights import ROOT
 
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.config.load import load_config
-from multilift_marl.evaluation.metrics import bootstrap
+from multilift_marl.evaluation.metrics import bootstrap, wilson
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.evaluation.suites import list_shifts
 from multilift_marl.policies.baselines import make_scripted
@@ -62,10 +62,12 @@ def evaluate(rig: str, overrides: dict[str, Any], episodes: int) -> list[dict[st
     for name, maker in makers.items():
         flown = run_episodes(config, maker, episodes, SEED)
         error = flown["payload_position_error_m"]
-        low, high = bootstrap(error)
+        success, (low, high) = flown["success_rate"], bootstrap(error)
+        least, most = wilson(int(success.sum()), episodes)
         row = {"rig": rig, "team": name, "episodes": str(episodes)}
         row |= {
-            "success_percent": f"{100 * flown['success_rate'].mean():.1f}",
+            "success_percent": f"{100 * success.mean():.1f}",
+            "success_ci95": f"{100 * least:.1f}-{100 * most:.1f}",
             "position_error_cm": f"{100 * error.mean():.2f}",
         }
         rows.append(row | {"position_error_ci95_cm": f"{100 * low:.2f}-{100 * high:.2f}"})

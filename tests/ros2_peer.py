@@ -118,8 +118,10 @@ def release(node):
     count = len(flown)
 
     def off():
-        last, goal = waiting[-1].pose.pose.position, target[-1].pose.position
-        return ((last.x - goal.x) ** 2 + (last.y - goal.y) ** 2 + (last.z - goal.z) ** 2) ** 0.5
+        """Return how far the payload was from its target at most in the last 50 messages [m]."""
+        goal = target[-1].pose.position
+        places = [message.pose.pose.position for message in waiting[-50:]]
+        return max(((at.x - goal.x) ** 2 + (at.y - goal.y) ** 2 + (at.z - goal.z) ** 2) ** 0.5 for at in places)
 
     done = spin(node, lambda: len(flown) > count + 250 and target and off() < 0.15, 2 * WAIT)
     return {"ready": ready, "complete": bool(done), "still": still, "off": off() if target else None}

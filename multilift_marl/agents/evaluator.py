@@ -23,6 +23,7 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_base_policy
 from multilift_marl.policies.policy import Policy
 from multilift_marl.tasks import find_task
+from multilift_marl.tasks.base import Task
 
 _METRICS = (
     "success_rate", "payload_position_error_m", "payload_rmse_m", "payload_attitude_error_deg", "settling_time_s",
@@ -59,7 +60,7 @@ class Evaluator:
     Attributes:
         error: metric by which policies that succeed alike are compared, the task's `ERROR`.
         best: what a checkpoint holds of the policy that is kept, its `iteration`, and its `score` in its evaluation,
-            success and negative error; None before the first.
+            success and negative error, which is `compared_by`; None before the first.
         initial: the same of the policy of `train.init`, without score; None where there is none.
     """
 
@@ -83,9 +84,11 @@ class Evaluator:
         values = {f"eval/{name}": summary[name]["mean"] for name in self._metrics}
         score = [values["eval/success_rate"], -values[f"eval/{self.error}"]]
         best, keep_last = self.best, self.config.eval.keep == "last"
+        if best is not None and best.get("compared_by", Task.ERROR) != self.error:
+            best["score"] = [0.0, -np.inf]  # of a run that an older version began: fresh episodes decide
         if best is None or keep_last or (score > best["score"] and self._confirm(policy, content["iteration"])):
             weights = {name: tensor.clone() for name, tensor in content["actor"].items()}  # learning changes them
-            best = self.best = content | {"actor": weights, "score": score}
+            best = self.best = content | {"actor": weights, "score": score, "compared_by": self.error}
         return values | {
             "eval/best_iteration": float(best["iteration"]),
             "eval/seconds": time.perf_counter() - start,

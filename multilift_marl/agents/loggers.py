@@ -20,7 +20,7 @@ _SECTIONS = ("env", "control", "reward", "train")  # of the configuration that c
 _KEYS = ("task", "seed")
 _RESULTS = (  # that TensorBoard shows beside them
     "eval/success_rate", "eval/payload_position_error_m", "eval/return", "final/learned_success_rate",
-    "final/learned_payload_position_error_m", "final/gained",
+    "final/learned_payload_position_error_m", "eval/payload_rmse_m", "final/learned_payload_rmse_m", "final/gained",
 )  # fmt: skip
 
 

@@ -65,7 +65,7 @@ class Margins(NamedTuple):
 
 
 def check_margins(config: Config) -> None:
-    """Refuse, by a ConfigError, margins that keep nothing, and shifts of nothing."""
+    """Refuse, by a ConfigError, margins and shifts of set-points that are none, or of what is not seen."""
     settings, seen = config.control, config.env.obstacle_sensing
     for key in ("obstacle_margin", "payload_margin", "sector_margin", "swing_shift"):
         if not (value := getattr(settings, key)):
@@ -117,7 +117,7 @@ def keep_clear(lo, hi, team, margins, smoothing):
             yaw = heading(mat(around.payload_rotation, e, load))
             c, s = cos(yaw), sin(yaw)
             way = sub(add(vec(command, e, n), lead), place)
-            # Projections in turn converge to a point of all half-spaces, if there is one (Bregman 1965).
+            # Projections in turn tend to a point of all half-spaces, if there is one (Bregman 1965).
             for _ in range(SWEEPS):
                 for j in range(around.points.shape[2]):
                     point = vec(around.points[e], n, j)

@@ -2,10 +2,12 @@
 
 Two cables do not hold a payload about the line of their anchors: it swings, and little brings it to rest. Here both
 drones move aside, against the side to which its bottom swings, in proportion to the angle. References follow commands
-by a filter of three poles: where the payload swings about as fast as `control.reference_frequency`, the shift comes
-between a quarter and half of a period late, and so acts as damping. Of two falcons' two ways to swing it damps the
-faster, 0.92 Hz, and feeds the slower: a payload at 0.4 rad/s has 0.06 after 20 s, with 0.06 m/rad 0.01, with 0.3 m/rad
-more than before.
+late, so that the shift acts as damping.
+
+Cables and payload swing in two ways, and cables pass no tilt on at once: what damps one way takes from the other. With
+two falcons and the payload of `hover` 0.06 m/rad raises the decay rate of the faster one, 0.93 Hz, from 0.08 to
+0.20 1/s, and lowers that of the slower from 0.27 to 0.20; 0.25 feeds it. The best value depends on the rig: 0.06 harms
+with cables of 0.5 m or a box 5 cm thick. A payload that hangs tilted moves its drones aside for good.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ def pull_plan_back(t, e, slope, h, objective, tape, w, gradient):
     nu, size, steps = slope.shape[0], weights.shape[0], tape.gain.shape[2]
     f, factor, moved = size - nu, tape.factor[t, e], w.force
     # By the implicit function theorem the plan answers to its cost as the linear-quadratic problem about it does: its
-    # first input moves by -H⁻¹ slope, with H the factorised Hessian of the first step, the rest by the gains.
+    # first input moves by H⁻¹ slope, with H the factorised Hessian of the first step, the others by the gains.
     solve_factorised(factor, slope.reshape((nu, 1)), nu, 1)
     moved[:] = 0.0
     for k in range(steps):
@@ -279,7 +279,7 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
         for i in range(size):
             costate[i] = costs[e, steps, i]
         for t in range(steps - 1, -1, -1):
-            # An episode has ended here: what comes after owes nothing to what was before.
+            # An episode has ended here, or a plan failed: what comes after owes nothing to what was before.
             if tape.cut[t, e]:
                 by_input[:] = 0.0
                 for i in range(size):

@@ -64,7 +64,7 @@ def solve_team(start, path, task, m, settings, w, residual):
     status, iterations = STOPPED if np.isfinite(cost) else NOT_FINITE, 0
     while status == STOPPED:
         merit = cost + set_push(rho, m)
-        # The step of Newton's method for these multipliers; the last damping is where the next search for one begins.
+        # The step of Newton's method for these multipliers, undamped if it can be.
         exact, damping, steepest, slope = _find_convex_step(iterations < EARLY, damped, path, task, m, w)
         if damping > 0.0:
             damped = damping

@@ -338,7 +338,7 @@ def take_step(start, states, inputs, problem, w):
         states, inputs: of the trajectory, overwritten.
         problem, w: see `recur`.
     """
-    # The gap, which a linearised step leaves between what it leads to and the next state, closes along the way.
+    # The gap between what the model's own step leads to and the next state of the guess closes along the way.
     size, moved = states.shape[1], w.force  # deviation of the present state
     for i in range(size):
         moved[i] = start[i] - states[0, i]

@@ -63,7 +63,8 @@ class ControlConfig(Section):
         0.0, description="[m] that they keep from the planes halfway to the neighbours' slots; 0: none"
     )
     swing_shift: Annotated[Float, Between(0, 10, "m/rad")] = Field(
-        0.0, description="[m/rad] that they move aside against the swing of a payload on two cables; 0: none"
+        0.0,
+        description="[m/rad] that those of two drones move aside against the swing of their payload; 0: none",
     )
     position_frequency: Annotated[Float | None, Between(0.01, 1000, "rad/s")] = Field(
         4.0, gt=0, description="[rad/s] of the position loop; at most 1/5 of attitude's; None: that"

@@ -210,7 +210,7 @@ class Regroup(Task):
         absent = int(rng.integers(n)) if rng.random() < option.absent else None
         if absent is not None:
             self._detach(env, absent)
-        # One drone at most is away at a time: after one has left, the next event is that it joins again.
+        # After one drone has left, the next event is that it may join again, which it does once it reaches its cable.
         for k, earliest in enumerate(option.events):
             own.when[env, k] = earliest + rng.uniform(0.0, option.event_spread)
             own.joins[env, k] = absent is not None

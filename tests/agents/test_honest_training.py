@@ -149,6 +149,12 @@ def test_a_team_that_tracks_is_judged_by_its_error_along_the_path(tmp_path, monk
     trainer.gain = trainer.evaluator.measure_gain(2)
     assert "RMSE" in _compare(trainer) and "5.00 cm" in _compare(trainer)
     assert set(asked) == {"payload_rmse_m"}
+    # A run that an older version began: its score, of the other error, would refuse what is better.
+    old = trainer.evaluator.best
+    del old["compared_by"]
+    old["score"] = [1.0, -0.001]
+    trainer.iteration = 2
+    assert trainer.evaluator.evaluate(trainer._content())["eval/best_iteration"] == 2
 
 
 def test_one_lost_payload_on_each_side_does_not_hide_a_smaller_error():

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import make, same, zeros
+from conftest import load, make, same, zeros
 from scipy.spatial.transform import Rotation
 
 from multilift_marl.control.formation import Reference
@@ -50,6 +50,23 @@ def test_the_line_is_that_of_all_anchors(anchors, line):
     np.testing.assert_allclose(anchor_line(np.array(anchors)), line, atol=1e-12)
 
 
+def test_on_a_course_commands_move_as_drones_know_the_payload():
+    """Where the goal moves, commands are made anew in each control step."""
+    keys = {"control.obstacle_margin": 0.0, "control.payload_margin": 0.0, "control.sector_margin": 0.0}
+    vec = make("navigate_senses", 1, 2, **keys, **{"control.swing_shift": 0.5})
+    vec.reset(seed=0)
+    state = vec.world.state
+    for angle in (0.3, -0.2):
+        state.payload_rotation[0] = Rotation.from_rotvec(angle * anchor_line(vec.world.system.anchors)).as_matrix()
+        state.payload_body_rates[0] = 0.0
+        load(vec.world)
+        vec.step(zeros(vec))
+        bottom = -state.payload_rotation[0, :, 2]
+        assert abs(bottom[1]) > 0.05
+        shifted = vec.reference.command[0] - vec.task.goal.slots[0]
+        np.testing.assert_allclose(shifted, np.tile(-0.5 * bottom * [1.0, 1.0, 0.0], (2, 1)), atol=0.02)
+
+
 def swung(shift: float) -> np.ndarray:
     """Return how fast two falcons' payload turns about the line [rad/s], for 15 s after a push; zero actions."""
     keys = {"control.swing_shift": shift, "env.episode_seconds": 15.0, "task_options.start_radius": 0.0}
@@ -57,6 +74,7 @@ def swung(shift: float) -> np.ndarray:
     vec.reset(seed=0)
     rates = vec.world.state.payload_body_rates
     rates[0] = 0.8 * anchor_line(vec.world.system.anchors)
+    load(vec.world)
     for _ in range(vec.max_steps - 1):
         vec.step(zeros(vec))
         speed.append(rates[0] @ anchor_line(vec.world.system.anchors))

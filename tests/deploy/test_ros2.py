@@ -83,7 +83,7 @@ def test_ros_releases_a_policy():
         ("role=policy", "policy=formation_integral", "start=topic"),
     )
     found = meet("release", simulation, (*policy, *TEAM))
-    assert found["ready"] and found["complete"], found["off"]  # it came to its target
+    assert found["ready"] and found["complete"], found["off"]  # it came to its target and stayed
     assert np.ptp(found["still"]) < 0.3  # before that, the drones' own places
 
 

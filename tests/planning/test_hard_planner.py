@@ -119,8 +119,8 @@ def test_few_iterations_stop_and_say_so():
     assert set(plans.status_names) <= set(STATUS[1:3]) and (plans.iterations == 2).all()
 
 
-@pytest.mark.parametrize("n, count", [(3, 40), (4, 20), (6, 10)])
-def test_plans_from_cold_starts_cost_what_ipopt_finds(n, count):
+@pytest.mark.parametrize("n, count, share", [(3, 40, 0.9), (4, 20, 0.8), (6, 10, 0.8)])
+def test_plans_from_cold_starts_cost_what_ipopt_finds(n, count, share):
     """Where the costs differ both are local minima: IPOPT, started from the plan, stays there."""
     pytest.importorskip("casadi")
     from oracle import Oracle
@@ -132,7 +132,7 @@ def test_plans_from_cold_starts_cost_what_ipopt_finds(n, count):
     costs = plans.costs.sum(axis=1)
     found = [oracle.solve(start) for start in starts]
     same = np.array([ok and abs(cost / c - 1) < 1e-4 for (cost, ok), c in zip(found, costs, strict=True)])
-    assert plans.converged.sum() >= count - 1 and same.mean() >= 0.8
+    assert plans.converged.sum() >= count - 1 and same.mean() >= share
     for e in np.flatnonzero(plans.converged & ~same):
         cost, ok = oracle.stay(plans, e)
         assert ok and cost == pytest.approx(costs[e], rel=1e-4)
