@@ -105,6 +105,20 @@ def test_the_integral_does_not_grow_while_rotors_are_at_their_limits():
         flight.world.state.rotor_speed[:] = flight.system.vehicle.rotor_speed_max if saturated else 1000.0
         flight.reject()
         assert (np.linalg.norm(flight.disturbance.force) > np.linalg.norm(before)) == grows
+    # Within 1 % of the largest thrust of either limit, of one rotor.
+    vehicle = flight.system.vehicle
+    low, high = flight.gains.thrust_min[0], flight.gains.thrust_max[0]
+    for thrust, grows in (
+        (low + 0.008 * high, False),
+        (low + 0.012 * high, True),
+        (0.988 * high, True),
+        (0.992 * high, False),
+    ):
+        before = flight.disturbance.force.copy()
+        flight.world.state.rotor_speed[:] = 1000.0
+        flight.world.state.rotor_speed[0, 0, 2] = np.sqrt(thrust / vehicle.thrust_coefficient)
+        flight.reject()
+        assert (np.linalg.norm(flight.disturbance.force) > np.linalg.norm(before)) == grows, thrust
     flight.reference.position[0, 0, 2] -= 2.0
     before = flight.disturbance.force.copy()
     flight.world.state.rotor_speed[:] = flight.system.vehicle.rotor_speed_max

@@ -5,7 +5,7 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 import pytest
-from conftest import make, zeros
+from conftest import TASKS, make, zeros
 
 from multilift_marl.planning.paths import own_time
 from multilift_marl.rendering import Stage
@@ -143,6 +143,14 @@ def test_the_path_of_a_track_is_dashed_through_its_targets():
         vec.step(zeros(vec))
     target_path = vec.task.target_path(0)
     assert np.linalg.norm(lines[:, None] - target_path[None], axis=2).min(axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_target_path_is_of_points_in_space(task):
+    vec = make(task, num_envs=1)
+    vec.reset(seed=0)
+    path = vec.task.target_path(0)
+    assert (path.ndim, path.shape[1:]) == (2, (3,))
 
 
 @pytest.mark.parametrize("path, closes", [("circle", True), ("figure8", True), ("lemniscate", True), ("random", False)])
