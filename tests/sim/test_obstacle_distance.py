@@ -11,6 +11,7 @@ from multilift_marl.kernels.jit import kernel
 from multilift_marl.mdp.failures import make_limits
 from multilift_marl.sim import World
 from multilift_marl.sim.obstacle_distance import (
+    _clearance,
     box_distance_to,
     cylinder_distance_to,
     find_touch,
@@ -236,6 +237,16 @@ def clearance(world: World, obstacles: Obstacles, within=np.inf, lost=None) -> n
     limits = make_limits(world.system)
     clearances(world.state, world.rig, limits, lost, world.nodes, obstacles, HULLS, within, out)
     return out
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_long_body_is_near_what_is_before_its_ends(axis):
+    """Whichever of its axes is the long one: what its sphere does not reach is left out."""
+    half, place = [0.1, 0.1, 0.1], [0.0, 0.0, 0.0]
+    half[axis], place[axis] = 3.0, 3.0 + 0.3 + 1.0
+    axes = tuple(np.diag(half).ravel())
+    found = _clearance.py_func(0, BOX, (0.0, 0.0, 0.0), axes, unit(BOX, tuple(place)), HULLS, 0.5)
+    assert found == pytest.approx(0.3, abs=1e-6)
 
 
 def random_team(rng, **overrides) -> World:

@@ -145,6 +145,15 @@ def test_an_absent_drone_waits_at_its_lowered_slot_from_the_start(hz):
     assert away.sum() == 32
 
 
+def test_who_is_absent_faces_where_its_place_has_it_face():
+    vec = regroup(num_envs=8, **{"task_options.absent": 1.0, "control.heading": "outward"})
+    vec.reset(seed=0)
+    heading = np.arctan2(vec.world.state.drone_rotation[..., 1, 0], vec.world.state.drone_rotation[..., 0, 0])
+    expected = vec.task.goal.yaw[:, None] + vec.world.system.slot_azimuth
+    away = ~vec.task.own.attached
+    np.testing.assert_allclose(np.exp(1j * heading[away]), np.exp(1j * expected[away]), atol=1e-6)
+
+
 def test_starts_that_are_drawn_again_leave_no_cable_broken():
     vec = regroup(num_envs=64, **{"task_options.start_tilt": 90.0})
     vec.reset(seed=0)
