@@ -58,6 +58,12 @@ class _Job(NamedTuple):
     """Whether trajectories are returned."""
 
 
+def divide_episodes(episodes: int, workers: int, most: int) -> list[tuple[int, int]]:
+    """Return the first episode and the number of each part: `most`, or a worker's share so that all have something."""
+    size = min(most, -(-episodes // workers))
+    return [(first, min(size, episodes - first)) for first in range(0, episodes, size)]
+
+
 def evaluate_parallel(
     config: Config, make_policy: Callable[[MultiliftVec], Policy], episodes: int, seed: int, workers: int,
     progress: Callable[[int], Any] | None = None, factors: Mapping[str, Any] | None = None,
@@ -73,9 +79,7 @@ def evaluate_parallel(
     import ray
     from ray import cloudpickle
 
-    # No more than a worker's share, or some would have nothing to do.
-    size = min(_PART if writer is None else _RECORDED, -(-episodes // workers))
-    parts = [(first, min(size, episodes - first)) for first in range(0, episodes, size)]
+    parts = divide_episodes(episodes, workers, _PART if writer is None else _RECORDED)
     values = build_config(config.model_dump(), {"env.num_threads": 1}).model_dump(mode="json")
     # Once for all parts, and by value: what makes the policy may be a function of a script or a closure.
     task = ray.put(cloudpickle.dumps((values, make_policy, seed, factors, writer is not None)))

@@ -113,3 +113,19 @@ def test_processes_of_ray_fly_the_parts_of_the_same_episodes(begun):
     assert digests[0] == digests[1] + digests[2]
     for name, metric in whole.items():
         np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), metric, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "episodes, workers, parts",
+    [
+        (6, 2, [(0, 3), (3, 3)]),
+        (5, 2, [(0, 3), (3, 2)]),
+        (100, 2, [(0, 32), (32, 32), (64, 32), (96, 4)]),
+        (1, 4, [(0, 1)]),
+    ],
+)
+def test_every_worker_has_episodes_to_fly_if_there_are_enough(episodes, workers, parts):
+    pytest.importorskip("ray")
+    from multilift_marl.evaluation.parallel import divide_episodes
+
+    assert divide_episodes(episodes, workers, 32) == parts
