@@ -342,8 +342,13 @@ def is_stable(e, goal, rig, stiffness):
         b = _plus(b, sx)
         c = _plus(c, _minus(_plus(matmul(transpose(x), sx), _diagonal(dot(r, f))), _plus(arm, transpose(arm))))
 
-    # It is positive definite if its Schur complement is, by Sylvester's criterion.
-    m = _minus(c, matmul(matmul(transpose(b), _inverse(a, 0.0)), b))
+    # It is positive definite if its Schur complement is.
+    return is_positive(_minus(c, matmul(matmul(transpose(b), _inverse(a, 0.0)), b)))
+
+
+@kernel
+def is_positive(m):
+    """Return whether a symmetric matrix, 9 numbers, is positive definite, by Sylvester's criterion."""
     determinant = dot((m[0], m[1], m[2]), cross((m[3], m[4], m[5]), (m[6], m[7], m[8])))
     return m[0] > 0.0 and m[0] * m[4] - m[1] * m[3] > 0.0 and determinant > 0.0
 

@@ -11,6 +11,7 @@ from multilift_marl.control.cable_forces import (
     BALANCED,
     balance_forces,
     distribute_wrench,
+    is_positive,
     is_stable,
     make_wrench_distribution,
     place_balanced,
@@ -194,6 +195,16 @@ def test_a_payload_settles_where_its_potential_energy_is_convex():
             found.append(is_stable(0, goal, make_rig(system), stiffness))
             assert found[-1] == (least > 0), (soft, roll, pitch, least)
     assert 0 < sum(found) < len(found)
+
+
+def test_a_symmetric_matrix_is_positive_definite_if_all_its_eigenvalues_are():
+    rng, found = np.random.default_rng(0), []
+    for _ in range(400):
+        half = rng.normal(size=(3, 3)) + rng.uniform(-1, 2) * np.eye(3)
+        matrix = half + half.T
+        found.append(is_positive(floats(matrix)))
+        assert found[-1] == (np.linalg.eigvalsh(matrix).min() > 0), matrix
+    assert 40 < sum(found) < 360
 
 
 def test_a_level_payload_of_grams_settles_as_well_as_one_of_kilograms():
