@@ -244,19 +244,16 @@ def _describe_action(policy: LearnedPolicy) -> dict[str, Any]:
         scale = {"at_minus_one": low, "at_zero": zero, "at_one": high}
         numbers.append({"name": name, "frame": frame, "unit": unit, "meaning": meaning, **scale})
     margins = Margins.of(control)
-    kept = {"margins": margins._asdict()} if any(margins) else {}
-    swing = {"swing_shift": control.swing_shift} if control.swing_shift else {}
-    return (
-        kept
-        | swing
-        | {
-            "interface": control.action,
-            "shape": ["batch", "drones", len(numbers)],
-            "dtype": "float32",
-            "range": [-1.0, 1.0],
-            "numbers": numbers,
-        }
-    )
+    kept: dict[str, Any] = {"margins": margins._asdict()} if any(margins) else {}
+    if control.swing_shift:
+        kept["swing_shift"] = control.swing_shift
+    return kept | {
+        "interface": control.action,
+        "shape": ["batch", "drones", len(numbers)],
+        "dtype": "float32",
+        "range": [-1.0, 1.0],
+        "numbers": numbers,
+    }
 
 
 def _measure_thrusts(config: Config) -> np.ndarray:

@@ -4,11 +4,11 @@ Two cables do not hold a payload about the line of their anchors: it swings, and
 drones move aside, against the side to which its bottom swings, in proportion to the angle. References follow commands
 late, so that the shift acts as damping.
 
-Cables and payload swing in two ways, and cables pass no tilt on at once: what damps one way takes from the other. With
-two falcons and the payload of `hover` 0.06 m/rad raises the decay rate of the faster one, 0.93 Hz, from 0.08 to
-0.20 1/s, and lowers that of the slower from 0.27 to 0.20; 0.25 feeds it. The best value depends on the rig: 0.06 harms
-with cables of 0.5 m or a box 5 cm thick. A payload that hangs tilted moves its drones aside for good. Drones
-that do not measure its attitude (`env.sensing=onboard`) take it for what is planned: there it has no effect.
+Cables and payload swing in two ways, and cables pass no tilt on at once: what damps one way takes from the other. The
+best value depends on the rig. A push of 0.8 rad/s on `hover`'s payload below two falcons leaves 0.35 rad/s after 15 s,
+with 0.06 m/rad 0.12, with 0.3 m/rad 0.88; on cables of 0.5 m, where it dies sooner, 0.06 m/rad prolongs it
+(tests/control/test_swing.py). A payload that hangs tilted moves its drones aside for good. Drones that do not measure
+its attitude (`env.sensing=onboard`) take it for what is planned: there it has no effect.
 """
 
 from __future__ import annotations
