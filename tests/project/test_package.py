@@ -201,33 +201,30 @@ def commands_of(block):
 
 
 SHORT = "env.num_envs=4 train.horizon=8 train.frames=32 train.diffmpc.window=4 eval.episodes=2"  # one iteration
-SHORTER = {  # of each script: keys that go, and what is added
-    "train.py": (re.findall(r"(\S+)=", SHORT), SHORT),
-    "evaluate.py": (["episodes"], "episodes=1 env.episode_seconds=0.4"),
-    "bench/air.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
-    "bench/bench.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
-    "bench/disturbance.py": (["rigs", "seconds"], "rigs=report4 seconds=0.05"),
-    "bench/numpy_functions.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
-    "bench/obstacles.py": (["obstacles", "repeats"], "obstacles=2 repeats=1"),
-    "bench/peers.py": (["cache", "repeats", "seconds", "save"], "peers=multilift_marl repeats=1 seconds=0.05"),
-    "bench/randomization.py": (["repeats", "seconds", "env.num_envs"], "repeats=1 seconds=0.05 env.num_envs=4"),
-    "bench/route_search.py": (["maps", "drones"], "maps=1 drones=2"),
-    "bench/start.py": (["repeats", "task", "num_envs", "install"], "repeats=1 num_envs=2"),
-    "bench/soak.py": (["minutes", "iterations", "steps", "num_envs"], "minutes=0.01 iterations=8 task=hover"),
-    "bench/tasks.py": (["repeats", "seconds"], "repeats=1 seconds=0.02 env.num_envs=4"),
-    "bench/workers.py": (["repeats", "workers"], "repeats=1 workers=0,1 env.num_envs=4 train.horizon=8"),
-    "bench/training.py": (["repeats"], f"repeats=1 {SHORT} train.minibatches=2"),
-    "multilift_marl.benchmark": (["episodes", "suite"], "episodes=1"),
-    "results/search_gains.py": (
-        ["minutes", "env.num_envs", "env.episode_seconds"],
-        "minutes=0.001 env.num_envs=2 env.episode_seconds=2.0",
-    ),
-    "results/shifts.py": ([], "episodes=2"),
-    "results/twin.py": (["episodes", "rounds"], "episodes=2 rounds=1 env.episode_seconds=0.4"),
-    "results/curves.py": ([], "."),  # folder
-    "examples/cleanrl_ppo.py": ([], "1"),  # iteration
-    "examples/fly_exported.py": ([], "1"),
-    "examples/ray_tune.py": (["16"], f"2 {SHORT}"),  # trials
+SHORTER = {  # of each script: what is added, in place of the same keys; then keys that go without any
+    "train.py": (SHORT,),
+    "evaluate.py": ("episodes=1 env.episode_seconds=0.4",),
+    "bench/air.py": ("repeats=1 seconds=0.05 env.num_envs=4",),
+    "bench/bench.py": ("repeats=1 seconds=0.05 env.num_envs=4",),
+    "bench/disturbance.py": ("rigs=report4 seconds=0.05",),
+    "bench/numpy_functions.py": ("repeats=1 seconds=0.05 env.num_envs=4",),
+    "bench/obstacles.py": ("obstacles=2 repeats=1",),
+    "bench/peers.py": ("peers=multilift_marl repeats=1 seconds=0.05", "cache", "save"),
+    "bench/randomization.py": ("repeats=1 seconds=0.05 env.num_envs=4",),
+    "bench/route_search.py": ("maps=1 drones=2",),
+    "bench/start.py": ("repeats=1 num_envs=2", "task", "install"),
+    "bench/soak.py": ("minutes=0.01 iterations=8 task=hover", "steps", "num_envs"),
+    "bench/tasks.py": ("repeats=1 seconds=0.02 env.num_envs=4",),
+    "bench/workers.py": ("repeats=1 workers=0,1 env.num_envs=4 train.horizon=8",),
+    "bench/training.py": (f"repeats=1 {SHORT} train.minibatches=2",),
+    "multilift_marl.benchmark": ("episodes=1", "suite"),
+    "results/search_gains.py": ("minutes=0.001 env.num_envs=2 env.episode_seconds=2.0",),
+    "results/shifts.py": ("episodes=2",),
+    "results/twin.py": ("episodes=2 rounds=1 env.episode_seconds=0.4",),
+    "results/curves.py": (".",),  # folder
+    "examples/cleanrl_ppo.py": ("1",),  # iteration
+    "examples/fly_exported.py": ("1",),
+    "examples/ray_tune.py": (f"2 {SHORT}", "16"),  # trials
 }
 MAINS = {
     "train.py": train,
@@ -241,7 +238,8 @@ MAINS = {
 def shorter(command):
     """Return the script of a documented command and its arguments, made short."""
     _, script, *arguments = shlex.split(command.replace("python -m", "python"))
-    dropped, more = SHORTER.get(script, ([], ""))
+    more, *gone = SHORTER.get(script, ("",))
+    dropped = [*gone, *re.findall(r"(\S+)=", more)]
     kept = [part for part in arguments if part.split("=")[0] not in dropped or "resume" in command]
     kept = [part.replace("=examples/", f"={ROOT}/examples/") for part in kept]
     for name in set(re.findall(r"config=(\S+)", command)) & set(list_configs()):
