@@ -215,30 +215,41 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
         _list_columns(learner, batch, (advantage - mean) / deviation, advantage + value)
         for batch, (advantage, value) in zip(batches, estimates, strict=True)
     ]
+    # Rows of teams of one size fit into one tensor, those of others do not.
+    sizes: dict[tuple[torch.Size, ...], list[list[torch.Tensor]]] = {}
+    for columns in tables:
+        sizes.setdefault(tuple(column.shape[1:] for column in columns), []).append(columns)
+    groups = [
+        (len(alike), alike[0] if len(alike) == 1 else [torch.cat(each) for each in zip(*alike, strict=True)])
+        for alike in sizes.values()
+    ]
 
     # 2. Some epochs of minibatches, fewer if the policy moves too far. A minibatch has as many rows of each batch.
     actor_parameters, critic_parameters = (group["params"] for group in learner.optimizer.param_groups)
     diagnostics: list[torch.Tensor] = []
     stop = False
     for _ in range(config.epochs):
-        # Rigs may differ in their numbers of drones, so that their rows do not fit into one tensor: each is cut into as
-        # many chunks.
-        orders = [torch.randperm(len(columns[0])).chunk(config.minibatches) for columns in tables]
+        orders = [_shuffle(count, len(columns[0]) // count).chunk(config.minibatches, 1) for count, columns in groups]
         for chunks in zip(*orders, strict=True):
             learner.optimizer.zero_grad(set_to_none=True)
-            losses = [
-                _add_gradients(learner, [column.index_select(0, chunk) for column in columns], 1 / len(tables))
-                for columns, chunk in zip(tables, chunks, strict=True)
-            ]
+            losses = torch.stack([
+                count / len(tables) * _add_gradients(learner, _pick(columns, chunk), count / len(tables))
+                for (count, columns), chunk in zip(groups, chunks, strict=True)
+            ])  # fmt: skip
             # Each by its own norm: a large gradient of the critic does not shorten the actor's step.
             norm = nn.utils.clip_grad_norm_(actor_parameters, config.max_grad_norm)
             nn.utils.clip_grad_norm_(critic_parameters, config.max_grad_norm)
             learner.optimizer.step()
-            diagnostics.append(torch.cat([torch.stack(losses).mean(0), norm.detach()[None]]))
+            diagnostics.append(torch.cat([losses.sum(0), norm.detach()[None]]))
         # The mean over an epoch: single minibatches are too noisy to stop by.
         if torch.stack(diagnostics[-config.minibatches :])[:, 0].mean() > config.target_kl:
             stop = True
             break
+    with torch.no_grad():
+        moved = torch.stack([
+            count / len(tables) * _team_kl(learner, _pick(columns, chunk))
+            for (count, columns), chunk in zip(groups, chunks, strict=True)
+        ])  # fmt: skip
 
     # 3. Statistics of the observations, for the next rollouts. After the update, or old log-probabilities would be of
     # other inputs than the new ones, and the ratios not 1 at first.
@@ -249,11 +260,22 @@ def update(learner: Learner, batches: Sequence[TensorDictBase]) -> dict[str, flo
     # ½ log 2π e σ² of each number, the same in every state.
     entropy = 0.5 * torch.log(2 * torch.pi * torch.e * learner.actor.log_std.detach().exp() ** 2).sum()
     return result | {
+        "team_kl": moved.sum().item(),
         "explained_variance": explained.item(),
         "entropy": entropy.item(),
         "stopped_early": float(stop),
         "learning_seconds": time.perf_counter() - start,
     }
+
+
+def _shuffle(count: int, rows: int) -> torch.Tensor:
+    """Return the rows of so many batches (count, rows), each batch's in an order of its own."""
+    return torch.stack([torch.randperm(rows) + batch * rows for batch in range(count)])
+
+
+def _pick(columns: list[torch.Tensor], chunk: torch.Tensor) -> list[torch.Tensor]:
+    """Return those rows of all columns."""
+    return [column.index_select(0, chunk.flatten()) for column in columns]
 
 
 def _update_statistics(learner: Learner, batches: Sequence[TensorDictBase], which: Sequence[Normalizer]) -> None:
@@ -286,6 +308,11 @@ def _add_gradients(learner: Learner, rows: list[torch.Tensor], weight: float) ->
         total = total - config.entropy * entropy
     (weight * total).backward()
     return torch.stack([value.detach() for value in (kl, clipped, policy_loss, critic_loss)])
+
+
+def _team_kl(learner: Learner, rows: list[torch.Tensor]) -> torch.Tensor:
+    """Return the KL of a team's actions from those of the rollouts: drones draw independently, so theirs add up."""
+    return rows[0].shape[-2] * surrogate_loss(learner, *rows[:4], *rows[6:])[2]
 
 
 def sequence_length(train: TrainConfig) -> int:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 from conftest import make_trainer, refusal
 
+from multilift_marl.agents import mappo
 from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.agents.trainer import resume_run
@@ -43,6 +46,57 @@ def test_teams_of_different_sizes_learn_together(tmp_path):
     assert [len(batch) for batch in batches] == [trainer.config.env.num_envs // 2] * 2
     assert not torch.equal(weights(trainer), before)
     assert np.isfinite(list(values.values())).all()
+
+
+ONE_STEP = {"train.epochs": 1, "train.minibatches": 1, "train.warmup": 0}
+
+
+def test_each_rig_counts_as_much_whatever_its_size(tmp_path):
+    rigs = {"train.rigs": [{"env.num_drones": 3}, {"env.num_drones": 5}, {"env.num_drones": 3, "cable.length": 0.7}]}
+    trainer = make_trainer(tmp_path, **TWO | ONE_STEP | rigs, **{"env.num_envs": 6})
+    batches = trainer.rollouts.collect(0)
+    advantages = [mappo.estimate_advantage(trainer.learner, batch)[0] for batch in batches]
+    every = torch.cat([each.flatten() for each in advantages])
+    values = mappo.update(trainer.learner, batches)  # the first ratios are 1: the loss is minus the advantage
+    expected = torch.stack([-((each - every.mean()) / every.std()).mean() for each in advantages]).mean()
+    assert abs(expected) > 1e-4  # of all drones alike it would be 0
+    assert values["loss_policy"] == pytest.approx(expected.item(), rel=0.01)
+
+
+def test_rigs_of_one_size_learn_as_one_batch_of_all(tmp_path):
+    trainer = make_trainer(tmp_path, **TWO | ONE_STEP | {"train.rigs": [{}, {"cable.length": 0.7}]})
+    batches, learner = trainer.rollouts.collect(0), trainer.learner
+    other = copy.deepcopy(learner)
+    mappo.update(learner, batches)
+    mappo.update(other, [torch.cat(batches)])
+    before, after = (torch.nn.utils.parameters_to_vector(each.actor.parameters()) for each in (other, learner))
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("rigs", [[], [{"env.num_drones": 3}, {"env.num_drones": 5}]])
+def test_a_teams_kl_is_the_sum_of_its_drones_after_the_update(tmp_path, rigs):
+    trainer = make_trainer(tmp_path, **TWO | ONE_STEP | {"train.rigs": rigs, "train.learning_rate": 2e-3})
+    batches = trainer.rollouts.collect(0)
+    seen = [batch["agents", "observation"] for batch in batches]
+    actor = trainer.learner.actor
+    actor.normalizer.update(torch.cat([rows.flatten(0, -2) for rows in seen]))
+    with torch.no_grad():
+        before = [torch.distributions.Normal(*actor(rows)) for rows in seen]
+    for batch, policy in zip(batches, before, strict=True):
+        batch["agents", "action_log_prob"] = policy.log_prob(batch["agents", "action"]).sum(-1)
+    known = copy.deepcopy(actor.normalizer)
+    values = mappo.update(trainer.learner, batches)
+    actor.normalizer = known  # which the update moves last
+    expected = []
+    for batch, rows, old in zip(batches, seen, before, strict=True):
+        with torch.no_grad():
+            new = torch.distributions.Normal(*actor(rows))
+        ratio = new.log_prob(batch["agents", "action"]).sum(-1) - batch["agents", "action_log_prob"]
+        expected.append((ratio.expm1() - ratio).sum(-1).mean())
+        exact = torch.distributions.kl_divergence(old, new).sum((-1, -2)).mean()  # over all actions that may be drawn
+        assert 0.5 < expected[-1] / exact < 2
+    assert values["team_kl"] == pytest.approx(torch.stack(expected).mean().item(), rel=1e-3)
+    assert values["team_kl"] > 0.05
 
 
 def test_rigs_may_fly_episodes_of_their_own_length(tmp_path):
