@@ -13,10 +13,12 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from multilift_marl.evaluation.metrics import name_error
 from multilift_marl.evaluation.rollout import Trace
 from multilift_marl.planning.feasibility import Feasibility
 from multilift_marl.planning.spline import sample_spline
 from multilift_marl.sim.scene import DRONE_COLOURS
+from multilift_marl.tasks.base import Task
 
 # Told apart by the colour-blind too (Okabe & Ito, Color Universal Design, 2008).
 POLICY_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -121,7 +123,7 @@ def plot_plan(path: str | Path, table: np.ndarray, feasibility: Feasibility) -> 
 
 
 def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]], pdf: bool = False) -> None:
-    """Plot success rate [%], payload error [cm] and return over the environment steps of a training.
+    """Plot success rate [%], the error that policies are compared by [cm] and return over the steps of a training.
 
     Args:
         path: of the PNG; its folder is made.
@@ -133,9 +135,12 @@ def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]], pdf: bool
     rows = list(rows)
     figure = Figure(figsize=(6.4, 8.0), layout="constrained")
     success, error, total, paid = figure.subplots(4, 1, sharex=True)
+    # Only rows of `track` hold an RMSE; those of older runs were compared by the position error.
+    tracks = len(_column(rows, "eval/payload_rmse_m")[0]) > 0
+    metric = "payload_rmse_m" if tracks else Task.ERROR
     panels = (
         (success, "success", "eval/success_rate", 100, "success [%]"),
-        (error, None, "eval/payload_position_error_m", 100, "position error [cm]"),
+        (error, None, f"eval/{metric}", 100, f"{name_error(metric)} [cm]"),
         (total, None, "eval/return", 1, "return"),
         (paid, "return", None, 1, "return in training"),
     )
@@ -148,7 +153,7 @@ def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]], pdf: bool
             axes.plot(frames, factor * values, "o-", color=POLICY_COLOURS[1], markersize=4, label="evaluation")
         _label(axes, None, label)
     success.set_ylim(-3, 103)
-    if len(_column(rows, "eval/payload_position_error_m")[0]):
+    if len(_column(rows, f"eval/{metric}")[0]):
         error.set_yscale("log")
         error.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         error.yaxis.set_major_formatter("{x:g}")

@@ -277,3 +277,7 @@ def test_every_line_of_the_training_plot_is_its_column(tmp_path, monkeypatch):
     assert [line.get_xydata().tolist() for line in error.lines] == [[[200, 3]]]
     assert [line.get_xydata().tolist() for line in total.lines] == [[[200, 9]]]
     assert [line.get_xydata().tolist() for line in paid.lines] == [[[100, 7]]]
+    assert error.get_ylabel() == "position error [cm]"
+    plots.plot_training(tmp_path / "training.png", [row | {"eval/payload_rmse_m": 0.05} for row in rows[1:]])
+    error = drawn[1].axes[1]  # of `track`, whose policies are compared by the RMSE
+    assert [line.get_xydata().tolist() for line in error.lines] == [[[200, 5]]] and error.get_ylabel() == "RMSE [cm]"
