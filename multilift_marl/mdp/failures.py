@@ -27,6 +27,7 @@ from multilift_marl.rig.resolve import MIN_SEPARATION
 from multilift_marl.rig.system import System
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.obstacle_distance import least_clearance
+from multilift_marl.sim.obstacles import count_hulls
 
 CAUSES = (
     "none",
@@ -82,6 +83,8 @@ class Limits(NamedTuple):
     """Its geometric centre from its centre of mass, in its frame [m]."""
     payload_round: bool
     """Whether it is a cylinder."""
+    payload_hull: int
+    """Row of `sim.obstacles.make_hulls` with the vertices of a mesh's hull from its geometric centre, else -1."""
     drone_half: np.ndarray
     """(N, 3) half edges of a drone [m]."""
     distance: float
@@ -103,6 +106,7 @@ def make_limits(system: System, distance: float = MAX_DISTANCE) -> Limits:
         payload_half=system.payload_size / 2,
         payload_center=triple(system.payload_center),
         payload_round=system.payload_shape == "cylinder",
+        payload_hull=-1 if system.payload_mesh is None else count_hulls(system.scenery),
         drone_half=np.array([drone_half_size(vehicle) for vehicle in system.vehicles]),
         distance=distance,
     )

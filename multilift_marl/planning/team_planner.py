@@ -71,7 +71,7 @@ def make_surroundings(
     """Return what the first team is to stay clear of; None: nothing."""
     if obstacles is None:
         obstacles = Obstacles.zeros(1, 0)
-    hulls, points = make_hulls(system.scenery), make_points(settings, system, model)
+    hulls, points = make_hulls(system), make_points(settings, system, model)
     return Surroundings(0, obstacles, hulls, settings.delay, points, np.zeros((settings.steps + 1, 0, 4)))
 
 

@@ -90,7 +90,7 @@ def _resolve(given: ObstacleConfig, key: str) -> list[Obstacle]:
     if given.shape == "mesh":
         assert given.mesh is not None
         mesh = read_mesh(given.mesh, given.size)
-        return [_make(given, HULL, mesh.edges / 2, np.zeros(3), _hull(mesh.points - mesh.middle))]
+        return [_make(given, HULL, mesh.edges / 2, np.zeros(3), find_hull(mesh.points - mesh.middle))]
     size = np.array(given.size, float)
     half = {"box": size, "cylinder": size[[0, 0, -1]], "sphere": size[[0, 0, 0]]}[given.shape] / 2
     return [_make(given, {"box": BOX, "cylinder": CYLINDER, "sphere": SPHERE}[given.shape], half, np.zeros(3))]
@@ -145,7 +145,7 @@ def _cut_wall(size: np.ndarray, gaps: list[tuple[float, ...]], key: str) -> list
     return boxes
 
 
-def _hull(points: np.ndarray) -> np.ndarray:
+def find_hull(points: np.ndarray) -> np.ndarray:
     """Return the vertices (V, 3) of the convex hull of points, by MuJoCo's compiler."""
     spec = mujoco.MjSpec()
     mesh = spec.add_mesh(name="hull", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)

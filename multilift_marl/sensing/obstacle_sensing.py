@@ -109,7 +109,7 @@ class ObstacleSensing:
         distances = np.zeros((e, n, max(sensor.points, 1)))
         drones = world.state.drone_position, world.state.drone_rotation
         known = own.drone_position, own.drone_rotation
-        obstacles = _needed(world.obstacles), make_hulls(world.system.scenery)
+        obstacles = _needed(world.obstacles), make_hulls(world.system)
         self.sense: Callable[[int, int], None] = prebind(
             sense_obstacles, *drones, *known, *obstacles, sensor, self.readings, distances
         )

@@ -1,7 +1,8 @@
 """Distance of two convex bodies by their support functions (Gilbert, Johnson and Keerthi 1988).
 
-A body is its kind, its middle and nine numbers: the half edges of its box as columns, of a HULL its attitude alone. A
-segment is a BOX two of whose half edges are zero. Points of the difference A - B are tuples; no array is made.
+A body is its kind, its middle, nine numbers, the half edges of its box as columns, of a HULL its attitude alone, and a
+HULL's row of `hulls`, vertices (H, V, 3) [m]. A segment is a BOX two of whose half edges are zero. Points of the
+difference A - B are tuples; no array is made.
 """
 
 from __future__ import annotations
@@ -20,22 +21,21 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 @kernel
-def separation(one, other, hulls, hull, beyond):
+def separation(one, other, hulls, beyond):
     """Return the vector from the nearest point of the second body to that of the first [m]; zero if they touch.
 
     Args:
-        one, other: bodies, (kind, middle, nine numbers).
+        one, other: bodies, see the module.
         hulls: vertices (H, V, 3) of the hulls [m].
-        hull: the row of it of the second body, if it is a HULL; the first is none.
         beyond: bodies farther apart than that may be reported at any greater distance [m].
     """
-    kind, middle, axes = one
-    other_kind, other_middle, other_axes = other
+    kind, middle, axes, hull = one
+    other_kind, other_middle, other_axes, other_hull = other
     # Any point of A - B will do to begin with; the middle of a hull need not be in it.
     toward = sub(other_middle, middle)
     a = sub(
-        add(middle, support(kind, axes, toward, hulls, 0)),
-        add(other_middle, support(other_kind, other_axes, scale(-1.0, toward), hulls, hull)),
+        add(middle, support(kind, axes, toward, hulls, hull)),
+        add(other_middle, support(other_kind, other_axes, scale(-1.0, toward), hulls, other_hull)),
     )
     v, b, c = a, _ZERO, _ZERO
     count = 1
@@ -46,8 +46,8 @@ def separation(one, other, hulls, hull, beyond):
         # The plane across v through w separates the origin from A - B: a lower bound, as |v| is an upper one.
         toward = scale(-1.0, v)
         w = sub(
-            add(middle, support(kind, axes, toward, hulls, 0)),
-            add(other_middle, support(other_kind, other_axes, v, hulls, hull)),
+            add(middle, support(kind, axes, toward, hulls, hull)),
+            add(other_middle, support(other_kind, other_axes, v, hulls, other_hull)),
         )
         least = dot(v, w) / length
         if least > beyond or length - least <= _TOLERANCE:

@@ -30,6 +30,7 @@ from multilift_marl.sim.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE
 
 _GRAZE = 1e-6  # [m] from a hull, where a ray has met it
 _ADVANCES = 64  # of a ray towards a hull
+_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # half edges of a point
 
 
 @kernel
@@ -43,8 +44,7 @@ def point_distance(e, m, point, obstacles, hulls):
         return inf, point
     middle, attitude, half = vec(obstacles.position, e, m), mat(obstacles.rotation, e, m), vec(obstacles.size, e, m)
     if kind == HULL:
-        nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        offset = separation((BOX, point, nothing), (HULL, middle, attitude), hulls, obstacles.hull[e, m], inf)
+        offset = separation((BOX, point, _NOTHING, 0), (HULL, middle, attitude, obstacles.hull[e, m]), hulls, inf)
         return norm(offset), sub(point, offset)
     local = tmul(attitude, sub(point, middle))
     distance, normal = local_distance(kind, half, local)
@@ -164,7 +164,7 @@ def _ray_to_hull(e, m, origin, direction, obstacles, hulls):
 def segment_distance_to(e, m, a, b, obstacles, hulls):
     """Return the distance of the segment a b, a cable, from an obstacle [m]; 0 if they touch."""
     middle, axes = _segment(a, b)
-    return body_distance_to(e, m, BOX, middle, axes, obstacles, hulls, inf)
+    return body_distance_to(e, m, (BOX, middle, axes, 0), obstacles, hulls, inf)
 
 
 @kernel
@@ -185,13 +185,13 @@ def box_distance_to(e, m, center, frame, half, obstacles, hulls):
         half: its half edges [m].
         obstacles, hulls: see the module.
     """
-    return body_distance_to(e, m, BOX, center, _stretch(frame, half), obstacles, hulls, inf)
+    return body_distance_to(e, m, (BOX, center, _stretch(frame, half), 0), obstacles, hulls, inf)
 
 
 @kernel
 def cylinder_distance_to(e, m, center, frame, half, obstacles, hulls):
     """Do as `box_distance_to` for an upright cylinder of radius `half[0]` and half height `half[2]` [m]."""
-    return body_distance_to(e, m, CYLINDER, center, _stretch(frame, half), obstacles, hulls, inf)
+    return body_distance_to(e, m, (CYLINDER, center, _stretch(frame, half), 0), obstacles, hulls, inf)
 
 
 @kernel
@@ -205,18 +205,21 @@ def _stretch(frame, half):
 
 
 @kernel
-def body_distance_to(e, m, kind, middle, axes, obstacles, hulls, beyond):
-    """Return the distance of a BOX or CYLINDER from an obstacle [m], 0 if they touch; see `gjk.separation`."""
+def body_distance_to(e, m, body, obstacles, hulls, beyond):
+    """Return the distance of a BOX, CYLINDER or HULL from an obstacle [m], 0 if they touch; see `gjk.separation`."""
     other = obstacles.kind[e, m]
     if other == NONE:
         return inf
     place, attitude, half = vec(obstacles.position, e, m), mat(obstacles.rotation, e, m), vec(obstacles.size, e, m)
+    kind, middle, axes, _ = body
+    if other == SPHERE and kind == HULL:
+        return max(norm(separation(body, (BOX, place, _NOTHING, 0), hulls, beyond + half[0])) - half[0], 0.0)
     if other == SPHERE:
         offset = sub(place, middle)
         return max(norm(sub(offset, nearest_within(kind, axes, offset))) - half[0], 0.0)
     if other != HULL:
         attitude = _stretch(attitude, half)
-    return norm(separation((kind, middle, axes), (other, place, attitude), hulls, obstacles.hull[e, m], beyond))
+    return norm(separation(body, (other, place, attitude, obstacles.hull[e, m]), hulls, beyond))
 
 
 @kernel
@@ -240,25 +243,25 @@ def least_clearance(e, state, rig, limits, lost, nodes, obstacles, hulls, within
     # The payload, whose middle is off its centre of mass.
     half = limits.payload_half
     middle, axes = add(payload, mul(attitude, limits.payload_center)), _stretch(attitude, half)
-    kind = CYLINDER if limits.payload_round else BOX
-    least = _clearance(e, kind, middle, axes, obstacles, hulls, least)
+    kind, hull = (CYLINDER if limits.payload_round else BOX), 0
+    if limits.payload_hull >= 0:
+        kind, axes, hull = HULL, attitude, limits.payload_hull
+    least = _clearance(e, (kind, middle, axes, hull), norm(half), obstacles, hulls, least)
     for n in range(state.drone_position.shape[1]):
         if lost[e, n]:
             continue
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
-        axes = _stretch(frame, row(limits.drone_half, n))
-        least = _clearance(e, BOX, drone, axes, obstacles, hulls, least)
+        box = row(limits.drone_half, n)
+        least = _clearance(e, (BOX, drone, _stretch(frame, box), 0), norm(box), obstacles, hulls, least)
         # Its cable, from anchor to hook; of a chain link by link.
         begin, end = add(payload, mul(attitude, row(rig.anchors, n))), add(drone, mul(frame, row(rig.hooks, n)))
         if nodes is not None:
             for k in range(rig.cable_segments[n] - 1):
                 node = vec(nodes.position[e], n, k)
-                middle, axes = _segment(begin, node)
-                least = _clearance(e, BOX, middle, axes, obstacles, hulls, least)
+                least = _cable_clearance(e, begin, node, obstacles, hulls, least)
                 begin = node
         if not state.cable_broken[e, n]:
-            middle, axes = _segment(begin, end)
-            least = _clearance(e, BOX, middle, axes, obstacles, hulls, least)
+            least = _cable_clearance(e, begin, end, obstacles, hulls, least)
     return least
 
 
@@ -269,11 +272,16 @@ def find_touch(e, state, rig, limits, lost, nodes, obstacles, hulls):
 
 
 @kernel
-def _clearance(e, kind, middle, axes, obstacles, hulls, least):
-    """Return the distance of a body from the nearest obstacle, if it is less than `least` [m]."""
-    one, two, three = column(axes, 0), column(axes, 1), column(axes, 2)
-    square = dot(one, one) + dot(two, two) + dot(three, three)
-    radius = sqrt(square)
+def _cable_clearance(e, a, b, obstacles, hulls, least):
+    """Return the distance of the segment a b from the nearest obstacle, if it is less than `least` [m]."""
+    middle, axes = _segment(a, b)
+    return _clearance(e, (BOX, middle, axes, 0), norm(column(axes, 0)), obstacles, hulls, least)
+
+
+@kernel
+def _clearance(e, body, radius, obstacles, hulls, least):
+    """Return the distance of a body within `radius` [m] from the nearest obstacle, if it is less than `least` [m]."""
+    _, middle, _, _ = body
     for m in range(obstacles.kind.shape[1]):
         if least <= 0.0:
             break
@@ -293,5 +301,5 @@ def _clearance(e, kind, middle, axes, obstacles, hulls, least):
         )
         if x * x + y * y + z * z >= reach * reach:
             continue
-        least = min(least, body_distance_to(e, m, kind, middle, axes, obstacles, hulls, least))
+        least = min(least, body_distance_to(e, m, body, obstacles, hulls, least))
     return least

@@ -19,7 +19,8 @@ from multilift_marl.rig.obstacles import CYLINDER as CYLINDER
 from multilift_marl.rig.obstacles import HULL as HULL
 from multilift_marl.rig.obstacles import NONE as NONE
 from multilift_marl.rig.obstacles import SPHERE as SPHERE
-from multilift_marl.rig.obstacles import Scenery
+from multilift_marl.rig.obstacles import Scenery, find_hull
+from multilift_marl.rig.system import System
 
 HIDDEN = (0.0, 0.0, -100.0)  # [m] where free rows are
 
@@ -88,9 +89,20 @@ def make_obstacles(scenery: Scenery, num_envs: int) -> Obstacles:
     return made
 
 
-def make_hulls(scenery: Scenery) -> np.ndarray:
-    """Return the vertices (H, V, 3) of the hulls, from their middles [m]; the last of a shorter list repeated."""
+def count_hulls(scenery: Scenery) -> int:
+    """Return how many obstacles are hulls."""
+    return sum(each.vertices is not None for each in scenery.obstacles)
+
+
+def make_hulls(system: System) -> np.ndarray:
+    """Return the vertices (H, V, 3) of the hulls, from their middles [m]; the last of a shorter list repeated.
+
+    Where there may be obstacles, the last is that of a payload that is a mesh.
+    """
+    scenery, mesh = system.scenery, system.payload_mesh
     found = [each.vertices for each in scenery.obstacles if each.vertices is not None]
+    if mesh is not None and scenery.count:
+        found.append(find_hull(mesh.points - mesh.middle))
     longest = max((len(vertices) for vertices in found), default=1)
     hulls = np.zeros((len(found), longest, 3))
     for row, vertices in zip(hulls, found, strict=True):

@@ -193,7 +193,7 @@ class Task:
             good_time=self.good_time,
             min_separation=self.min_separation,
             obstacles=world.obstacles,
-            hulls=make_hulls(system.scenery),
+            hulls=make_hulls(system),
             obstacle_readings=sensing.obstacles.readings.observed if sensing.obstacles else None,
             nodes=world.nodes,
             clearance=self.clearance,

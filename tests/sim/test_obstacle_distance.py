@@ -12,6 +12,7 @@ from multilift_marl.mdp.failures import make_limits
 from multilift_marl.sim import World
 from multilift_marl.sim.obstacle_distance import (
     _clearance,
+    body_distance_to,
     box_distance_to,
     cylinder_distance_to,
     find_touch,
@@ -20,7 +21,7 @@ from multilift_marl.sim.obstacle_distance import (
     ray_distance,
     segment_distance_to,
 )
-from multilift_marl.sim.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE, Obstacles, place_obstacle
+from multilift_marl.sim.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE, Obstacles, make_hulls, place_obstacle
 
 GEOMS = {BOX: "box", CYLINDER: "cylinder", SPHERE: "sphere", HULL: "mesh"}
 CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -73,8 +74,8 @@ def geom(obstacles: Obstacles, m: int = 0) -> str:
     return f'<geom name="obstacle" type="{GEOMS[kind]}" {shape} {place}/>'
 
 
-def scene(*geoms: str, hull: np.ndarray = CUBE):
-    asset = f'<mesh name="hull" vertex="{words(hull.ravel())}"/>'
+def scene(*geoms: str, hull: np.ndarray = CUBE, own: np.ndarray = CUBE):
+    asset = f'<mesh name="hull" vertex="{words(hull.ravel())}"/><mesh name="own" vertex="{words(own.ravel())}"/>'
     option = '<option ccd_iterations="200" ccd_tolerance="1e-9"/>'
     model = mujoco.MjModel.from_xml_string(
         f"<mujoco>{option}<asset>{asset}</asset><worldbody>{''.join(geoms)}</worldbody></mujoco>"
@@ -84,13 +85,13 @@ def scene(*geoms: str, hull: np.ndarray = CUBE):
     return model, data
 
 
-def geom_distance(obstacles: Obstacles, other: str, hull: np.ndarray) -> float:
-    model, data = scene(geom(obstacles), other, hull=hull)
+def geom_distance(obstacles: Obstacles, other: str, hull: np.ndarray, own: np.ndarray = CUBE) -> float:
+    model, data = scene(geom(obstacles), other, hull=hull, own=own)
     return mujoco.mj_geomDistance(model, data, 0, 1, 100.0, None)
 
 
 @pytest.mark.parametrize("kind", GEOMS)
-@pytest.mark.parametrize("body", ["box", "cylinder", "segment"])
+@pytest.mark.parametrize("body", ["box", "cylinder", "segment", "hull"])
 def test_distances_of_bodies_are_mujocos(kind, body):
     rng = np.random.default_rng([kind, len(body)])
     apart = 0
@@ -104,6 +105,12 @@ def test_distances_of_bodies_are_mujocos(kind, body):
         elif body == "cylinder":
             ours = cylinder_distance_to(0, 0, tuple(center), nine, (half[0], half[0], half[2]), obstacles, hulls)
             theirs = geom_distance(obstacles, f'<geom type="cylinder" size="{words(half[[0, 2]])}" {place}/>', hulls[0])
+        elif body == "hull":
+            own = random_hull(rng)
+            both = np.stack([own, np.resize(hulls[0], own.shape)])
+            obstacles.hull[:] = 1
+            ours = body_distance_to(0, 0, (HULL, tuple(center), nine, 0), obstacles, both, np.inf)
+            theirs = geom_distance(obstacles, f'<geom type="mesh" mesh="own" {place}/>', hulls[0], own)
         else:
             a, b = tuple(center), tuple(center + rng.normal(size=3))
             ours = segment_distance_to(0, 0, a, b, obstacles, hulls)
@@ -245,8 +252,33 @@ def test_a_long_body_is_near_what_is_before_its_ends(axis):
     half, place = [0.1, 0.1, 0.1], [0.0, 0.0, 0.0]
     half[axis], place[axis] = 3.0, 3.0 + 0.3 + 1.0
     axes = tuple(np.diag(half).ravel())
-    found = _clearance.py_func(0, BOX, (0.0, 0.0, 0.0), axes, unit(BOX, tuple(place)), HULLS, 0.5)
+    body = BOX, (0.0, 0.0, 0.0), axes, 0
+    found = _clearance.py_func(0, body, np.linalg.norm(half), unit(BOX, tuple(place)), HULLS, 0.5)
     assert found == pytest.approx(0.3, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [(SPHERE, (0.1, 0.1, 0.1)), (BOX, (0.05, 0.05, 1.0)), (HULL, (0.1, 0.1, 0.1))]
+)
+def test_a_mesh_is_as_near_as_its_own_hull(tmp_path, kind, size):
+    """Beside an edge of a square that stands on its corner, far within the box about it."""
+    points = [(x, y, z) for z in (0.0, 0.15) for x, y in ((0.4, 0.0), (0.0, 0.4), (-0.4, 0.0), (0.0, -0.4))]
+    faces = [(4, 3, 2, 1), (5, 6, 7, 8), (1, 2, 6, 5), (2, 3, 7, 6), (3, 4, 8, 7), (4, 1, 5, 8)]
+    lines = [f"v {x} {y} {z}" for x, y, z in points] + ["f " + " ".join(map(str, face)) for face in faces]
+    (tmp_path / "square.obj").write_text("\n".join(lines))
+    (tmp_path / "ball.obj").write_text("\n".join(lines))
+    ends = [[0.35, 0, 0.07], [0, 0.35, 0.07], [-0.35, 0, 0.07], [0, -0.35, 0.07]]
+    rock = [{"shape": "mesh", "mesh": str(tmp_path / "ball.obj"), "size": [0.2, 0.2, 0.2], "position": [0, 0, -50]}]
+    mesh = {"payload.shape": "mesh", "payload.mesh": str(tmp_path / "square.obj"), "payload.anchors": ends}
+    world = World(make_system(4, **mesh, **{"scene.obstacles": rock}), 1, 1)
+    middle = world.state.payload_position[0] + world.state.payload_rotation[0] @ world.system.payload_center
+    obstacles = Obstacles.zeros(1, 1)
+    place_obstacle(0, 0, obstacles, kind, size, tuple(middle + [0.33, 0.33, 0.0]))
+    # of the edge x + y = 0.4; the corner of an upright box is nearest to it, the edge of the rock is parallel
+    near = {SPHERE: 0.1, BOX: 0.1 / np.sqrt(2), HULL: 0.1 / np.sqrt(2)}[kind]
+    limits, lost, out = make_limits(world.system), np.zeros((1, 4), bool), np.zeros(1)
+    clearances(world.state, world.rig, limits, lost, world.nodes, obstacles, make_hulls(world.system), np.inf, out)
+    assert out[0] == pytest.approx((0.66 - 0.4) / np.sqrt(2) - near, abs=1e-6)
 
 
 def random_team(rng, **overrides) -> World:
