@@ -8,7 +8,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from multilift_marl.errors import ConfigError
+from multilift_marl.control.formation import goal_hook, hook_arm
+from multilift_marl.errors import ConfigError, warn_once
 from multilift_marl.kernels.jit import inlined, kernel
 from multilift_marl.math3d import add, matrow, mul, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.mdp import rewards
@@ -22,6 +23,7 @@ from multilift_marl.sim.contact import drone_half_size
 FAR = 0.5  # [m] from its target, at which a payload's pose earns half
 CREEP = 0.006  # [m/s] at which a margin is gone through
 MAX_MARGIN = 0.2  # of a cable's length
+LONG = 2.0  # [m] a cable whose swing the phases of plans are long enough for
 _SLACK_REACH = 0.9  # of its cable: the farthest that a drone stands from its anchor
 
 
@@ -124,9 +126,26 @@ def move_goal(e, goal, path, eased):
 
 @inlined
 def cable_chord(e, n, goal, rig):
-    """Return the vector from where anchor n is at the target pose of environment e to the slot of its drone [m]."""
+    """Return the vector from anchor n to the hook of its drone at the target of environment e [m]."""
     anchor = add(row(goal.position, e), mul(matrow(goal.rotation, e), row(rig.anchors, n)))
-    return sub(vec(goal.slots, e, n), anchor)
+    return sub(goal_hook(e, n, goal, rig), anchor)
+
+
+@inlined
+def held_force(e, n, v, fraction, cable_weight):
+    """Return what drone n holds of its nominal cable force, and of a slack cable half the weight (N,) [N]."""
+    carried = (0.0, 0.0, 0.5 * (1.0 - fraction) * cable_weight[n])
+    return add(scale(fraction, vec(v.goal.cable_force, e, n)), carried)
+
+
+@inlined
+def keep_hook(e, n, v, fraction, cable_weight):
+    """Move the slot of drone n, which leans less by a fraction of its cable force, so that its hook stays in place."""
+    goal, rig = v.goal, v.rig
+    if rig.hooked:
+        held, yaw = held_force(e, n, v, fraction, cable_weight), goal.drone_yaw[e]
+        shift = sub(hook_arm(n, vec(goal.cable_force, e, n), yaw, rig), hook_arm(n, held, yaw, rig))
+        put(goal.slots[e, n], add(vec(goal.slots, e, n), shift))
 
 
 @inlined
@@ -137,11 +156,10 @@ def scale_cable_force(e, n, v, fraction, cable_weight):
     with all accelerations, is taken off again.
     """
     goal, rig = v.goal, v.rig
-    cable_force = scale(fraction, vec(goal.cable_force, e, n))
+    held = held_force(e, n, v, fraction, cable_weight)
     # The mass that a nominal cable force lifts, times the slot's acceleration.
     idle = scale(-rig.force[n, 2] / GRAVITY, vec(goal.slot_acceleration, e, n))
-    carried = (0.0, 0.0, 0.5 * (1.0 - fraction) * cable_weight[n])
-    put(goal.cable_force[e, n], add(add(cable_force, idle), carried))
+    put(goal.cable_force[e, n], add(held, idle))
 
 
 @inlined
@@ -215,6 +233,21 @@ def margin_ratio(margin: float, system: System) -> np.ndarray:
             "be; lower it or raise cable.length"
         )
     return ratio
+
+
+def pace_of(pace: float, system: System) -> float:
+    """Return the pace of a plan for cables of up to 2 m; longer ones swing slower, and take longer as they do."""
+    return pace / max(1.0, sqrt(system.cable_length.max() / LONG))
+
+
+def warn_of_time(end: float, task: str, pace: float, seconds: float) -> None:
+    """Warn where a plan that is slower than usual, until `end` [s], does not fit into episodes of `seconds`."""
+    if pace < 1 and end > seconds:
+        warn_once(
+            "tasks",
+            f"so slowly, task {task} can succeed from {end:.1f} s on, but env.episode_seconds={seconds:g} ends before; "
+            f"raise it to {end + 1:.0f}",
+        )
 
 
 def paced(phase: tuple[float, float], pace: float, later: float = 0.0, longer: float = 0.0) -> tuple[float, float]:

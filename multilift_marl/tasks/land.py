@@ -20,14 +20,17 @@ from multilift_marl.mdp.ground import (
     Margin,
     Pace,
     cable_chord,
+    keep_hook,
     make_ground,
     margin_ratio,
     move_goal,
+    pace_of,
     paced,
     pull_fraction,
     readiness,
     scale_cable_force,
     set_resting_goal,
+    warn_of_time,
 )
 from multilift_marl.mdp.initial_states import set_equilibrium
 from multilift_marl.mdp.observations import Component, target_velocity
@@ -131,6 +134,7 @@ def advance(e, v):
     lower = ease(t, plan.lower[0], plan.lower[1])
     for n in range(rig.slots.shape[0]):
         chord = cable_chord(e, n, goal, rig)
+        keep_hook(e, n, v, own.pull_fraction[e], ground.cable_weight)
         put(goal.slots[e, n], add(vec(goal.slots, e, n), scale(-SHORTER * lower[0], chord)))
         put(goal.slot_velocity[e, n], scale(-SHORTER * lower[1], chord))
         put(goal.slot_acceleration[e, n], scale(-SHORTER * lower[2], chord))
@@ -249,6 +253,7 @@ class Land(Task):
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, system, e = self.options, self.world.system, self.world.num_envs
+        pace = pace_of(option.pace, system)
         ground = make_ground(system)
         margin_ratio(option.margin, system)  # of which cables have enough
         creeping = option.margin / CREEP
@@ -256,16 +261,18 @@ class Land(Task):
         self.own = LandArrays(np.zeros((e, 3)), np.zeros(e, np.int64), np.zeros(e), np.zeros(e))
         self.settings = LandSettings(
             ground=ground,
-            approach=paced(APPROACH, option.pace),
-            descend=paced(DESCEND, option.pace),
-            settle=paced(SETTLE, option.pace, longer=creeping),
-            release=paced(RELEASE, option.pace, later=creeping),
-            lower=paced(LOWER, option.pace, later=creeping),
+            approach=paced(APPROACH, pace),
+            descend=paced(DESCEND, pace),
+            settle=paced(SETTLE, pace, longer=creeping),
+            release=paced(RELEASE, pace, later=creeping),
+            lower=paced(LOWER, pace, later=creeping),
             radius=option.pad_radius,
             speed=option.touch_speed,
             clearance=option.clearance * min(ground.size, 1.0),
             drone_half=float(np.linalg.norm(half)),
         )
+        end = sum(self.settings.lower) + option.success_seconds
+        warn_of_time(end, self.name, pace, self.config.env.episode_seconds)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw the pad; the team hangs at rest above the origin. See `Task.start`."""

@@ -21,9 +21,11 @@ from multilift_marl.mdp.ground import (
     Pace,
     cable_chord,
     cable_rise,
+    keep_hook,
     make_ground,
     margin_ratio,
     move_goal,
+    pace_of,
     paced,
     place_on_ground,
     pull_fraction,
@@ -31,6 +33,7 @@ from multilift_marl.mdp.ground import (
     resting_distance,
     scale_cable_force,
     set_resting_goal,
+    warn_of_time,
 )
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import RestBounds, Term, action_rate, is_at_rest
@@ -121,6 +124,7 @@ def advance(e, v):
     for n in range(rig.slots.shape[0]):
         # along the cable: short of taut, a little beyond, then where the force puts the slot
         chord = cable_chord(e, n, goal, rig)
+        keep_hook(e, n, v, pulled[0], plan.ground.cable_weight)
         reach = -SLACK + (SLACK + TAUT) * tight[0] - TAUT * pulled[0] + plan.margin[n] * (crept - pulled[0])
         slot = add(vec(goal.slots, e, n), scale(reach, chord))
         # from its place on the ground: up first, inward faster and faster
@@ -131,7 +135,7 @@ def advance(e, v):
         put(goal.slot_velocity[e, n], _stretched(under, -2.0 * risen[0] * risen[1], -risen[1]))
         curved = risen[1] ** 2 + risen[0] * risen[2]
         put(goal.slot_acceleration[e, n], _stretched(under, -2.0 * curved, -risen[2]))
-        scale_cable_force(e, n, v, pulled[0], v.settings.ground.cable_weight)
+        scale_cable_force(e, n, v, pulled[0], plan.ground.cable_weight)
         own.peak[e] = max(own.peak[e], v.state.cable_tension[e, n] / v.resting_tension[n])
     own.stage[e] = _stage(e, v)
     v.mask.ignored[e] = IGNORED[own.stage[e]]
@@ -221,6 +225,7 @@ class Takeoff(Task):
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, system, e, n = self.options, self.world.system, self.world.num_envs, self.world.num_drones
+        pace = pace_of(option.pace, system)
         ground = make_ground(system)
         self._spread = option.start_spread * float(system.cable_length.min())
         self._distance = resting_distance(system, self._spread)
@@ -230,12 +235,14 @@ class Takeoff(Task):
             ground=ground,
             bounds=RestBounds.of(option),
             climb=option.target_height - ground.payload,
-            rise=paced(RISE, option.pace),
-            tighten=paced(TIGHTEN, option.pace, longer=creeping),
-            pull=paced(PULL, option.pace, later=creeping),
-            lift=paced(LIFT, option.pace, later=creeping),
+            rise=paced(RISE, pace),
+            tighten=paced(TIGHTEN, pace, longer=creeping),
+            pull=paced(PULL, pace, later=creeping),
+            lift=paced(LIFT, pace, later=creeping),
             margin=margin_ratio(option.margin, system),
         )
+        end = sum(self.settings.lift) + option.success_seconds
+        warn_of_time(end, self.name, pace, self.config.env.episode_seconds)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw where the payload and the drones are on the ground; see `Task.start`."""

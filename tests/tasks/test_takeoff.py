@@ -8,12 +8,13 @@ from conftest import make, refusal, zeros
 from test_scripted_flights import fly_once
 
 import multilift_marl as ml
+from multilift_marl.errors import warn_once
 from multilift_marl.math3d import axis_angle
 from multilift_marl.mdp.ground import CREEP, resting_distance
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.tasks import land, takeoff
-from multilift_marl.tasks.takeoff import FLYING, LIFT, LIFTED, PULL, RESTING, TIGHTEN
+from multilift_marl.tasks.takeoff import FLYING, LIFT, LIFTED, PULL, RESTING, SLACK, TAUT, TIGHTEN
 
 ARRIVED = LIFT[0] + LIFT[1]  # [s]
 CALM = {"randomization.payload_mass": 0.0}
@@ -144,6 +145,42 @@ def test_with_a_margin_drones_that_miss_their_places_snatch_less():
         assert vec.task.own.stage[0] == LIFTED
         peaks.append(float(vec.world.stats.tension_peak[0]))
     assert peaks[0] > 3 * peaks[1] and peaks[1] < 2 * vec.world.system.resting_tension.max()
+
+
+@pytest.mark.parametrize("hook", [[0.0, 0.0, -0.1], [0.02, 0.01, -0.06]])
+def test_hooks_of_level_drones_are_short_of_taut_by_as_much(hook):
+    """Drones lean as much as they pull, and their hooks are to stay where the cables end."""
+    vec = make("takeoff", num_envs=1, **{"cable.hook": hook}, **CALM)
+    vec.reset(seed=0)
+    system, state = vec.world.system, vec.world.state
+    for seconds, share in ((TIGHTEN[0], -SLACK), (PULL[0], TAUT)):
+        goal = at(vec, seconds)
+        turned = axis_angle((0.0, 0.0, 1.0), float(goal.yaw[0]))
+        level = np.array(turned).reshape(3, 3)  # payload and drones, whose headings are the payload's
+        hooks = goal.slots[0] + hook @ level.T
+        anchors = state.payload_position[0] + system.anchors @ level.T
+        np.testing.assert_allclose(np.linalg.norm(hooks - anchors, axis=1), 1.0 + share, atol=2e-4)
+    goal = at(vec, ARRIVED)
+    expected = goal.position[0] + system.slots @ level.T
+    np.testing.assert_allclose(goal.slots[0], expected, atol=1e-9)  # leaning as they do in flight
+
+
+@pytest.mark.parametrize("task", ["takeoff", "land"])
+@pytest.mark.parametrize("rig", [{"cable.hook": [0.02, 0, -0.08]}, {"cable.length": 3.0, "env.episode_seconds": 18.0}])
+def test_hooks_and_long_cables_leave_the_ground_and_come_to_it_gently(task, rig):
+    vec = make(task, num_envs=8, **rig)
+    _, success, failure = fly_once(vec, make_scripted("formation_integral", vec).act)
+    assert success.all() and not failure.any()
+
+
+@pytest.mark.parametrize("task", ["takeoff", "land"])
+def test_episodes_too_short_for_a_slow_plan_are_warned_of(task, caplog):
+    warn_once.cache_clear()
+    make(task, num_envs=1, **{"env.episode_seconds": 3.0})  # the usual plan, cut on purpose
+    assert not caplog.records
+    make(task, num_envs=1, **{"cable.length": 3.0})
+    [record] = caplog.records
+    assert f"task {task} can succeed from" in record.message and "env.episode_seconds=" in record.message
 
 
 @pytest.mark.parametrize("task", ["takeoff", "land"])

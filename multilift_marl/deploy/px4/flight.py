@@ -24,7 +24,7 @@ from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, FlightError
 from multilift_marl.evaluation.rollout import Trace, Tracer, measure_episodes
 from multilift_marl.math3d import ease, heading
-from multilift_marl.mdp.ground import MAX_MARGIN
+from multilift_marl.mdp.ground import MAX_MARGIN, pace_of
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
 from multilift_marl.sim.world import World
@@ -234,6 +234,7 @@ class Flight:
         """Return the configuration of another task by the same rig; it leaves the ground and comes to it gently."""
         if task in ("takeoff", "land"):
             options = {**options, "pace": _PACE, "margin": self.margin}
+            seconds /= pace_of(1.0, self.config.system)
         values = {key: value for key, value in self._flown.model_dump().items() if key not in _OWN}
         overrides = {f"task_options.{key}": value for key, value in options.items()}
         overrides |= {"task": task, "env.episode_seconds": seconds, "control.action": "reference"}
