@@ -10,7 +10,22 @@ from pydantic import Field
 from multilift_marl.control.formation import goal_hook, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import drawing, kernel
-from multilift_marl.math3d import add, axis_angle, matmul, matrow, mul, norm, put, putmat, rot_z, row, scale, sub, vec
+from multilift_marl.math3d import (
+    add,
+    axis_angle,
+    matmul,
+    matrow,
+    mul,
+    norm,
+    put,
+    putmat,
+    rot_z,
+    row,
+    scale,
+    sub,
+    unit,
+    vec,
+)
 from multilift_marl.rig.constants import RigArrays
 from multilift_marl.schema.values import Float, Section
 from multilift_marl.sim.cables.catenary import cable_end
@@ -67,7 +82,9 @@ def set_equilibrium(e, v, goal, equilibrium, pose, velocity, moved):
         anchor = add(payload, mul(attitude, row(rig.anchors, n)))
         cable = sub(add(goal_hook(e, n, goal, rig), moved), anchor)
         direction = scale(1.0 / norm(cable), cable)
-        # its tension in the middle, where the direction of a heavy cable is that of its chord
+        if equilibrium.cable_weight[n] > 0.0:
+            direction = unit(add(direction, _sag(e, n, goal, rig)))
+        # its tension in the middle
         half = (0.0, 0.0, 0.5 * equilibrium.cable_weight[n])
         tension = equilibrium.load * norm(sub(vec(goal.cable_force, e, n), half))
         end = cable_end(
@@ -84,6 +101,14 @@ def set_equilibrium(e, v, goal, equilibrium, pose, velocity, moved):
         cable_force = add(scale(tension, direction), half)
         hover_drone(e, n, state, cable_force, goal.drone_yaw[e] + rig.heading[n], equilibrium)
         place_at_hook(e, n, state, add(anchor, end), equilibrium.hooks)
+
+
+@kernel
+def _sag(e, n, goal, rig):
+    """Return the direction of the force in the middle of a heavy cable at the target, less that of its chord."""
+    anchor = add(row(goal.position, e), mul(matrow(goal.rotation, e), row(rig.anchors, n)))
+    middle = sub(vec(goal.cable_force, e, n), (0.0, 0.0, 0.5 * rig.cable_weight[n]))
+    return sub(unit(middle), unit(sub(goal_hook(e, n, goal, rig), anchor)))
 
 
 class TargetOptions(Section):

@@ -162,3 +162,26 @@ def test_impossible_chains_are_refused(key, value, complaint):
     message = refusal(make_system, 4, **{**CHAIN, key: value})
     assert message.startswith(key) or key == "cable.density"
     assert complaint in message
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        {"vehicle.preset": "iris", "cable.angle": 45.0},
+        {"env.num_drones": 8, "payload.shape": "cylinder", "payload.size": [0.5, 0.5, 0.2], "payload.mass": 0.5},
+        {"cable.hook": [0.02, 0.0, -0.05], "cable.length": [0.8, 1.0, 1.0, 1.2]},
+    ],
+)
+def test_heavy_chains_start_in_their_slots_and_stay_there(rig):
+    """Their sag is centimetres: the force in a chain's middle is not along the line between its ends."""
+    still = {f"task_options.start_{name}": 0.0 for name in ("radius", "tilt", "speed")}
+    known = {"randomization.payload_mass": 0.0, "randomization.payload_force": 0.0}
+    drones = rig.get("env.num_drones", 4)
+    vec = make("hover", 1, drones, **still, **known, **{"cable.model": "chain", "cable.density": 0.1}, **rig)
+    vec.reset(seed=0)
+    state, goal = vec.world.state, vec.task.goal
+    start = state.drone_position.copy()
+    np.testing.assert_allclose(start, goal.slots, atol=1e-5)
+    for _ in range(50):
+        vec.step(np.zeros((1, vec.num_drones, vec.action_size), np.float32))
+    assert np.abs(state.drone_position - start).max() < 1e-4
