@@ -77,7 +77,7 @@ def nearest(name: str, names: Iterable[str], full: Callable[[str], str] = str, o
     """
     names = sorted(names)
     known = _ELSEWHERE.get(name)
-    close = [known] if known in names else difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    close = [known] if known in names else difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     return f"; did you mean '{full(close[0])}'?" if close else f"; known: {', '.join(names)}{otherwise}"
 
 

@@ -44,7 +44,12 @@ def check_dagger(train: TrainConfig) -> None:
 
 def make_teacher(name: str, vec: MultiliftVec) -> Policy:
     """Return the teacher of a name, a baseline or one's own module:Class, for environments."""
-    return OwnPolicy(name, vec, "train.dagger.teacher") if ":" in name else make_scripted(name, vec)
+    if ":" in name:
+        return OwnPolicy(name, vec, "train.dagger.teacher")
+    try:
+        return make_scripted(name, vec)
+    except ConfigError as error:
+        raise ConfigError(f"train.dagger.teacher={name} cannot teach here: {error}") from None
 
 
 def taken_numbers(learner: Learner) -> torch.Tensor:

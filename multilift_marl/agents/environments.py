@@ -26,7 +26,10 @@ def training_environment(config: Config) -> Config:
     for key in config.train.overrides:
         if key.partition(".")[0] in ("task", "seed", "train", "eval"):
             raise ConfigError(f"train.overrides changes the environment and cannot hold '{key}'; set {key} itself")
-    environment = build_config(config.model_dump(), config.train.overrides)
+    try:
+        environment = build_config(config.model_dump(), config.train.overrides)
+    except ConfigError as error:
+        raise ConfigError(f"train.overrides: {error}") from error
     check_interface(config.train.residual, environment.control.action, "train.residual")
     for env in (config.env, environment.env):
         check_communication(config.train, env)

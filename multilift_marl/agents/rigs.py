@@ -32,12 +32,19 @@ def divide_rigs(environment: Config) -> list[Config]:
             "multiple of that"
         )
     share = {"env.num_envs": total // len(train.rigs)}
-    return [build_config(environment.model_dump(), rig | share) for rig in _checked(train.rigs)]
+    return [_build(environment, k, rig | share) for k, rig in enumerate(_checked(train.rigs), 1)]
 
 
 def evaluated_rigs(config: Config) -> list[Config]:
     """Return what a policy is evaluated with: the rigs, in the task's own environment."""
-    return [build_config(config.model_dump(), rig) for rig in _checked(config.train.rigs)] or [config]
+    return [_build(config, k, rig) for k, rig in enumerate(_checked(config.train.rigs), 1)] or [config]
+
+
+def _build(config: Config, k: int, rig: dict[str, Any]) -> Config:
+    try:
+        return build_config(config.model_dump(), rig)
+    except ConfigError as error:
+        raise ConfigError(f"rig {k} of train.rigs: {error}") from error
 
 
 def _checked(rigs: tuple[dict[str, Any], ...]) -> tuple[dict[str, Any], ...]:

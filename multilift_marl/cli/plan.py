@@ -58,6 +58,7 @@ def _plan(values: dict[str, Any]) -> int:
     options, overrides = split_options(Options, values)
     if (options.waypoints is None) == (options.file is None):
         raise ConfigError("give either waypoints=<list or CSV file> or file=<path>")
+    _check_keys(options, overrides)
     own: dict[str, Any] = {"path": "file", "file": options.file}
     if options.waypoints is not None:
         own = {"path": "waypoints", "waypoints": options.waypoints, "waypoint_times": options.times}
@@ -81,9 +82,11 @@ def _plan(values: dict[str, Any]) -> int:
         limits = option.speed, option.acceleration
         path = plan_waypoints(option.waypoints, option.waypoint_times, *limits, system)
         table, feasibility = path.table, assess_path(path.table, system, ranges)
+        for key in {"speed", "acceleration"} & options.model_fields_set if path.timed else ():
+            raise ConfigError(f"{key} means nothing beside times, which {path.name} has; leave out one of them")
         print("way-points at " + ", ".join(f"{time:.2f}" for time in path.times) + " s")
         if feasibility.violation is not None:
-            refusal = describe_violation(path, feasibility.violation)
+            refusal = describe_violation(path, feasibility.violation, "")
     print(f"{table[-1, 0]:.2f} s, {system.num_drones} drones\n\n{_format(feasibility)}")
     if options.plot is not None:
         from multilift_marl.evaluation.plots import plot_plan
@@ -97,6 +100,21 @@ def _plan(values: dict[str, Any]) -> int:
         write_whole(_place(options.out), ("\n".join(lines) + "\n").encode())
         print(f"wrote {options.out}; fly it by task_options.path=file task_options.file={options.out}")
     return 0
+
+
+def _check_keys(options: Options, overrides: dict[str, Any]) -> None:
+    """Refuse, by a ConfigError, keys that mean nothing beside others, and names of files of other kinds."""
+    for key in ("path", "file", "waypoints", "waypoint_times", "speed", "acceleration"):
+        if f"task_options.{key}" in overrides:
+            own = {"path": "waypoints or file", "waypoint_times": "times"}.get(key, key)
+            raise ConfigError(f"task_options.{key} means nothing to this command; set {own}")
+    for key in ("times", "speed", "acceleration"):
+        if key in options.model_fields_set and options.file is not None:
+            raise ConfigError(f"{key} means nothing beside file, a path with its own times; leave out one of them")
+    for key, ending in (("out", ".csv"), ("plot", ".png")):
+        name = getattr(options, key)
+        if name is not None and not name.lower().endswith(ending):
+            raise ConfigError(f"{key}={name} is written as {ending[1:].upper()}; give a name that ends in {ending}")
 
 
 def _format(feasibility: Feasibility) -> str:

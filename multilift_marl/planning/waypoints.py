@@ -35,6 +35,8 @@ class WaypointPath(NamedTuple):
     """(K,) at which they are passed [s]."""
     table: np.ndarray
     """(T, 13) the polynomials as a spline, see `spline.fit_spline`."""
+    timed: bool
+    """Whether times were given, in place of speed and acceleration."""
 
 
 def load_waypoints(
@@ -80,6 +82,7 @@ def plan_waypoints(
     given = written if times is None else np.array(times, float)
     _check_waypoints(name, values, given, system)
     values[:, 3] = np.unwrap(values[:, 3])
+    timed = given is not None
     if given is None:
         _check_limits(name, speed, acceleration)
         # The yaw counts as the way of the outermost slot.
@@ -96,14 +99,21 @@ def plan_waypoints(
     step = max(_STEP, 2 * passed[-1] / MAX_ROWS)
     pieces = [np.linspace(a, b, int((b - a) / step) + 2)[1:] for a, b in zip(passed[:-1], passed[1:], strict=True)]
     rows = np.concatenate([np.zeros(1), *pieces])
-    return WaypointPath(name, passed, np.hstack([rows[:, None], spline(rows), spline(rows, 1), spline(rows, 2)]))
+    table = np.hstack([rows[:, None], spline(rows), spline(rows, 1), spline(rows, 2)])
+    return WaypointPath(name, passed, table, timed)
 
 
-def describe_violation(path: WaypointPath, violation: Margin) -> str:
-    """Return which limit is exceeded between which way-points, and what to change, as one sentence."""
+def describe_violation(path: WaypointPath, violation: Margin, prefix: str = "task_options.") -> str:
+    """Return which limit is exceeded between which way-points, and what to change, as one sentence.
+
+    Args:
+        path, violation: what is wrong.
+        prefix: of the keys speed and acceleration.
+    """
     after = int(np.clip(np.searchsorted(path.times, violation.time), 1, len(path.times) - 1))
     cures = {"height": "place way-points higher", "distance": "turn more slowly, or take longer cables"}
-    cure = cures.get(violation.quantity, "give it more time, or lower task_options.speed or task_options.acceleration")
+    slower = "give it more time" if path.timed else f"lower {prefix}speed or {prefix}acceleration"
+    cure = cures.get(violation.quantity, slower)
     return f"{path.name} cannot be flown: between way-points {after} and {after + 1}, {violation}; {cure}"
 
 

@@ -241,7 +241,13 @@ class Loss(Task):
             ConfigError: they have to, but measure nothing of them, or would not feel each loss.
         """
         known, early = self.config.env, self.options.loss_time[0]
-        if self.options.broadcast or known.sensing not in ("onboard", "blind") or known.communication != "none":
+        if self.options.broadcast:
+            return False
+        if self.world.system.payload_shape == "point":
+            raise ConfigError(
+                "payload.shape=point does not tilt, by which drones notice a loss; set task_options.broadcast=true"
+            )
+        if known.sensing not in ("onboard", "blind") or known.communication != "none":
             return False
         why = ""
         if known.sensing == "onboard":

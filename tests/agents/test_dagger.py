@@ -157,7 +157,10 @@ def test_a_teacher_with_the_truth_flies_as_if_nothing_disturbed_its_senses(teach
         ({"train.gru": 8}, "dagger has no train.gru"),
         ({"train.dagger.teacher": "formation_rout"}, "formation_route"),
         ({"train.dagger.teacher": "hold_ctbr"}, "control.action=ctbr"),
-        ({"train.dagger.teacher": "formation_route"}, "navigate"),
+        (
+            {"train.dagger.teacher": "formation_route"},
+            "train.dagger.teacher=formation_route cannot teach here: .*navigate",
+        ),
         ({"train.dagger.capacity": 10**12, "train.frames": 10**12}, "lower train.dagger.capacity"),
     ],
 )

@@ -258,7 +258,10 @@ def test_overrides_change_the_environment_of_training_alone(tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"train.overrides": {"env.episode_second": 1.0}}, r"unknown key 'env\.episode_second'; did you mean"),
+        (
+            {"train.overrides": {"env.episode_second": 1.0}},
+            r"train\.overrides: unknown key 'env\.episode_second'; did you mean",
+        ),
         ({"train.overrides": {"train.frames": 5}}, r"cannot hold 'train\.frames'; set train\.frames itself"),
         ({"train.algorithm": "ippo", "train.critic": "set"}, r"train\.critic=set is of mappo"),
         ({"train.actor": "attention", "train.hidden": (16, 30)}, r"last of train\.hidden must be a multiple of 4"),

@@ -144,3 +144,13 @@ def test_a_table_has_means_and_intervals_in_its_units():
     found = (flown["failure_cause"] == 1).mean()
     assert rows["ground [%]"][0].startswith(f"{100 * found:.1f} (")
     assert "tilt [%]" not in rows  # nobody has failed so
+
+
+def test_a_row_that_one_policy_has_stands_in_the_table():
+    one, other = summarize(episodes()), summarize(episodes(seed=1))
+    key, heading, *_ = next(row for row in _ROWS if row[0] in one)
+    lines = format_table({"policy": one, "baselines": {"script": other | {key: None}}}, "mine").splitlines()
+    [line] = [each for each in lines if each.startswith(f"| {heading} ")]
+    assert line.rstrip(" |").endswith("-") and line.count("(") == 1
+    gone = format_table({"policy": one | {key: None}, "baselines": {"script": other | {key: None}}}, "mine")
+    assert f"| {heading} " not in gone

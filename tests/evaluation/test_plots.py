@@ -7,7 +7,7 @@ import pytest
 import multilift_marl as ml
 from multilift_marl.evaluation import plots
 from multilift_marl.evaluation.outline import payload_surface
-from multilift_marl.evaluation.rollout import trace_episode
+from multilift_marl.evaluation.rollout import Trace, trace_episode
 from multilift_marl.policies.baselines import make_scripted
 
 L_SHAPE = """
@@ -49,6 +49,7 @@ def test_the_surface_of_a_mesh_is_its_own_and_a_point_has_none(l_shape):
     assert volume == pytest.approx(4 / 6 * 0.4 * 0.6 * 0.2)  # an L of 4 of 6 squares
     np.testing.assert_allclose(centre, 0, atol=1e-9)  # its centre of mass
     assert payload_surface(ml.load_config("hover", {"payload.shape": "point"}).system).shape == (0, 3, 3)
+    assert Trace._field_defaults["surface"].shape == (0, 3, 3)
 
 
 def test_paths_show_the_outline_and_the_anchors(tmp_path, monkeypatch):

@@ -238,6 +238,14 @@ def test_the_command_writes_what_is_flown_and_says_what_is_left(tmp_path, capsys
         (["waypoints=[[0,0,2],[1,1,2]]", "config=hover"], "is of task hover"),
         (["waypoints=[[0,0,2],[1,1,2]]", "env.num_drones=1"], "two anchors or more"),
         (["waypoints=[[0,0,2],[1,1,2]]", "speed=0"], "speed must be from"),
+        (["waypoints=[[0,0,2],[9,1,2]]", "speed=40", "acceleration=90"], "; lower speed or acceleration"),
+        (["waypoints=[[0,0,2],[9,1,2]]", "times=[0,0.5]"], "; give it more time"),
+        (["waypoints=[[0,0,2],[1,1,2]]", "task_options.speed=1"], "means nothing to this command; set speed"),
+        (["waypoints=[[0,0,2],[1,1,2]]", "task_options.waypoint_times=[0,9]"], "this command; set times"),
+        (["waypoints=[[0,0,2],[1,1,2]]", "times=[0,9]", "speed=2"], "speed means nothing beside times"),
+        (["file=a.csv", "acceleration=3"], "acceleration means nothing beside file"),
+        (["waypoints=[[0,0,2],[1,1,2]]", "out=a.npz"], "out=a.npz is written as CSV; give a name that ends in .csv"),
+        (["waypoints=[[0,0,2],[1,1,2]]", "plot=a.foo"], "plot=a.foo is written as PNG"),
     ],
 )
 def test_the_command_refuses_in_a_sentence(arguments, said, capsys, tmp_path, monkeypatch):

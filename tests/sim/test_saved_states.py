@@ -105,6 +105,25 @@ def test_the_state_of_another_system_is_refused(vec, other):
     World(vec.config.system, 2, 1).load_state_dict(vec.world.state_dict())
 
 
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"control.action": "ctbr"},
+        {"control.action": "velocity"},
+        {"control.position_frequency": 2.0},
+        {"env.units": "cable"},
+    ],
+)
+def test_the_state_under_another_controller_is_refused(vec, other):
+    """Its last action and filters would mean something else."""
+    saved = make(num_envs=2, **other).state_dict()
+    before = vec.state_dict()
+    with pytest.raises(ValueError, match=r"is that of another|has shape"):
+        vec.load_state_dict(saved)
+    assert same(vec.state_dict(), before)
+    vec.load_state_dict({key: array for key, array in before.items() if key != "control"})  # of an older version
+
+
 def test_an_environment_that_diverged_may_hold_anything(vec):
     saved = vec.state_dict()
     saved["world.diverged"] = np.array([False, True])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import make, zeros
+from conftest import GRAVITY, make, zeros
 from test_scripted_flights import fly_once
 
 from multilift_marl.config.load import load_config
@@ -215,3 +215,13 @@ def test_the_slow_last_part_of_the_descent_scales_with_the_vehicle():
         task.stages["plan"](0, 1)
     assert ground.size < 0.5
     assert task.goal.position[0, 2] - ground.payload == pytest.approx(NEAR * ground.size, rel=1e-6)
+
+
+def test_cables_that_are_not_yet_slack_are_missed_by_what_they_pull_beyond_their_own_weight():
+    vec = make("land", num_envs=2, **{"cable.model": "chain", "cable.density": 0.05})
+    vec.reset(seed=0)
+    weight = GRAVITY * 0.05 * vec.world.system.cable_length
+    [criterion] = [each for each in vec.task.criteria() if each.name == "cable_force_n"]
+    expected = (vec.world.state.cable_tension - weight).max(axis=1)
+    assert (expected > 1).all()
+    np.testing.assert_allclose(criterion.excess(), expected)

@@ -148,6 +148,9 @@ def test_the_reward_counts_what_a_snatch_adds_to_the_largest_tension():
 
 def test_one_drone_cannot_lose_itself():
     assert "raise env.num_drones" in refusal(make, "loss", num_drones=1)
+    message = refusal(make, "loss", **{"payload.shape": "point"})
+    assert message.startswith("payload.shape=point does not tilt") and "set task_options.broadcast=true" in message
+    make("loss", **{"payload.shape": "point", "task_options.broadcast": True})
     for task in ("loss", "recover"):
         message = refusal(make, task, **{"task_options.target_height": (2.0, 1.5)})
         assert "task_options.target_height" in message and "must list the lower one first" in message

@@ -223,6 +223,15 @@ def cause(vec) -> str:
     return vec.failure_causes[vec.task.cause[0]]
 
 
+def test_tensions_are_compared_with_those_at_rest_of_the_true_payload():
+    vec = make("takeoff", num_envs=3, **{"payload.mass": 0.8, "randomization.payload_mass": 0.2})
+    vec.reset(seed=0)
+    true = vec.world.hidden_loads.payload_mass
+    expected = vec.world.system.resting_tension.max() * true / 0.8
+    assert np.ptp(true) > 0.01
+    np.testing.assert_allclose(vec.task._resting_tension(), expected)
+
+
 def test_drones_may_touch_the_ground_until_they_fly():
     vec = after(0.2)
     assert vec.task.own.stage[0] == RESTING and cause(vec) == "none"
