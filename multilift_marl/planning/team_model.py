@@ -17,12 +17,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from multilift_marl.errors import warn_once
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.physical import AIR_DENSITY, GRAVITY
 from multilift_marl.rig.system import System
 
 LOCAL = 13  # what the law of a drone depends on: attitude 3, body rates 3, c 2, ċ 2, thrust vector 3
 _STEEPEST = 0.1  # least vertical component of a cable's unit vector that the chart is used with
+HEAVY = 0.15  # [-] of the payload: weight of the cables above which sag matters
 SLOW = 1e-6  # [m²/s²] that makes the drag smooth at rest
 
 
@@ -46,6 +48,17 @@ class TeamModel(NamedTuple):
 def has_model(system: System) -> bool:
     """Return whether there is a model of a team: its payload is a point, or has anchors apart from each other."""
     return not system.anchors.any() or bool(np.ptp(system.anchors, axis=0).max() > 1e-9)
+
+
+def warn_of_heavy_cables(system: System) -> None:
+    """Warn where cables weigh so much that the model's straight ones lead a team astray."""
+    share = float(system.cable_mass.sum()) / system.payload_mass
+    if share > HEAVY:
+        warn_once(
+            "planning",
+            f"plans are of straight cables, but these weigh {share:.0%} of the payload and sag: teams of policy=mpc "
+            "may be lost; lower cable.density, or take another policy",
+        )
 
 
 def make_model(system: System) -> TeamModel:

@@ -18,7 +18,7 @@ from multilift_marl.planning.approach import Approach, begin_approaches, write_a
 from multilift_marl.planning.flatness import SAMPLES, SHAPES, STEP
 from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.hard_planner import HardPlanner
-from multilift_marl.planning.team_model import has_model
+from multilift_marl.planning.team_model import has_model, warn_of_heavy_cables
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.policies.full_state_command import FullStateCommand, rotations
@@ -84,6 +84,7 @@ class TeamMpc:
                 "policy=mpc plans for bodies with two anchors or more, apart, and for points; set payload.shape=point, "
                 "or take another policy for this rig"
             )
+        warn_of_heavy_cables(system)
         rejection = config.control.disturbance
         if config.planner.estimate and rejection != "none":
             raise ConfigError(
