@@ -9,6 +9,11 @@ combinations are flown, see `is_redundant`.
 
 from __future__ import annotations
 
+import os
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # before numpy: the threads of its BLAS would wait for other workers' cores
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import importlib.util
 import signal
 import sys
