@@ -12,6 +12,7 @@ from multilift_marl.sim.world import Shard, World
 
 Measured = dict[str, np.ndarray]
 """Fields of `SystemState` by name, of one environment."""
+APART = 0.2  # [m] of two plans of one target, in which a step or two pass
 _PERFECT = {"env.sensing": "ideal", "env.communication": "none"} | {
     f"randomization.{name}": value
     for name, value in (
@@ -53,16 +54,20 @@ class MeasuredTeam(MultiliftVec):
         self._closing = 1.0 - np.exp(-dt / np.array(times))[..., None]  # of the gap in a tick, (2, N, 1)
 
     def begin(
-        self, measured: Measured, seed: int | None = None, target: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> np.ndarray:
+        self, measured: Measured, seed: int | None = None, target: tuple[np.ndarray, np.ndarray] | None = None,
+        heard: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
         """Begin an episode where the team is, and return its first observation; see `failure`.
 
         Args:
             measured: the state.
             seed: of the episode, whose target the task draws; None for the next one.
             target: position (3,) [m] and rotation (3, 3) of the payload in place of those drawn.
+            heard: position (3,) [m] of a target that another, such as a simulation that may have gone on, plans by the
+                same seed: where the next episode's is there, that one begins.
         """
-        self.reset(seed=seed)
+        if heard is None or not self._goes_on(heard):
+            self.reset(seed=seed)
         if target is not None:
             self.task.place_goal(0, *target)
         self._put(measured)
@@ -71,6 +76,11 @@ class MeasuredTeam(MultiliftVec):
         self._observe(0)
         self._history.begin(0)
         return self._stacked.copy()
+
+    def _goes_on(self, heard: np.ndarray) -> bool:
+        """Draw the next episode, and return whether its target begins where one is heard."""
+        self.reset()
+        return bool(np.linalg.norm(heard - self.task.goal.position[0]) < APART)
 
     def command(self, action: np.ndarray) -> Reference:
         """Take actions (1, N, A) in [-1, 1]; return the references, whose commands are those of the actions.

@@ -71,6 +71,11 @@ class EnvConfig(Section):
     )
 
     @property
+    def length(self) -> float:
+        """How long an episode is [s]: `episode_seconds` in whole policy steps."""
+        return round(self.episode_seconds * self.policy_hz) / self.policy_hz
+
+    @property
     def ages(self) -> tuple[int, ...]:
         """How many steps ago each observation is that drones hold."""
         return tuple(range(self.history)) if isinstance(self.history, int) else self.history

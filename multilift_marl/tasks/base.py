@@ -253,7 +253,7 @@ class Task:
     def succeeded(self) -> np.ndarray:
         """Return which environments (E,) would be successes if they ended now: good for the last seconds, or all."""
         seconds: float = getattr(self.options, "success_seconds", 0.0)
-        return self.good_time >= min(seconds, self.config.env.episode_seconds) - 1e-9
+        return self.good_time >= min(seconds, self.config.env.length) - 1e-9
 
     def criteria(self) -> tuple[Criterion, ...]:
         """Return what a success needs beside time, for reports; who overrides `succeeded` overrides this, too."""
@@ -263,7 +263,7 @@ class Task:
 
     def success_windows(self) -> tuple[tuple[float, float], ...]:
         """Return from when to when [s] an episode has to be within the success region throughout."""
-        length = self.config.env.episode_seconds
+        length = self.config.env.length
         return ((length - min(getattr(self.options, "success_seconds", 0.0), length), length),)
 
     def metrics(self) -> dict[str, np.ndarray]:

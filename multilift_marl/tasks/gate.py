@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl.control.formation import place_formation
+from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import drawing, inlined, kernel
 from multilift_marl.math3d import add, ease, mat, matrow, mul, put, putmat, rot_z, row, sub, triple, vec
 from multilift_marl.mdp.criteria import ArrivalOptions, Criterion, rest_criteria, tension_criterion
@@ -309,7 +310,7 @@ class Gate(Task):
         "action_rate": Term(-0.05, action_rate),
     }
     CAN_PLAN: ClassVar[bool] = False
-    KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, update=find_touch)
+    KERNELS: ClassVar[Kernels] = Kernels(is_good=has_arrived, plan=advance_target, check=find_touch)
     EXTRA: ClassVar[tuple[Component, ...]] = (
         Component("target_velocity", 2, "slot", "m/s", "horizontal velocity of the target", target_velocity, True),
         Component(
@@ -327,6 +328,11 @@ class Gate(Task):
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, system, e = self.options, self.world.system, self.world.num_envs
+        if option.arrival <= option.set_off:
+            raise ConfigError(
+                f"task_options.arrival={option.arrival:g} s must be later than set_off={option.set_off:g} s, when the "
+                "target leaves; raise it"
+            )
         x = SPACING * (np.arange(option.gates) - (option.gates - 1) / 2)
         drone = np.array([drone_half_size(vehicle) for vehicle in system.vehicles])
         clear = THICKNESS / 2 + np.linalg.norm(drone[:, :2], axis=1) + SPARE

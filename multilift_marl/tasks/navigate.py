@@ -38,6 +38,7 @@ from multilift_marl.tasks.base import Kernels, Task
 Place = Annotated[Vector, Between(-1e3, 1e3, "m")]
 SPARE = 0.10  # [m] of clearance that the reward asks for
 FAR = 9.0  # [m] that a goal is seen to be away at most, of four falcons: beyond all of the usual length
+APART = 0.01  # [m] that start and goal of a given map are at least
 ROOM = 2.0  # [m] of the payload's space about a given map
 PEAK = 35.0 / 16.0  # of an eased motion's speed over its mean, see `math3d.ease`
 
@@ -208,6 +209,10 @@ def given_map(option: NavigateOptions, system: System, obstacles: Obstacles) -> 
     used = obstacles.kind[0] != NONE
     # Spheres about them, whatever way they are turned.
     far = np.linalg.norm(obstacles.size[0, used], axis=1, keepdims=True)
+    if np.linalg.norm(goal - start) < APART:
+        raise ConfigError(
+            f"task_options.start and goal are less than {APART:g} m apart, and there is no way between them; move one"
+        )
     points = np.vstack([start, goal, obstacles.center[0, used] - far, obstacles.center[0, used] + far])
     low = points.min(axis=0) - ROOM if option.low is None else np.array(option.low)
     high = points.max(axis=0) + ROOM if option.high is None else np.array(option.high)
@@ -287,7 +292,7 @@ class Navigate(Task):
     def metrics(self) -> dict[str, np.ndarray]:
         """See `Task.metrics`; `arrival_time_s` is the whole episode's where the payload is not at rest at the goal."""
         straight = np.linalg.norm(self.own.goal - self.own.start, axis=1)
-        arrived = np.where(self.good_time > 0, self.time - self.good_time, self.config.env.episode_seconds)
+        arrived = np.where(self.good_time > 0, self.time - self.good_time, self.config.env.length)
         return super().metrics() | {"arrival_time_s": arrived, "path_length_ratio": self.own.travelled / straight}
 
     def criteria(self) -> tuple[Criterion, ...]:

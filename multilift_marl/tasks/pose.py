@@ -106,8 +106,8 @@ def note_reached(e, v):
     settings, stage = v.settings, v.own.plan.stage[e]
     begin = stage * settings.hold
     end = min(begin + settings.hold, settings.length)
-    # Time is a sum of steps: half a step less, for round-off.
-    if v.time[e] > end - 0.5 * v.dt:
+    # In the last policy step before the next target, which begins between two of them or, to round-off, with one.
+    if v.time[e] > end - v.dt + 1e-6:
         v.own.reached[e, stage] = v.good_time[e] >= min(settings.success_seconds, end - begin) - 1e-9
 
 
@@ -190,7 +190,7 @@ class Pose(Task):
                 f"task_options.way_seconds={option.way_seconds:g} must not exceed target_seconds="
                 f"{option.target_seconds:g}: the plan would never arrive"
             )
-        length = self.config.env.episode_seconds
+        length = self.config.env.length
         hold = min(option.target_seconds, length)
         # The last target may have less time than the others; round-off must not add one that has none.
         targets = ceil(length / hold - 1e-9)

@@ -61,6 +61,25 @@ def test_a_measured_team_observes_what_the_simulated_one_does(task):
             np.testing.assert_allclose(array, getattr(vec.reference, name), atol=1e-9, err_msg=name)
 
 
+@pytest.mark.parametrize("heard", ["next", "first", None])
+def test_a_task_that_begins_anew_follows_a_simulation_to_its_next_episode(heard):
+    """By the target that it publishes; without one the episode begins again."""
+    config = config_of("pose_easy")
+    vec, team = MultiliftVec(config, EVALUATION), MeasuredTeam(config)
+    vec.reset(seed=7)
+    team.begin(measure(vec), 7)
+    first = vec.task.goal.position[0].copy()
+    vec.reset(mask=np.ones(1, bool))
+    following = vec.task.goal.position[0].copy()
+    assert np.linalg.norm(following - first) > 0.3
+    team.begin(measure(vec), 7, None, {"next": following, "first": first, None: None}[heard])
+    np.testing.assert_array_equal(team.task.goal.position[0], following if heard == "next" else first)
+    vec.reset(mask=np.ones(1, bool))
+    if heard == "next":
+        team.begin(measure(vec), 7, None, vec.task.goal.position[0])
+        np.testing.assert_array_equal(team.task.goal.position[0], vec.task.goal.position[0])
+
+
 def test_rotors_that_nobody_measures_close_their_gap_by_the_motors_lags():
     lags = {"vehicle.rotor_time_constant_up": [0.03, 0.06], "vehicle.rotor_time_constant_down": [0.05, 0.1]}
     config = config_of(**lags)

@@ -252,6 +252,13 @@ def test_the_command_says_how_it_went(capsys):
     assert "simulated 0.5 s" in output and "steps without a fresh set-point, by drone: [25, 25]" in output
 
 
+@pytest.mark.parametrize("names", ["report", "crazyswarm2"])
+def test_autopilots_fly_whatever_the_action_interface(names, capsys):
+    wait = ["policy=none", "seconds=0.1", "speed=0", f"domain={DOMAIN}", "env.num_drones=2"]
+    assert command.main([*wait, "config=hover_ctbr", f"names={names}"]) == 0
+    assert "simulated 0.1 s" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [

@@ -170,3 +170,15 @@ def test_a_failure_ends_the_episode():
             break
     assert terminated.tolist() == info["failure"].tolist() == [False, True, False]
     assert not info["diverged"].any()
+
+
+@pytest.mark.parametrize("seconds", [1.0, 1.01, 1.03, 1.05])
+def test_success_is_asked_for_within_the_steps_that_an_episode_has(seconds):
+    """An episode of 1.01 s has 50 steps of 20 ms: success throughout its last second is success throughout it."""
+    easy = {"task_options.success_distance": 5.0, "task_options.success_angle": 90.0}
+    calm = {"randomization.payload_mass": 0.0, "randomization.payload_force": 0.0}
+    vec = make("hover", 2, **easy, **calm, **{"env.episode_seconds": seconds, "task_options.success_seconds": 9.0})
+    vec.reset(seed=0)
+    for _ in range(vec.max_steps):
+        *_, info = vec.step(zeros(vec))
+    assert info["success"].all()

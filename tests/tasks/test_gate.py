@@ -171,3 +171,18 @@ def test_a_formation_drawn_in_passes_level():
     vec = make("hover", num_envs=1)
     assert "formation_narrow" not in fitting_scripts(vec)
     assert "formation_narrow is for gaps" in refusal(make_scripted, "formation_narrow", vec)
+
+
+@pytest.mark.parametrize("times", [(8.0, 5.0), (5.0, 5.0), (12.0, 11.0)])
+def test_a_target_that_arrives_before_it_leaves_is_refused(times):
+    given = dict(zip(("task_options.set_off", "task_options.arrival"), times, strict=True))
+    assert "must be later than set_off" in refusal(make, "gate", **given)
+
+
+def test_no_team_starts_in_a_wall():
+    """Starts that would are drawn again, as others that fail."""
+    vec = make("gate", 64, **{"task_options.start_radius": 3.0})
+    vec.reset(seed=0)
+    for _ in range(3):
+        *_, info = vec.step(zeros(vec))
+    assert not (info["failure_cause"] == vec.failure_causes.index("wall")).any()

@@ -162,6 +162,12 @@ def test_scenes_without_room_for_a_map_are_refused():
     assert "pillars" in refusal(make, "navigate", **{"task_options.pillars": [8, 3]})
 
 
+def test_a_given_way_has_a_length():
+    place = {"task_options.level": "given", "scene.reserved": 0, "task_options.start": [0, 0, 1.5]}
+    assert "less than 0.01 m apart" in refusal(make, "navigate", **place, **{"task_options.goal": [0, 0, 1.505]})
+    make("navigate", **place, **{"task_options.goal": [0, 0, 1.52]}).reset()
+
+
 def test_configured_obstacles_stay_beside_those_of_maps():
     beam = {"shape": "box", "size": [0.1, 0.1, 0.1], "position": [0, 0, 9]}
     vec = make("navigate", num_envs=2, **{"scene.obstacles": [beam]})

@@ -156,6 +156,21 @@ def test_success_needs_the_last_second_of_every_target():
     assert same(info["success"], expected)
 
 
+@pytest.mark.parametrize("seconds", [2.24, 2.25, 10 / 3, 3.015])
+def test_targets_may_change_between_two_policy_steps(seconds):
+    """Each is marked in the last step that belongs to it, wherever in the step the next one begins."""
+    near = {"success_distance": 1.0, "success_angle": 60, "target_xy": 0.05, "target_tilt": 0, "target_yaw": 2}
+    options = near | {
+        "success_seconds": 0.5,
+        "way_seconds": 1.5,
+        "target_seconds": seconds,
+        "target_height": [1.5, 1.5],
+    }
+    vec = make("pose", 2, **{f"task_options.{key}": value for key, value in options.items()})
+    *_, (_, info) = flown(vec, vec.max_steps)
+    assert info["success"].all()
+
+
 @pytest.mark.slow
 def test_the_best_script_solves_nine_of_ten_easy_episodes():
     for script in ("formation_integral", "payload_geometric"):

@@ -17,7 +17,6 @@ from multilift_marl.deploy.ros.stages import Stage
 from multilift_marl.deploy.ros.types import read_place, stamp_ns
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
-from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
 
 
@@ -70,6 +69,20 @@ class SetPoints:
         numbers = [c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]]
         action = np.stack([*(number / control.max_offset for number in numbers), turned / control.max_yaw], axis=-1)
         return np.clip(action, -1, 1)[None].astype(np.float32)
+
+
+class Idle:
+    """A policy whose actions do not count: autopilots fly by the set-points of others."""
+
+    def __init__(self, vec: MultiliftVec):
+        self._action = np.zeros((1, vec.num_drones, vec.action_size), np.float32)
+
+    def reset(self, mask: np.ndarray | None = None) -> None:
+        """Do nothing."""
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return zeros (1, N, A)."""
+        return self._action
 
 
 def read_stamped(message: Any) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
@@ -148,7 +161,7 @@ class LiveFlight:
             autopilots = TopicAutopilots(vec.config, vec.world, take)
             vec.use_controller(autopilots)
             self.answers = autopilots.answers
-            policy = make_scripted("formation", vec)  # whose actions do not count
+            policy = Idle(vec)
         elif policy is None:
             policy = SetPoints(vec, subscribe_setpoints(node, names, vec.num_drones))
             self.answers = policy.answers

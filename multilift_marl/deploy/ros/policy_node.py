@@ -46,7 +46,7 @@ from multilift_marl.deploy.ros.types import (
     read_vehicle_odometry,
     trajectory_setpoint,
 )
-from multilift_marl.envs.measured import MeasuredTeam
+from multilift_marl.envs.measured import APART, MeasuredTeam
 from multilift_marl.errors import ConfigError
 from multilift_marl.mdp.failures import MAX_DISTANCE
 from multilift_marl.policies.policy import Policy
@@ -57,7 +57,6 @@ WAITING, READY, FLYING, HOLDING, LANDING = "waiting", "ready", "flying", "holdin
 _LEAP, _LEAP_ACCELERATION = 0.1, 20.0  # [m], [m/s²]: what is farther off than these was put elsewhere
 _LEAPS = 5  # steps in a row of that, after which the task begins anew
 _SAME = 1e-9  # [m], and of a rotation's numbers, by which targets differ only in rounding
-_APART = 0.2  # [m] of two plans of one target, in which a step or two pass
 _REMIND = 2.0  # [s] between words about what is waited for
 _REMEMBERED = 1_000_000  # steps of which the latency is known
 Say = Callable[[str], None]
@@ -103,6 +102,7 @@ class PolicyNode:
         self.mode, self.steps, self.latency = WAITING, 0, deque[float](maxlen=_REMEMBERED)
         self._plans = self.team.task.KERNELS.plan is not None
         self._target: tuple[np.ndarray, np.ndarray] | None = None
+        self._heard: np.ndarray | None = None  # the last target of others [m], where this task plans its own
         self._before: tuple[np.ndarray, np.ndarray, int] | None = None  # positions, velocities, stamp of the last step
         self._woken = self._flown = self._sent = self._reminded = self._refused = 0.0  # [s]
         self._leaps, self._why = 0, ""
@@ -242,8 +242,8 @@ class PolicyNode:
 
     def _compare(self, target: np.ndarray) -> None:
         """Say, where this task plans its target, that others have another one."""
-        off = float(np.linalg.norm(target - self.team.task.goal.position[0]))
-        if self.mode == FLYING and off > _APART and self._woken > self._refused + _REMIND:
+        self._heard, off = target, float(np.linalg.norm(target - self.team.task.goal.position[0]))
+        if self.mode == FLYING and off > APART and self._woken > self._refused + _REMIND:
             self._refused = self._woken
             self._say(f"/target is {off:.1f} m from the target planned here: give both the same seed and task")
 
@@ -282,14 +282,14 @@ class PolicyNode:
         if self._target is None and not self._plans:
             self._why = "no /target is heard"
             return None
-        observation = self.team.begin(self._bodies.measured, self._seed, self._target)
+        heard = None if self._before is None else self._heard
+        observation = self.team.begin(self._bodies.measured, self._seed, self._target, heard)
         self._why = f"the task has failed where the team is, {self.team.failure}" if self.team.failure else ""
         if not self._wanted and not self._why:
             self._change(READY, f"{self._awaited} lets it fly")
             # Drones are asked to stay where they are, so that who follows set-points has some before the flight.
-            reference = self.team.reference  # which begins where the drones are
             if self._names.setpoints != FULL_STATE:  # which would start a Crazyflie's motors
-                self._publish(reference.position[0], reference.yaw[0])
+                self._publish(self.team.reference.position[0], self.team.reference.yaw[0])  # where the drones are
         if self._why or not self._wanted:
             return None
         self._policy.reset()
