@@ -23,6 +23,8 @@ _NAMES = {
     "track_realistic_2_4": "track_realistic",
     "track_realistic_5_8": "track_realistic_fast",
     "gate_realistic": "gate_realistic",
+    "gate_realistic_3": "gate_realistic",
+    "gate_realistic_5": "gate_realistic",
     "gate_two": "gate_walls",
     "gate_three": "gate_walls",
     "recover_realistic": "recover_success",
