@@ -30,7 +30,7 @@ _NAMES = {
     "recover_realistic": "recover_success",
     "loss": "loss_realistic",
     "loss_snap": "loss_realistic",
-    "loss_realistic": "loss_realistic",
+    "loss_realistic": "loss_wash",
     "loss_onboard": "loss_onboard",
     "recover_crazymarl_rates": "recover_rates_success",
     "track_generalist": "track_rigs",
