@@ -41,7 +41,7 @@ def test_the_search_changes_the_gains_of_its_script(config, script):
     ("name", "script"), [("hover_wind", "formation_integral"), ("gate_realistic", "formation_narrow")]
 )
 def test_the_search_measures_what_evaluations_do(name, script):
-    config = ml.load_config(name, {"env.num_envs": 16})
+    config = ml.load_config(name, {"env.num_envs": 16, "train.rigs": []})
     evaluated = search_gains.fly(config, LINEAR[script], seed=3)
     reported = run_episodes(config, LINEAR[script], 16, 3, TRAINING_EVALUATION)
     assert evaluated.success == reported["success_rate"].mean()
