@@ -109,7 +109,11 @@ FLIGHTS: dict[str, Flight] = {
         "gate_realistic", {}, "gate_realistic", "gate, realistic", scripts=("formation_narrow", "searched")
     ),
     "gate_realistic_3": Flight(
-        "gate_realistic", {"env.num_drones": 3}, "gate_realistic", "gate, realistic, three drones", scripts=("searched",)
+        "gate_realistic",
+        {"env.num_drones": 3},
+        "gate_realistic",
+        "gate, realistic, three drones",
+        scripts=("searched",),
     ),
     "gate_realistic_5": Flight(
         "gate_realistic", {"env.num_drones": 5}, "gate_realistic", "gate, realistic, five drones", scripts=("searched",)

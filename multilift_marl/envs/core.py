@@ -251,10 +251,9 @@ class MultiliftVec:
         saved |= {name: getattr(self, name).copy() for name in _SAVED}
         if self.commander is not None:
             saved |= {f"commander.{name}": array.copy() for name, array in self.commander.arrays().items()}
-        known = self.config.env
-        meaning = self.config.control.model_dump(), known.policy_hz, known.sensing, known.units
+        c, env = self.config.control.model_dump(exclude_defaults=True), self.config.env
         saved["task_name"] = fingerprint(self.task.name, self.num_envs)
-        saved["control"] = fingerprint([str(each) for each in meaning], self.num_envs)
+        saved["control"] = fingerprint(f"{c} {env.policy_hz} {env.sensing} {env.units}", self.num_envs)
         return saved
 
     def load_state_dict(self, saved: dict[str, np.ndarray]) -> None:
@@ -263,8 +262,7 @@ class MultiliftVec:
         Raises:
             ValueError: it is of other environments, or not what `state_dict` returned; nothing is changed then.
         """
-        now = self.state_dict()
-        saved = {"control": now["control"]} | saved  # which older ones do not hold
+        saved = {"control": (now := self.state_dict())["control"]} | saved  # which older ones do not hold
         check_saved(saved, now, "world.diverged", "world.system", "task_name", "control")
         delays, most = self.config.randomization, 2**63 - 1
         whole = "steps", "seeds", "sensing.sent", "sensing.seen", "sensing.obstacle_steps"

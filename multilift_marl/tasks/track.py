@@ -43,7 +43,6 @@ from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Between, Choice, Float, Places, Section, Span, Vector
 from multilift_marl.tasks.base import Kernels, Task
 
-SMALLEST = 0.01  # [m] of a random path's room
 AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
 _DRAWN = 400  # points of a path that is drawn
 
@@ -84,7 +83,7 @@ class TrackOptions(Section):
     radius: Span = Field((5.0, 5.0), description="[m] of circle and helix, or its range")
     rate: Span = Field((0.2, 0.2), description="[rad/s] of circle and helix, or its range")
     climb: Float = Field(0.5, ge=0, description="[m] that a helix goes up, and down, from its middle height")
-    room: Annotated[Vector, Between(0, 1e3, "m")] = Field(
+    room: Annotated[Vector, Between(0.01, 1e3, "m")] = Field(
         (3.0, 3.0, 0.5), description="[m] random way-points within ± this of the start"
     )
     height: Float = Field(2.0, gt=0, description="[m] of the path's centre")
@@ -331,10 +330,6 @@ class Track(Task):
                     f"task_options.{form} is given, but task_options.path={forms} does not fly it; set "
                     f"task_options.path={form}, or task_options.{form}=null"
                 )
-        if "random" in option.path and max(option.room) < SMALLEST:
-            raise ConfigError(
-                f"task_options.room={option.room} leaves no path; let one of them be {SMALLEST:g} m or more"
-            )
         if option.file and option.waypoints:
             raise ConfigError(f"task_options.path={forms} has a file and way-points; leave one of them out")
         if option.waypoint_times and not option.waypoints:
