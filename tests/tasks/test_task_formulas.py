@@ -115,6 +115,7 @@ def test_a_payload_on_the_ground_counts_as_it_is_carried(e, fraction):
 RIG = record(
     anchors=np.array([[0.3, 0.1, 0.08], [-0.25, 0.15, 0.05], [0.1, -0.3, 0.02]]), azimuth=np.array([0.3, 2.5, -1.2]),
     heading=np.array([0.1, -0.4, 0.7]), force=np.array([[1.0, 0.5, 3.4], [-0.9, 0.4, 3.2], [0.1, -0.8, 3.0]]),
+    hooked=False,
 )  # fmt: skip
 
 
