@@ -262,7 +262,7 @@ class MultiliftVec:
         Raises:
             ValueError: it is of other environments, or not what `state_dict` returned; nothing is changed then.
         """
-        saved = {"control": (now := self.state_dict())["control"]} | saved  # which older ones do not hold
+        now = {key: each for key, each in self.state_dict().items() if key != "control" or key in saved}  # not in older
         check_saved(saved, now, "world.diverged", "world.system", "task_name", "control")
         delays, most = self.config.randomization, 2**63 - 1
         whole = "steps", "seeds", "sensing.sent", "sensing.seen", "sensing.obstacle_steps"

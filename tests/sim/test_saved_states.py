@@ -124,6 +124,18 @@ def test_the_state_under_another_controller_is_refused(vec, other):
     vec.load_state_dict({key: array for key, array in before.items() if key != "control"})  # of an older version
 
 
+def test_a_state_kept_in_a_file_is_loaded_from_it(vec, tmp_path):
+    """What NumPy reads of an archive is a mapping, and no dict."""
+    before = vec.state_dict()
+    np.savez(tmp_path / "state.npz", **before)
+    other = make(num_envs=2)
+    with np.load(tmp_path / "state.npz") as saved:
+        other.load_state_dict(saved)
+    assert same(other.state_dict(), before)
+    with pytest.raises(ValueError, match="is missing"):
+        vec.load_state_dict(["steps"])
+
+
 def test_an_environment_that_diverged_may_hold_anything(vec):
     saved = vec.state_dict()
     saved["world.diverged"] = np.array([False, True])
