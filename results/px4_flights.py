@@ -37,6 +37,7 @@ ROWS: dict[str, list[str]] = {
     "pose": ["config=pose", "policy=formation_integral"],
     "hover_rtk_halved": ["config=hover", "policy=formation_integral", "position_errors=0.5"],
     "hover_conditions": ["config=hover_px4", "policy=formation_integral"],
+    "navigate": ["config=navigate_px4", "policy=formation_route"],
 }
 EIGHT = ("task_options.speed=2", "task_options.acceleration=2")
 LONGER = [f"{part}.env.episode_seconds=20" for part in ("flight", "nodes.planner")]  # integrals begin with the task

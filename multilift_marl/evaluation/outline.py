@@ -1,10 +1,14 @@
-"""The payload's surface as triangles, for plots."""
+"""The payload's surface as triangles, and the obstacles' corners, for plots."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
+from multilift_marl.rig.obstacles import BOX, CYLINDER, HULL
 from multilift_marl.rig.system import System
+from multilift_marl.tasks.scenery import Box
 
 _SIDES = 48  # of what stands for a cylinder
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -28,6 +32,25 @@ def payload_surface(system: System) -> np.ndarray:
     if system.payload_shape == "cylinder":
         return _cylinder(half[0], half[2]) + system.payload_center
     return (half * _CORNERS)[_BOX] + system.payload_center
+
+
+def obstacle_corners(boxes: Iterable[Box], hulls: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return of each obstacle points (V, 3) of its surface, world frame [m], whose convex hull is its outline.
+
+    Args:
+        boxes: what stands around, see `Task.scenery`.
+        hulls: see `sim.obstacles.make_hulls`.
+    """
+    angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros(_SIDES), np.ones(_SIDES)
+    level, upright = np.column_stack([c, s, zero]), np.column_stack([c, zero, s])
+    rings = np.vstack([level, upright, upright[:, [1, 0, 2]]])
+    unit = {BOX: _CORNERS, CYLINDER: np.vstack([np.column_stack([c, s, -one]), np.column_stack([c, s, one])])}
+    found = []
+    for box in boxes:
+        points = hulls[box.hull] if box.kind == HULL else unit.get(box.kind, rings) * box.size
+        found.append(points @ np.reshape(box.rotation, (3, 3)).T + box.position)
+    return tuple(found)
 
 
 def _cylinder(radius: float, half_height: float) -> np.ndarray:

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.tri import Triangulation
 
 from multilift_marl.evaluation.metrics import name_error
 from multilift_marl.evaluation.rollout import Trace
@@ -62,11 +63,17 @@ def plot_tensions(path: str | Path, trace: Trace, title: str = "", pdf: bool = F
 def plot_paths(path: str | Path, trace: Trace, title: str = "", pdf: bool = False) -> None:
     """Plot the paths of payload and drones [m] from above (x-y) and from the side (x-z), to one scale.
 
-    The team is drawn where the episode ends: the payload by its outline, the cables from their anchors, dots.
+    The team is drawn where the episode ends: the payload by its outline, the cables from their anchors, dots; and so
+    are the obstacles.
     """
     figure = Figure(figsize=(8.4, 4.4), layout="constrained")
     for axes, up, name in zip(figure.subplots(1, 2), (1, 2), "yz", strict=True):
         payload, target = trace.payload_position[:, [0, up]].T, trace.target_position[:, [0, up]].T
+        for corners in trace.obstacles:  # beyond the paths they are cut off
+            seen = Triangulation(corners[:, 0], corners[:, up])
+            faces = list(corners[:, [0, up]][seen.triangles])
+            shade = PolyCollection(faces, facecolors="0.75", edgecolors="none", antialiaseds=False, alpha=0.5, zorder=0.5)
+            axes.add_collection(shade, autolim=False)
         if len(trace.surface):
             outline = PolyCollection(list(trace.surface[..., [0, up]]), facecolors="0.8", edgecolors="0.8", zorder=1)
             axes.add_collection(outline)

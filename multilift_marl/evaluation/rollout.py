@@ -10,7 +10,7 @@ import numpy as np
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
-from multilift_marl.evaluation.outline import payload_surface
+from multilift_marl.evaluation.outline import obstacle_corners, payload_surface
 from multilift_marl.evaluation.shortfalls import ShortfallMeter
 from multilift_marl.mdp.failures import MAX_DISTANCE
 from multilift_marl.policies.policy import Policy
@@ -41,6 +41,8 @@ class Trace(NamedTuple):
     """Of each cable its points from anchor to hook at the end (P, 3), of a broken one without the hook [m]."""
     surface: np.ndarray = np.zeros((0, 3, 3))
     """(F, 3, 3) triangles of the payload's surface at the end, world frame [m]."""
+    obstacles: tuple[np.ndarray, ...] = ()
+    """Corners (V, 3) of each at the end, see `obstacle_corners` [m]."""
 
 
 def run_episodes(
@@ -265,7 +267,7 @@ class Tracer:
 
     def __init__(self) -> None:
         self._rows: list[tuple[Any, ...]] = []
-        self._end: tuple[tuple[np.ndarray, ...], np.ndarray] = (), np.zeros((0, 3, 3))
+        self._end: tuple[tuple[np.ndarray, ...], np.ndarray, tuple[np.ndarray, ...]] = (), np.zeros((0, 3, 3)), ()
         self._surface: np.ndarray | None = None  # in the payload's frame
 
     def __call__(self, vec: MultiliftVec) -> None:
@@ -274,7 +276,8 @@ class Tracer:
         if self._surface is None:
             self._surface = payload_surface(vec.world.system)
         surface = self._surface @ state.payload_rotation[0].T + state.payload_position[0]
-        self._end = tuple(vec.world.cable_points(0, n) for n in range(vec.num_drones)), surface
+        obstacles = obstacle_corners(task.scenery(0), task.view.hulls)
+        self._end = tuple(vec.world.cable_points(0, n) for n in range(vec.num_drones)), surface, obstacles
         self._rows.append(
             (
                 (len(self._rows) + 1) * task.dt, state.payload_position[0].copy(), task.goal.position[0].copy(),
@@ -287,4 +290,4 @@ class Tracer:
         """Return what was recorded, at least one step."""
         columns = (np.array(column) for column in zip(*self._rows, strict=True))
         fields = dict(zip(Trace._fields, columns, strict=False))
-        return Trace(**fields, cables=self._end[0], surface=self._end[1])
+        return Trace(**fields, cables=self._end[0], surface=self._end[1], obstacles=self._end[2])

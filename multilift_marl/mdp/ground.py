@@ -219,6 +219,13 @@ Margin = Annotated[
 ]
 """Option of tasks that begin or end on the ground."""
 
+Origin = Annotated[
+    tuple[Float, Float],
+    Between(-1e3, 1e3, "m"),
+    Field(description="[m] x and y where the team starts; ranges of places are about them"),
+]
+"""Option of tasks that begin or end on the ground."""
+
 
 def margin_ratio(margin: float, system: System) -> np.ndarray:
     """Return a margin [m] over the length of each cable (N,) [-].

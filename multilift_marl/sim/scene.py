@@ -65,9 +65,9 @@ def set_options(spec: mujoco.MjSpec, timestep: float) -> None:
     option.timestep = timestep
     option.gravity = [0, 0, -GRAVITY]
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    option.solver = mujoco.mjtSolver.mjSOL_CG
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.tolerance = 1e-18
-    option.iterations = 1000  # elliptic cones: 300 leave 2 mm/s in rare steps of 16 drones that rattle on the ground
+    option.iterations = 1000
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     # AUTORESET would put a diverged simulation back to its start unnoticed; `World.diverged` marks it instead.
     option.disableflags |= disable.mjDSBL_REFSAFE | disable.mjDSBL_AUTORESET | disable.mjDSBL_ISLAND

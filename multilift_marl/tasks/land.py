@@ -18,6 +18,7 @@ from multilift_marl.mdp.ground import (
     CREEP,
     Ground,
     Margin,
+    Origin,
     Pace,
     cable_chord,
     keep_hook,
@@ -55,6 +56,7 @@ _AT_REST = 0.02  # [m/s]
 class LandOptions(Section):
     """Ranges of the start and bounds of success."""
 
+    origin: Origin = (0.0, 0.0)
     pad_xy: Float = Field(1.0, ge=0, description="[m] pad's x and y within ± this; the team starts above the origin")
     pad_yaw: Float = Field(45.0, ge=0, le=180, description="[deg] heading of team and pad within ± this")
     start_height: Float = Field(1.5, gt=0, description="[m] of the payload at the start")
@@ -72,7 +74,7 @@ class LandArrays(NamedTuple):
     """What an episode holds beside its goal."""
 
     course: np.ndarray
-    """(E, 3) from the start to the pad [m]."""
+    """(E, 3) from the start, above the origin, to the pad [m]."""
     touch: np.ndarray
     """(E,) int64, AIRBORNE, LANDED or CRASHED."""
     speed: np.ndarray
@@ -85,6 +87,8 @@ class LandSettings(NamedTuple):
     """Constants of the task, and what counts as landed."""
 
     ground: Ground
+    origin: tuple[float, float]
+    """Above which teams start [m]."""
     approach: tuple[float, float]
     """Begin and length [s], as of the next ones."""
     descend: tuple[float, float]
@@ -107,7 +111,7 @@ def start_above_origin(e, rng, v, equilibrium, ranges):
     goal, (xy, yaw, height) = v.goal, ranges
     # A payload on the ground has its centre of mass at `ground.payload`: the course leads down, z < 0.
     put(v.own.course[e], (rng.uniform(-xy, xy), rng.uniform(-xy, xy), v.settings.ground.payload - height))
-    set_resting_goal(e, goal, (0.0, 0.0, height))
+    set_resting_goal(e, goal, (*v.settings.origin, height))
     putmat(goal.rotation[e], rot_z(rng.uniform(-yaw, yaw)))
     place_formation(e, goal, v.rig)
     still = (0.0, 0.0, 0.0)
@@ -124,7 +128,7 @@ def advance(e, v):
     # The slow part is no longer than the whole descent, where teams start low.
     near = min(NEAR * ground.size, -course[2])
     # The start again, from the course alone; the three phases add up on it.
-    set_resting_goal(e, goal, (0.0, 0.0, ground.payload - course[2]))
+    set_resting_goal(e, goal, (*plan.origin, ground.payload - course[2]))
     move_goal(e, goal, (course[0], course[1], 0.0), ease(t, plan.approach[0], plan.approach[1]))
     move_goal(e, goal, (0.0, 0.0, course[2] + near), ease(t, plan.descend[0], plan.descend[1]))
     move_goal(e, goal, (0.0, 0.0, -near), ease(t, plan.settle[0], plan.settle[1]))
@@ -167,8 +171,8 @@ def load_height(e, state, limits):
 @inlined
 def off_pad(e, v):
     """Return the level distance of the payload of environment e from the middle of its pad [m]."""
-    payload, course = v.state.payload_position, v.own.course
-    return hypot(payload[e, 0] - course[e, 0], payload[e, 1] - course[e, 1])
+    payload, course, (x, y) = v.state.payload_position, v.own.course, v.settings.origin
+    return hypot(payload[e, 0] - x - course[e, 0], payload[e, 1] - y - course[e, 1])
 
 
 @inlined
@@ -261,6 +265,7 @@ class Land(Task):
         self.own = LandArrays(np.zeros((e, 3)), np.zeros(e, np.int64), np.zeros(e), np.zeros(e))
         self.settings = LandSettings(
             ground=ground,
+            origin=option.origin,
             approach=paced(APPROACH, pace),
             descend=paced(DESCEND, pace),
             settle=paced(SETTLE, pace, longer=creeping),
@@ -296,7 +301,7 @@ class Land(Task):
             return (soft,)
         return (
             soft,
-            Criterion("pad_distance_m", settings.radius, lambda: _level(state, course) - settings.radius),
+            Criterion("pad_distance_m", settings.radius, lambda: _level(state, course, settings) - settings.radius),
             Criterion("speed_m_s", _AT_REST, lambda: length(state.payload_velocity) - _AT_REST),
             Criterion("height_m", TOUCH, lambda: lowest_points(state, self.limits) - TOUCH),
             Criterion("cable_force_n", 0.0, lambda: (state.cable_tension - slack).max(axis=1)),
@@ -304,9 +309,9 @@ class Land(Task):
         )
 
 
-def _level(state: SystemState, course: np.ndarray) -> np.ndarray:
+def _level(state: SystemState, course: np.ndarray, settings: LandSettings) -> np.ndarray:
     """Return level distances of payloads from the middle of their pad (E,) [m], see `off_pad`."""
-    return np.asarray(np.hypot(*(state.payload_position - course)[:, :2].T))
+    return np.asarray(np.hypot(*((state.payload_position - course)[:, :2] - settings.origin).T))
 
 
 def lowest_points(state: SystemState, limits: Limits) -> np.ndarray:

@@ -18,6 +18,7 @@ from multilift_marl.mdp.ground import (
     CREEP,
     Ground,
     Margin,
+    Origin,
     Pace,
     cable_chord,
     cable_rise,
@@ -56,6 +57,7 @@ HARMLESS = 1.5  # times the resting tension that costs nothing
 class TakeoffOptions(Section):
     """Ranges of the start and bounds of success."""
 
+    origin: Origin = (0.0, 0.0)
     place_xy: Float = Field(1.0, ge=0, description="[m] payload's x and y within ± this")
     target_yaw: Float = Field(45.0, ge=0, le=180, description="[deg] heading of payload and target within ± this")
     target_height: Float = Field(1.5, gt=0, description="[m] of the payload at the end")
@@ -87,6 +89,8 @@ class TakeoffSettings(NamedTuple):
     """Constants of the task."""
 
     ground: Ground
+    origin: tuple[float, float]
+    """About which payloads are placed [m]."""
     bounds: RestBounds
     climb: float
     """Of the target [m]."""
@@ -102,8 +106,8 @@ class TakeoffSettings(NamedTuple):
 @drawing
 def start_on_ground(e, rng, v, ranges, distance):
     """Write goal and team at rest on the ground; ranges are x and y [m], heading [rad] and spread of drones [m]."""
-    goal, (xy, yaw, spread), ground = v.goal, ranges, v.settings.ground
-    set_resting_goal(e, goal, (rng.uniform(-xy, xy), rng.uniform(-xy, xy), ground.payload))
+    goal, (xy, yaw, spread), ground, (x, y) = v.goal, ranges, v.settings.ground, v.settings.origin
+    set_resting_goal(e, goal, (x + rng.uniform(-xy, xy), y + rng.uniform(-xy, xy), ground.payload))
     putmat(goal.rotation[e], rot_z(rng.uniform(-yaw, yaw)))
     place_formation(e, goal, v.rig)
     place_on_ground(e, rng, v, ground, distance, spread)
@@ -233,6 +237,7 @@ class Takeoff(Task):
         self.own = TakeoffArrays(np.zeros((e, 3)), np.zeros((e, n, 3)), np.zeros(e, np.int64), np.zeros(e), np.zeros(e))
         self.settings = TakeoffSettings(
             ground=ground,
+            origin=option.origin,
             bounds=RestBounds.of(option),
             climb=option.target_height - ground.payload,
             rise=paced(RISE, pace),

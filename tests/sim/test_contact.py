@@ -47,6 +47,75 @@ def test_a_payload_slides_as_far_in_every_direction(degrees, friction):
     assert np.linalg.norm(world.state.payload_velocity) < 1e-3
 
 
+@pytest.mark.parametrize("timestep", [0.004, 0.001])
+@pytest.mark.parametrize("restitution", [0.0, 0.3, 0.5, 0.65])
+def test_what_slides_is_neither_thrown_up_nor_without_friction(restitution, timestep):
+    """Coulomb's deceleration from the first step on, whatever the restitution, and the payload stays on the ground."""
+    overrides = {"contact.restitution": restitution, "sim.timestep": timestep, "cable.length": 30.0}
+    world = loose(-2e-4, (2.0, 0.0, 0.0), **overrides)
+    state, heights, start = world.state, [], None
+    for step in range(round(1.0 / timestep)):
+        world.step(np.zeros((1, 1, 4)))
+        heights.append(state.payload_position[0, 2] - world.system.payload_size[2] / 2)
+        if step == 0:
+            start = state.payload_velocity[0].copy()
+    assert 1.6 < start[0] < 2.0 and abs(start[2]) < 0.25
+    assert max(heights) < 8e-3
+    assert state.payload_position[0, 0] == pytest.approx(2.0**2 / (2 * GRAVITY), abs=8e-3)
+    assert abs(state.payload_velocity[0, 0]) < 0.01
+
+
+@pytest.mark.parametrize(("restitution", "creep"), [(0.0, 1e-4), (0.3, 5e-3), (0.5, 1.2e-2), (0.65, 1.2e-2)])
+def test_what_is_pushed_less_than_friction_holds_stays(restitution, creep):
+    """A third of the friction for two seconds; one and a half of it moves the payload as Coulomb says."""
+    for share in (0.36, 1.5):
+        world = loose(-2e-4, (0.0, 0.0, 0.0), **{"contact.restitution": restitution, "cable.length": 40.0})
+        for _ in range(250):
+            world.step(np.zeros((1, 1, 4)))
+        begin = world.state.payload_position[0, 0]
+        world.hidden_loads.payload_force[0] = [share * world.system.payload_mass * GRAVITY, 0.0, 0.0]
+        for _ in range(250):
+            world.step(np.zeros((1, 1, 4)))
+        moved = world.state.payload_position[0, 0] - begin
+        if share < 1:
+            assert abs(moved) < creep
+        else:
+            assert moved == pytest.approx(0.5 * 0.5 * GRAVITY, rel=0.15)
+
+
+@pytest.mark.parametrize("timestep", [0.004, 0.001])
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 0.65])
+def test_boxes_that_tumble_on_the_ground_gain_no_energy(restitution, timestep):
+    """Forty at random attitudes and speeds, with friction."""
+    rng = np.random.default_rng(3)
+    overrides = {"contact.restitution": restitution, "sim.timestep": timestep, "cable.length": 20.0}
+    world = World(without_drag(make_system(1, **FALL | overrides)), 40, 1)
+    state, system = world.state, world.system
+    state.payload_position[:] = [0, 0, 0.3]
+    state.payload_velocity[:] = rng.uniform(-2, 2, (40, 3))
+    state.payload_body_rates[:] = rng.uniform(-8, 8, (40, 3))
+    for turn in state.payload_rotation:
+        turn[:] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        turn[:, 0] *= np.linalg.det(turn)
+    state.drone_position[:] = [0, 10.0, 15.0]
+    state.rotor_speed[:] = 0
+    load(world)
+    world.break_cables(np.ones((40, 1), bool))
+    world.hidden_loads.motors_off[:] = True
+
+    def energy() -> np.ndarray:
+        spin = (state.payload_body_rates**2 * system.payload_inertia).sum(axis=1) / 2
+        moving = (state.payload_velocity**2).sum(axis=1) / 2
+        return system.payload_mass * (moving + GRAVITY * state.payload_position[:, 2]) + spin
+
+    before, most = energy(), np.zeros(40)
+    for _ in range(round(1.2 / timestep)):
+        world.step(np.zeros((40, 1, 4)))
+        most = np.maximum(most, energy() / before)
+    assert most.max() < 1.01
+    assert energy().max() < 0.9 * before.max()  # they have landed
+
+
 @pytest.mark.parametrize(
     ("restitution", "timestep", "model"),
     [(e, h, "massless") for e in (0.3, 0.5, 0.65) for h in (0.004, 0.001)] + [(e, 0.004, "chain") for e in (0.3, 0.6)],

@@ -204,12 +204,11 @@ def step_once(model, start, solver: int, tolerance: float, iterations: int) -> n
     "preset, num_drones",
     [("hover", 4), ("recover_crazymarl", 3), ("loss", 4), ("takeoff", 8), ("takeoff", 16), ("track_auto6", 6)],
 )
-def test_conjugate_gradients_find_what_newtons_method_finds(preset, num_drones):
+def test_solvers_find_what_newtons_method_finds(preset, num_drones):
     vec = make_vec(preset, num_envs=4, num_threads=1, num_drones=num_drones)
     model, batch = copy.copy(vec.world.model), vec.world.shards[0].batch
-    used = model.opt.solver, model.opt.tolerance, model.opt.iterations
-    assert used[0] == mujoco.mjtSolver.mjSOL_CG
-    rng, data, far, slack, touching = np.random.default_rng(0), mujoco.MjData(model), [], 0, 0
+    limits, solvers = (model.opt.tolerance, model.opt.iterations), batch.expand("opt.solver")
+    rng, data, far, slack, touching, gradients = np.random.default_rng(0), mujoco.MjData(model), [], 0, 0, 0
     vec.reset(seed=0)
     action = np.zeros((4, num_drones, vec.action_size))
     for _ in range(80):
@@ -221,11 +220,16 @@ def test_conjugate_gradients_find_what_newtons_method_finds(preset, num_drones):
             for name in ("qpos", "qvel", "qfrc_applied", "qacc_warmstart"):
                 getattr(data, name)[:] = batch.bind(name)[e]
             exact = step_once(model, data, mujoco.mjtSolver.mjSOL_NEWTON, 1e-14, 200)
-            far.append(np.abs(step_once(model, data, *used) - exact).max())
+            used = int(np.ravel(solvers)[e])
+            far.append(np.abs(step_once(model, data, used, *limits) - exact).max())
             mujoco.mj_forward(model, data)
+            # Newton's method wherever bodies touch; conjugate gradients are faster where none are near.
+            assert used == mujoco.mjtSolver.mjSOL_NEWTON or not data.ncon
+            gradients += used == mujoco.mjtSolver.mjSOL_CG
             touching = max(touching, data.ncon)
             slack += data.nefc - 4 * data.ncon < num_drones
-    assert np.max(far) < (4e-6 if preset == "takeoff" else 2e-8)  # [m/s], [rad/s]; many drones rattle on the ground
+    assert np.max(far) < 5e-8  # [m/s], [rad/s]
+    assert gradients > 0 or preset == "takeoff"
     assert np.median(far) < 1e-10
     assert touching >= num_drones if preset == "takeoff" else slack > 0
 
@@ -250,6 +254,8 @@ def falls(model) -> tuple[np.ndarray, int]:
 )  # fmt: skip
 def test_contact_by_pairs_is_that_of_mujocos_own_search(overrides):
     spec = build_spec(make_system(3, **overrides))
+    for pair in spec.pairs:
+        pair.solreffriction = [0.0, 0.0]  # geoms have none of their own
     paired, contacts = falls(spec.compile())
     for pair in list(spec.pairs):
         spec.delete(pair)

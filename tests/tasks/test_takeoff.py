@@ -57,7 +57,7 @@ def test_a_team_that_stands_does_not_drift(model, num_drones):
     before = [array.copy() for array in (state.payload_position, state.drone_position)]
     world.step(np.zeros((2, num_drones, 4)), nstep=500)
     for now, was in zip((state.payload_position, state.drone_position), before, strict=True):
-        np.testing.assert_allclose(now, was, atol=1e-3)
+        np.testing.assert_allclose(now, was, atol=1.5e-3 if model == "chain" else 2e-4)  # in two seconds
     assert not world.diverged.any()
 
 

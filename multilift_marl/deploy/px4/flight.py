@@ -2,7 +2,8 @@
 
 Take-off and landing are the tasks of these names, the ways between are task `track` with two way-points, the drones'
 set-points those of the action interface. Every part has a world of its own, which begins in the state that the last one
-left; the autopilots notice nothing of that.
+left; the autopilots notice nothing of that. Around them are the obstacles of the task, which ways between parts do not
+avoid: task `navigate` is flown from the ground below its start to that below its goal.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from multilift_marl.mdp.ground import MAX_MARGIN, pace_of
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.policies.policy import Policy
 from multilift_marl.sim.world import World
+from multilift_marl.tasks.navigate import Navigate
 
 SCRIPT = "formation_integral"  # of all parts but the task
 _TURNING = 0.5  # [rad/s] of drones about themselves there, on average
@@ -91,8 +93,7 @@ class Flight:
         self._flown = build_config(self.config.model_dump(), _BY_AUTOPILOTS)
         self._task = self._make(self._flown)
         self._task.reset(seed=seed)
-        self._landing = self._make(self._part("land", _LANDING, {"pad_xy": 0.0, "pad_yaw": 0.0}))
-        self._landing.reset(seed=seed)
+        self._landing = self._make_landing()
         self.start: dict[str, np.ndarray] = {}
         self.phases: list[Phase] = []
         self._known_peak = 0.0
@@ -126,7 +127,9 @@ class Flight:
                 observation = self._arm(self._task)
             else:
                 rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": begin.pose[2]}
-                takeoff = self._make(self._part("takeoff", _TAKEOFF, rise))
+                if self.config.task == "navigate":
+                    rise["origin"] = begin.pose[:2]
+                takeoff = self._make_part("takeoff", _TAKEOFF, rise)
                 self._run(takeoff, self._arm(takeoff), "take-off", Stage.TAKE_OFF)
                 self._say("to the task")
                 way = self._go(takeoff, read_goal(takeoff), begin, "the way to the task")
@@ -138,6 +141,8 @@ class Flight:
             self._say(f"{why}: back, and landing")
             if way is self._task:
                 begin, self.stage = self._here(), Stage.HOVER
+                if self.config.task == "navigate":  # it lands where it is
+                    self._landing = self._make_landing(begin.pose)
                 self._begin("stop", way)
                 self._rest(way, begin, 0.0, HOLD, "stop")
             self._end(self._return(way, begin))
@@ -167,7 +172,7 @@ class Flight:
 
     def _here(self) -> Goal:
         """Return where the team of the task rests if its payload stays where it is."""
-        vec, state = self._make(self._part("hover", HOLD, {})), self._task.world.state
+        vec, state = self._make_part("hover", HOLD, {}), self._task.world.state
         vec.reset(seed=self.seed)
         yaw = heading(tuple(state.payload_rotation[0].ravel()))
         c, s = np.cos(yaw), np.sin(yaw)
@@ -245,6 +250,23 @@ class Flight:
         vec.use_controller(AutopilotController(config, vec.world, self.team), self.team.report)
         return vec
 
+    def _make_part(self, task: str, seconds: float, options: dict[str, Any]) -> MultiliftVec:
+        """Return the environment of another part, among the obstacles of the task."""
+        vec = self._make(self._part(task, seconds, options))
+        for own, given in zip(vec.world.obstacles, self._task.world.obstacles, strict=True):
+            own[:] = given
+        return vec
+
+    def _make_landing(self, pose: tuple[float, float, float, float] | None = None) -> MultiliftVec:
+        """Return the environment of the landing: of task `navigate` below a pose, None for its goal."""
+        options: dict[str, Any] = {"pad_xy": 0.0, "pad_yaw": 0.0}
+        if isinstance(self._task.task, Navigate):
+            x, y, z = self._task.task.own.goal[0].tolist() if pose is None else pose[:3]
+            options |= {"origin": (x, y), "start_height": z}
+        vec = self._make_part("land", _LANDING, options)
+        vec.reset(seed=self.seed)
+        return vec
+
     def _drawn(self) -> dict[str, np.ndarray]:
         """Return what is hidden in the task, which is the same all along."""
         # Not the bias: it is one of the numbers observed, and other tasks observe others.
@@ -273,7 +295,7 @@ class Flight:
             seconds, options = way
             # Task `track` lets drones face as the payload does.
             self._rest(vec, begin, wrapped(begin.pose[3] - begin.yaw), 0.0, what)
-            before, vec = vec, self._make(self._part("track", seconds, options))
+            before, vec = vec, self._make_part("track", seconds, options)
             self._fly_part(vec, self._take_over(vec, before.world, what), what)
             begin = read_goal(vec)
         self._rest(vec, end._replace(yaw=begin.yaw), wrapped(end.yaw - begin.yaw), HOLD, what)
@@ -360,11 +382,13 @@ def check_config(config: Config) -> Config:
             f"drones under PX4 follow config=land too late at task_options.pace={pace:g}, and the "
             f"payload hits the ground; set task_options.pace={LANDING_PACE:g} and env.episode_seconds=24"
         )
-    if config.task == "navigate" or config.scene.obstacles:
+    if config.scene.obstacles and config.task != "navigate":
         raise ConfigError(
-            "PX4 flies where nothing is in the way: a flight's own ways to and from its task do not avoid obstacles; "
-            "take another task than navigate, and leave scene.obstacles out"
+            "a flight's own ways to and from its task do not avoid obstacles; take task navigate, or leave "
+            "scene.obstacles out"
         )
+    if any(any(each.travel) for each in config.scene.obstacles):
+        raise ConfigError("PX4 flies among obstacles that stand still; set scene.obstacles.travel to 0, 0, 0")
     if config.cable.model != "massless":
         raise ConfigError("flights by PX4 go on from state to state, which chains cannot; set cable.model=massless")
     return build_config(config.model_dump(), {"env.num_envs": 1, "env.num_threads": 1})
