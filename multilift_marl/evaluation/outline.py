@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -51,6 +51,25 @@ def obstacle_corners(boxes: Iterable[Box], hulls: np.ndarray) -> tuple[np.ndarra
         points = hulls[box.hull] if box.kind == HULL else unit.get(box.kind, rings) * box.size
         found.append(points @ np.reshape(box.rotation, (3, 3)).T + box.position)
     return tuple(found)
+
+
+def find_outline(points: np.ndarray) -> np.ndarray:
+    """Return the corners (K, 2) of the convex hull of points (V, 2), counter-clockwise (Andrew's monotone chain)."""
+    rows = np.unique(points.round(9), axis=0).tolist()
+    corners: list[list[float]] = []
+    for side in (rows, rows[::-1]):
+        chain: list[list[float]] = []
+        for x, y in side:
+            while len(chain) > 1 and _turn(chain[-2], chain[-1], (x, y)) <= 0:
+                chain.pop()
+            chain.append([x, y])
+        corners += chain[:-1]
+    return np.array(corners or rows)
+
+
+def _turn(a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> float:
+    """Return twice the area of the triangle a, b, c, positive if it is counter-clockwise."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def _cylinder(radius: float, half_height: float) -> np.ndarray:

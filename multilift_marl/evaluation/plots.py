@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
-from matplotlib.tri import Triangulation
 
 from multilift_marl.evaluation.metrics import name_error
+from multilift_marl.evaluation.outline import find_outline
 from multilift_marl.evaluation.rollout import Trace
 from multilift_marl.planning.feasibility import Feasibility
 from multilift_marl.planning.spline import sample_spline
@@ -70,9 +70,7 @@ def plot_paths(path: str | Path, trace: Trace, title: str = "", pdf: bool = Fals
     for axes, up, name in zip(figure.subplots(1, 2), (1, 2), "yz", strict=True):
         payload, target = trace.payload_position[:, [0, up]].T, trace.target_position[:, [0, up]].T
         for corners in trace.obstacles:  # beyond the paths they are cut off
-            seen = Triangulation(corners[:, 0], corners[:, up])
-            faces = list(corners[:, [0, up]][seen.triangles])
-            shade = PolyCollection(faces, facecolors="0.75", edgecolors="none", antialiaseds=False, alpha=0.5, zorder=0.5)
+            shade = PolyCollection([find_outline(corners[:, [0, up]])], color="0.75", alpha=0.6, linewidths=0, zorder=0.5)
             axes.add_collection(shade, autolim=False)
         if len(trace.surface):
             outline = PolyCollection(list(trace.surface[..., [0, up]]), facecolors="0.8", edgecolors="0.8", zorder=1)

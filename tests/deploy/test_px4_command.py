@@ -46,6 +46,12 @@ DT = 0.004
         (["px4=/nowhere", "parameters={MPC_XY_P: 1.2}"], "px4=/nowhere holds no PX4"),
         (["px4=/nowhere", "config=loss"], "PX4 cannot fly config=loss"),
         (["px4=/nowhere", "config=regroup"], "PX4 cannot fly config=regroup"),
+        (["px4=/nowhere", "scene.obstacles=[{size: [1, 1, 1], position: [5, 0, 1]}]"], "take task navigate, or leave"),
+        (
+            ["px4=/nowhere", "config=navigate", "scene.obstacles=[{size: [1, 1, 1], travel: [0, 1, 0]}]"],
+            "obstacles that stand still",
+        ),
+        (["px4=/nowhere", "config=navigate", "policy=formation_route"], "px4=/nowhere holds no PX4"),
         (["px4=/nowhere", "config=land"], "set task_options.pace=0.5 and env.episode_seconds=24"),
         (["px4=/nowhere", "config=land", "task_options.pace=0.5"], "px4=/nowhere holds no PX4"),
         (["px4=/nowhere", "position_errors=-1"], "position_errors"),

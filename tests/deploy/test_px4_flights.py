@@ -67,6 +67,32 @@ def test_a_team_flies_from_the_ground_through_a_task_and_back(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_team_crosses_a_map_from_below_its_start_to_below_its_goal():
+    """Obstacles stand in every part of the flight."""
+    still = {"randomization.payload_force": 0.0, "env.sensing": "ideal", "task_options.map": 3}
+    config, seen = config_of("navigate_px4", **still), {}
+
+    def watch(vec, stage):
+        seen.setdefault(vec.task.name, []).append((vec, vec.world.state.payload_position[0].copy()))
+
+    with Airfield(config.system) as field:
+        flight = Flight(config, field.team, 1000, lambda text: None, watch)
+        result = flight.fly(find_policy("formation_route").bind)
+    assert result.ended == "" and result.metrics["failure_cause"][0] == 0
+    assert [phase.name for phase in result.phases] == [
+        "take-off", "the way to the task", "navigate", "the way back", "landing"
+    ]  # fmt: skip
+    own, kinds = flight.vec.task.own, flight.vec.world.obstacles.kind[0]
+    assert np.count_nonzero(kinds) >= 5
+    for vec in (part[0][0] for part in seen.values()):
+        np.testing.assert_array_equal(vec.world.obstacles.kind[0], kinds)
+        np.testing.assert_array_equal(vec.world.obstacles.position[0], flight.vec.world.obstacles.position[0])
+    np.testing.assert_allclose(seen["takeoff"][0][1][:2], own.start[0, :2], atol=0.01)
+    np.testing.assert_allclose(seen["land"][-1][1][:2], own.goal[0, :2], atol=0.1)
+    assert seen["land"][-1][1][2] < 0.1 < result.trace.payload_position[-1, 2]
+
+
+@pytest.mark.slow
 def test_drones_that_miss_their_places_take_off_and_land_without_a_snatch():
     suite = replace(EXACT, position=Sensor(50.0, offset=0.03))
     config = config_of("hover", **{"randomization.payload_force": 0.0, "env.episode_seconds": 1.0})

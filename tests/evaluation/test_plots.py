@@ -80,3 +80,39 @@ def test_paths_show_the_outline_and_the_anchors(tmp_path, monkeypatch):
         lines = [line.get_xydata() for line in axes.lines]
         assert any(line.shape == (2, 2) and (line == trace.cables[2][:, [0, up]]).all() for line in lines)
         assert any(line.shape == (1, 2) and (line[0] == trace.cables[2][0, [0, up]]).all() for line in lines)
+
+
+def area(polygon):
+    """Return what a counter-clockwise polygon (K, 2) encloses."""
+    x, y = polygon.T
+    return (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
+
+
+def test_paths_show_obstacles_as_they_stand(tmp_path, monkeypatch, l_shape):
+    """Areas from above and from the side, and their middles, of a body of each kind."""
+    around = [
+        {"shape": "box", "size": [1.0, 0.4, 2.0], "position": [3.0, 1.0, 1.0], "rotation": [0.0, 0.0, 30.0]},
+        {"shape": "cylinder", "size": [0.6, 3.0], "position": [-3.0, 1.0, 1.5]},
+        {"shape": "sphere", "size": [0.8], "position": [0.0, 4.0, 2.0]},
+        {"shape": "mesh", "mesh": l_shape["payload.mesh"], "size": [0.4, 0.6, 0.2], "position": [0.0, -4.0, 1.0]},
+    ]
+    config = ml.load_config("hover", {"env.episode_seconds": 0.1, "scene.obstacles": around})
+    trace = trace_episode(config, lambda vec: make_scripted("formation", vec), 0, 5)
+    turned = np.deg2rad(30.0)
+    ring = 48 / 2 * np.sin(2 * np.pi / 48)  # of a regular polygon about a unit circle
+    expected = [
+        (1.0 * 0.4, (np.cos(turned) + 0.4 * np.sin(turned)) * 2.0),
+        (ring * 0.3**2, 0.6 * 3.0),
+        (ring * 0.4**2, ring * 0.4**2),
+        ((0.4 * 0.6 - 0.2 * 0.4 / 2), 0.4 * 0.2),  # of the hull of an L
+    ]
+    drawn = []
+    monkeypatch.setattr(plots, "_save", lambda figure, path, pdf: drawn.append(figure))
+    plots.plot_paths(tmp_path / "paths.png", trace)
+    for k, axes in enumerate(drawn[0].axes):
+        shades = [each.get_paths()[0].vertices[:-1] for each in axes.collections[: len(around)]]
+        np.testing.assert_allclose([area(shade) for shade in shades], [areas[k] for areas in expected], rtol=1e-6)
+        for shade, body in zip(shades, around, strict=True):
+            middle = (shade.min(axis=0) + shade.max(axis=0)) / 2
+            np.testing.assert_allclose(middle, np.array(body["position"])[[0, k + 1]], atol=1e-6)
+        assert np.ptp(axes.get_xlim()) < 5  # as wide as the paths

@@ -328,3 +328,24 @@ def test_drones_start_within_a_share_of_their_shortest_cable():
     for length in (0.5, 2.0):
         task = ml.make_vec("takeoff", **{"env.num_envs": 1, "env.num_drones": 3, "cable.length": length}).task
         assert task._spread == pytest.approx(length * task.options.start_spread)
+
+
+@pytest.mark.parametrize("task", ["takeoff", "land"])
+def test_a_team_may_begin_anywhere(task):
+    """Beside another origin the same episodes succeed, and drones observe the same."""
+    flown = []
+    for origin in ([0.0, 0.0], [30.0, -20.0]):
+        vec = make(task, num_envs=4, **{"task_options.origin": origin})
+        observation, _ = vec.reset(seed=5)
+        policy, seen = make_scripted("formation_integral", vec), [observation.copy()]
+        for _ in range(vec.max_steps - 1):
+            observation, *_ = vec.step(policy.act(observation))
+            seen.append(observation.copy())
+        state = vec.world.state
+        level = [each.excess() for each in vec.task.criteria()]
+        flown.append((np.array(seen), state.payload_position - [*origin, 0.0], vec.task.succeeded(), level))
+    here, there = flown
+    np.testing.assert_allclose(there[0], here[0], atol=2e-5)
+    np.testing.assert_allclose(there[1], here[1], atol=1e-6)
+    assert here[2].all() and there[2].all()
+    np.testing.assert_allclose(np.array(there[3]), np.array(here[3]), atol=1e-5)
