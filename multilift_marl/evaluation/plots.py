@@ -70,7 +70,9 @@ def plot_paths(path: str | Path, trace: Trace, title: str = "", pdf: bool = Fals
     for axes, up, name in zip(figure.subplots(1, 2), (1, 2), "yz", strict=True):
         payload, target = trace.payload_position[:, [0, up]].T, trace.target_position[:, [0, up]].T
         for corners in trace.obstacles:  # beyond the paths they are cut off
-            shade = PolyCollection([find_outline(corners[:, [0, up]])], color="0.75", alpha=0.6, linewidths=0, zorder=0.5)
+            shade = PolyCollection(
+                [find_outline(corners[:, [0, up]])], color="0.75", alpha=0.6, linewidths=0, zorder=0.5
+            )
             axes.add_collection(shade, autolim=False)
         if len(trace.surface):
             outline = PolyCollection(list(trace.surface[..., [0, up]]), facecolors="0.8", edgecolors="0.8", zorder=1)

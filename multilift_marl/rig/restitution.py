@@ -8,9 +8,8 @@ steps, with the damping ratio ζ for which they part at e times the speed (Schwa
 
 Implicit steps h damp too, by ω h/2 at the natural frequency ω, which is left out of d = 2 ω (ζ - ω h/2), k = ω².
 
-Friction has a damping of its own, which stops what slides where Coulomb's force would suffice. MuJoCo's convex contact
-pushes apart what it slows (Anitescu 2006): with the normal damping of 5000 1/s a box that slides at 2 m/s is thrown up by
-46 mm, with the 1e-9 of a high restitution it slides without end.
+Friction has a damping of its own. MuJoCo's convex contact pushes apart what it slows (Anitescu 2006): with 5000 1/s a
+box that slides at 2 m/s is thrown up by 46 mm, with the 1e-9 of a high restitution it slides without end.
 """
 
 from __future__ import annotations
@@ -19,7 +18,9 @@ from math import acos, acosh, exp, sqrt
 
 STIFFNESS = 6e4  # [1/s²] over the effective mass; with DAMPING a penetration fades with a time constant of 80 ms
 DAMPING = 5e3  # [1/s] over the effective mass: stops an approach within a step, without bouncing or passing through
-FRICTION = 0.3  # [-] damping of sliding, times the step; more throws what slides up, less lets bouncing bodies gain energy
+FRICTION = (
+    0.3  # [-] damping of sliding, times the step: more throws up what slides, with less what tumbles gains energy
+)
 STICKING = 10.0  # [-] by how much friction yields less than contact: what sticks does not creep
 _BOUNCE = 0.3  # [-] ω h of a contact that bounces: it lasts for ten steps
 

@@ -126,7 +126,7 @@ class Flight:
             if self.config.task == "takeoff":
                 observation = self._arm(self._task)
             else:
-                rise = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": begin.pose[2]}
+                rise: dict[str, Any] = {"place_xy": 0.0, "target_yaw": 0.0, "target_height": begin.pose[2]}
                 if self.config.task == "navigate":
                     rise["origin"] = begin.pose[:2]
                 takeoff = self._make_part("takeoff", _TAKEOFF, rise)
