@@ -35,9 +35,9 @@ def pin_vehicles(preset: str | tuple[str, ...]) -> str | tuple[str, ...]:
     return _pin(key, preset) if isinstance(preset, str) else tuple(_pin(key, each) for each in preset)
 
 
-def pin_mesh(reference: str | None) -> str | None:
-    """Return the pinned reference to a mesh, None if there is none; see `pin_file`."""
-    return None if reference is None else pin_file(reference)
+def pin_text(value: Any) -> Any:
+    """Return the pinned reference to a file where a value is one, text; others as they are. See `pin_file`."""
+    return pin_file(value) if isinstance(value, str) else value
 
 
 def pin_policy(reference: str | None) -> str | None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from multilift_marl.schema.files import pin_mesh
+from multilift_marl.schema.files import pin_text
 from multilift_marl.schema.values import Between, Float, Int, Positive, Section, Vector
 
 NotNegative = Annotated[Float, Field(ge=0)]
@@ -42,7 +42,7 @@ class ObstacleConfig(Section):
         description="[m] of a wall: middle along y from its own and width of each; a window with its lower and upper "
         "edge above the wall's foot as well",
     )
-    mesh: Annotated[str | None, AfterValidator(pin_mesh)] = Field(None, description="path of an .obj or .stl file")
+    mesh: Annotated[str | None, AfterValidator(pin_text)] = Field(None, description="path of an .obj or .stl file")
     travel: Annotated[Vector, Between(-1000, 1000, "m")] = Field(
         (0.0, 0.0, 0.0), description="[m] it moves along this to both sides of its position, by a sine of time"
     )
