@@ -10,6 +10,7 @@ import torch
 
 from multilift_marl.agents.checkpoint import check_like, parse_checkpoint
 from multilift_marl.agents.mappo import Learner
+from multilift_marl.agents.meanings import spell
 from multilift_marl.agents.policy import LearnedPolicy, find_checkpoint, shipped_policies
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
@@ -48,7 +49,7 @@ class Initial(NamedTuple):
         there = self.policy.config
         for here in configs:
             self._check_meanings(there, here)
-        self._check_networks([key for key in _NETWORK if _spell(key, there) != _spell(key, configs[0])], configs[0])
+        self._check_networks([key for key in _NETWORK if spell(key, there) != spell(key, configs[0])], configs[0])
 
     def take_over(self, learner: Learner, here: Config) -> str:
         """Give a learner the policy's weights and statistics, the critic's where they fit; return what was given.
@@ -91,7 +92,7 @@ class Initial(NamedTuple):
                 self._compare(what, f"control.{number.limit}", there, here)
 
     def _compare(self, what: str, key: str, there: Config, here: Config) -> None:
-        found, wanted = (_spell(key, config) for config in (there, here))
+        found, wanted = (spell(key, config) for config in (there, here))
         if found != wanted:
             raise ConfigError(f"{_KEY}={self.name} {what} {found} there and {wanted} here; set {found}")
 
@@ -101,10 +102,10 @@ class Initial(NamedTuple):
         if differing:
             if there.train.residual != here.train.residual and "train.residual" not in differing:
                 differing = [*differing, "train.residual"]
-            cure = " ".join(_spell(key, there) for key in differing)
+            cure = " ".join(spell(key, there) for key in differing)
             first = differing[0]
             raise ConfigError(
-                f"{_KEY}={self.name} has another network: {_spell(first, there)} there and {_spell(first, here)} here; "
+                f"{_KEY}={self.name} has another network: {spell(first, there)} there and {spell(first, here)} here; "
                 f"set {cure}"
             )
 
@@ -148,11 +149,3 @@ def short_name(reference: str) -> str:
     """Return what a policy is called in tables: the name of its run, else that of its file."""
     path = Path(reference.partition("#sha256=")[0])
     return path.parent.parent.name if path.parent.name == "checkpoints" else path.stem
-
-
-def _spell(key: str, config: Config) -> str:
-    """Return key=value of a configuration as a command takes it."""
-    value: Any = config
-    for part in key.split("."):
-        value = getattr(value, part)
-    return f"{key}={list(value) if isinstance(value, tuple) else value}"

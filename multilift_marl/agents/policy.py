@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from multilift_marl.agents.contract import AGAIN, Network, open_network, read_fields
+from multilift_marl.agents.meanings import changed_meanings, spell
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.errors import CheckpointError, ConfigError, nearest, pip_install, reason
+from multilift_marl.errors import CheckpointError, ConfigError, nearest, pip_install, reason, warn_once
 from multilift_marl.plugins import identify, named
 from multilift_marl.policies.baselines import SCRIPTED, check_interface, make_scripted
 from multilift_marl.policies.policy import Policy
@@ -126,12 +127,20 @@ class TrainedPolicy:
     def check(self, config: Config, role: str = "") -> None:
         """Refuse environments, by a ConfigError, of which the configuration alone tells that it cannot fly them.
 
+        Warn of those in which its actions or observations mean something else than in its own, see `meanings`.
+
         Args:
             config: theirs.
             role: the key that names the policy, for messages.
         """
         if reason := self.misfit_config(config):
             raise ConfigError(f"the policy of {self.source} {reason}")
+        if changed := changed_meanings(self.config, config):
+            own = " ".join(spell(key, self.config) for key in changed)
+            warn_once(
+                "agents", f"the policy of {self.source} was configured with {own}; the values here change what its "
+                "actions and observations mean",
+            )  # fmt: skip
 
     def misfit_config(self, config: Config) -> str:
         """Return why the policy does not fit a configuration, as the rest of a sentence, "" if nothing tells so."""

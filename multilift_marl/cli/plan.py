@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from multilift_marl._files import write_whole
 from multilift_marl._interrupt import ending_at_once
@@ -18,7 +18,8 @@ from multilift_marl.planning.feasibility import Feasibility, assess_path
 from multilift_marl.planning.path_file import load_path
 from multilift_marl.planning.path_table import COLUMNS
 from multilift_marl.planning.team_model import has_model
-from multilift_marl.planning.waypoints import describe_violation, plan_waypoints, sample_rows
+from multilift_marl.planning.waypoints import Keys, describe_violation, plan_waypoints, sample_rows
+from multilift_marl.schema.files import pin_text
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Between, Float, Places
 from multilift_marl.tasks.track import TrackOptions
@@ -37,13 +38,17 @@ class Options(CommandOptions):
     """Keys of the command beside those of the configuration."""
 
     config: str = Field("track", description="the team that is to fly: name or path of a configuration of task track")
-    waypoints: Places = Field(None, description="list of [x, y, z] or [x, y, z, yaw], or a CSV file of such columns")
+    waypoints: Annotated[Places, AfterValidator(pin_text)] = Field(
+        None, description="list of [x, y, z] or [x, y, z, yaw], or a CSV file of such columns"
+    )
     times: tuple[Float, ...] | None = Field(None, description="[s] at which they are passed; None: the least allowed")
     speed: Annotated[Float, Between(1e-3, 100, "m/s")] = Field(1.0, description="[m/s] largest, without times")
     acceleration: Annotated[Float, Between(1e-3, 1000, "m/s²")] = Field(
         0.5, description="[m/s²] largest, without times"
     )
-    file: str | None = Field(None, description="in place of way-points: a path to assess, see task_options.file")
+    file: Annotated[str | None, AfterValidator(pin_text)] = Field(
+        None, description="in place of way-points: a path to assess, see task_options.file"
+    )
     out: str | None = Field(None, description="CSV file for task_options.file, of columns t, x, y, z, yaw")
     plot: str | None = Field(None, description="PNG of place, speed, and of tensions and thrusts beside their limits")
 
@@ -76,11 +81,11 @@ def _plan(values: dict[str, Any]) -> int:
     refusal = ""
     if option.waypoints is None:
         smoothing = option.file_spacing, option.file_ramp, option.file_offset
-        table = load_path(str(option.file), *smoothing, _WHOLE, system, ranges)
+        table = load_path(str(option.file), *smoothing, _WHOLE, system, ranges, "file")
         feasibility = assess_path(table, system, ranges)
     else:
         limits = option.speed, option.acceleration
-        path = plan_waypoints(option.waypoints, option.waypoint_times, *limits, system)
+        path = plan_waypoints(option.waypoints, option.waypoint_times, *limits, system, Keys("waypoints", "times"))
         table, feasibility = path.table, assess_path(path.table, system, ranges)
         for key in {"speed", "acceleration"} & options.model_fields_set if path.timed else ():
             raise ConfigError(f"{key} means nothing beside times, which {path.name} has; leave out one of them")
@@ -91,13 +96,13 @@ def _plan(values: dict[str, Any]) -> int:
     if options.plot is not None:
         from multilift_marl.evaluation.plots import plot_plan
 
-        plot_plan(_place(options.plot), table, feasibility)
+        plot_plan(_place("plot", options.plot), table, feasibility)
         print(f"wrote {options.plot}")
     if refusal:
         raise ConfigError(refusal)
     if options.out is not None:
         lines = [",".join(COLUMNS), *(",".join(f"{number:.9g}" for number in row) for row in sample_rows(table))]
-        write_whole(_place(options.out), ("\n".join(lines) + "\n").encode())
+        write_whole(_place("out", options.out), ("\n".join(lines) + "\n").encode())
         print(f"wrote {options.out}; fly it by task_options.path=file task_options.file={options.out}")
     return 0
 
@@ -127,7 +132,7 @@ def _format(feasibility: Feasibility) -> str:
     return "\n".join(lines)
 
 
-def _place(name: str) -> Path:
-    """Return where a file is to be written; its folder is made."""
+def _place(key: str, name: str) -> Path:
+    """Return where the file of a key is to be written; its folder is made."""
     path = Path(name).expanduser()
-    return make_folder(path.parent, "another path") / path.name
+    return make_folder(path.parent, f"{key}=<path>") / path.name

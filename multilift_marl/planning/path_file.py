@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import ceil, isfinite, pi
-from pathlib import Path
 
 import numpy as np
 
@@ -29,7 +28,7 @@ _SAMPLES = 8  # of each piece of the spline, where it is checked
 
 def load_path(
     reference: str, spacing: float, ramp: float, offset: tuple[float, float, float], seconds: float, system: System,
-    ranges: RandomizationConfig,
+    ranges: RandomizationConfig, key: str = KEY,
 ) -> np.ndarray:  # fmt: skip
     """Return the spline (K, 13) of a file; see `thin_rows`, `ramp_rows` and `fit_spline`.
 
@@ -40,33 +39,34 @@ def load_path(
         offset: added to each position (3,) [m].
         seconds: that an episode takes.
         system, ranges: the team that is to fly it and what its episodes draw.
+        key: that the file was given by, for messages.
 
     Raises:
         ConfigError: no such file, not the table that is expected, or a path that the team cannot fly.
     """
-    rows, name = read_rows(reference), reference.partition("#")[0]
+    rows, source = read_rows(reference, key), f"{key}={reference.partition('#')[0]}"
     rows[:, 1:4] += offset
-    _check_times(name, rows, seconds)
+    _check_times(source, rows, seconds)
     if (count := len(_keep_rows(rows[:, 0], spacing))) > MAX_ROWS:
         raise ConfigError(
-            f"{KEY}={name} has {count} rows, more than {MAX_ROWS}; raise task_options.file_spacing={spacing:g} s, "
+            f"{source} has {count} rows, more than {MAX_ROWS}; raise task_options.file_spacing={spacing:g} s, "
             "or keep of the file what an episode flies"
         )
     thin = thin_rows(rows, spacing)
     if ramp > 0:
         if rows[-1, 0] < ramp:
-            raise ConfigError(f"task_options.file_ramp={ramp:g} s is longer than the {rows[-1, 0]:g} s of {KEY}={name}")
+            raise ConfigError(f"task_options.file_ramp={ramp:g} s is longer than the {rows[-1, 0]:g} s of {source}")
         thin = ramp_rows(thin, ramp)
     if (step := np.diff(thin[:, 0]).min()) < _MIN_STEP:
         raise ConfigError(
-            f"{KEY}={name} has rows {step:.2g} s apart, less than {_MIN_STEP:g} s; raise task_options.file_spacing"
+            f"{source} has rows {step:.2g} s apart, less than {_MIN_STEP:g} s; raise task_options.file_spacing"
         )
     table = fit_spline(thin)
-    check_height(f"{KEY}={name}", table, system, ", or lift it by task_options.file_offset")
+    check_height(source, table, system, ", or lift it by task_options.file_offset")
     slower = "" if ramp else ", or give it task_options.file_ramp=2 to do so"
-    check_thrust(f"{KEY}={name}", table, system, ranges, slower)
-    _warn_of_limits(name, table, system, ranges)
-    warn_of_length(f"{KEY}={name}", table, seconds)
+    check_thrust(source, table, system, ranges, slower)
+    _warn_of_limits(source, table, system, ranges)
+    warn_of_length(source, table, seconds)
     return table
 
 
@@ -79,42 +79,47 @@ def warn_of_length(source: str, table: np.ndarray, seconds: float) -> None:
         )  # fmt: skip
 
 
-def _warn_of_limits(name: str, table: np.ndarray, system: System, ranges: RandomizationConfig) -> None:
+def _warn_of_limits(source: str, table: np.ndarray, system: System, ranges: RandomizationConfig) -> None:
     """Warn of a path on which a team that followed it without error would exceed its limits."""
     if violation := find_violation(table, system, ranges):
-        warn_once("tasks", f"{KEY}={name} leads the team beyond its limits: {violation}; make it slower or smoother")
+        warn_once("tasks", f"{source} leads the team beyond its limits: {violation}; make it slower or smoother")
 
 
-def read_rows(reference: str) -> np.ndarray:
+def read_rows(reference: str, key: str = KEY) -> np.ndarray:
     """Return the rows t [s], x, y, z [m], yaw [rad] of a file (K, 5): t begins at 0, yaw is unwrapped.
+
+    Args:
+        reference: of the file, see `pin_file`.
+        key: that it was given by, for messages.
 
     Raises:
         ConfigError: no such file, or not the table that is expected.
     """
-    path, content = read_pinned(KEY, reference)
-    rows = read_table(f"{KEY}={path}", content)
+    path, content = read_pinned(key, reference)
+    source = f"{key}={path}"
+    rows = read_table(source, content)
     if rows.ndim != 2 or rows.shape[1] not in (4, 5):
         shape = f"{rows.shape[1]} columns" if rows.ndim == 2 else f"an array of shape {rows.shape}"
-        raise ConfigError(f"{KEY}={path} holds {shape}; give 4 columns t, x, y, z or 5 with yaw")
+        raise ConfigError(f"{source} holds {shape}; give 4 columns t, x, y, z or 5 with yaw")
     if len(rows) < _MIN_ROWS:
-        raise ConfigError(f"{KEY}={path} has {len(rows)} rows, too few for a smooth path; give {_MIN_ROWS} or more")
+        raise ConfigError(f"{source} has {len(rows)} rows, too few for a smooth path; give {_MIN_ROWS} or more")
     rows = np.hstack([rows, np.zeros((len(rows), 5 - rows.shape[1]))])
     if not (np.abs(rows) < _MOST).all():
         row, column = np.argwhere(~(np.abs(rows) < _MOST))[0]
-        raise ConfigError(f"{KEY}={path} holds {rows[row, column]} as {COLUMNS[column]} in row {row + 1}; correct it")
+        raise ConfigError(f"{source} holds {rows[row, column]} as {COLUMNS[column]} in row {row + 1}; correct it")
     steps = np.diff(rows[:, 0])
     if steps.min() <= 0:
         row = int(np.argmax(steps <= 0))
         raise ConfigError(
-            f"{KEY}={path}: t does not increase from row {row + 1} ({rows[row, 0]:g} s) to row {row + 2} "
+            f"{source}: t does not increase from row {row + 1} ({rows[row, 0]:g} s) to row {row + 2} "
             f"({rows[row + 1, 0]:g} s); sort the rows by t and leave out repeated ones"
         )
     rows[:, 0] -= rows[0, 0]
-    rows[:, 4] = _unwrap(path, rows[:, 0], rows[:, 4])
+    rows[:, 4] = _unwrap(source, rows[:, 0], rows[:, 4])
     return rows
 
 
-def _unwrap(path: Path, t: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+def _unwrap(source: str, t: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """Return yaw (K,) [rad] without leaps of a turn; one that spans more than a turn has none and stays as it is.
 
     Raises:
@@ -126,7 +131,7 @@ def _unwrap(path: Path, t: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     whole = span > 4 * pi and (yaw == np.round(yaw)).all()
     if leaps.any() or fast or whole:
         raise ConfigError(
-            f"{KEY}={path}: yaw goes from {yaw.min():g} to {yaw.max():g} rad within {t[-1]:g} s; if it is in degrees, "
+            f"{source}: yaw goes from {yaw.min():g} to {yaw.max():g} rad within {t[-1]:g} s; if it is in degrees, "
             "name its column yaw_deg or convert it, else let it turn more slowly"
         )
     if span > 2 * pi + 0.01:
@@ -136,13 +141,13 @@ def _unwrap(path: Path, t: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     if unclear.any():
         row = int(np.argmax(unclear))
         raise ConfigError(
-            f"{KEY}={path}: yaw may turn either way from row {row + 1} ({yaw[row]:g} rad) to row {row + 2} "
+            f"{source}: yaw may turn either way from row {row + 1} ({yaw[row]:g} rad) to row {row + 2} "
             f"({yaw[row + 1]:g} rad); put rows between them"
         )
     return unwrapped
 
 
-def _check_times(name: str, rows: np.ndarray, seconds: float) -> None:
+def _check_times(source: str, rows: np.ndarray, seconds: float) -> None:
     """Refuse a path that hardly moves within an episode of `seconds`, because its times are no seconds."""
     steps, moves = np.diff(rows[:, 0]), np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1)
     fastest, lasts = float((moves / steps).max()), float(rows[-1, 0])
@@ -151,7 +156,7 @@ def _check_times(name: str, rows: np.ndarray, seconds: float) -> None:
     units = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
     likely = next((unit for unit, factor in units.items() if fastest / factor > 2 * _SLOW), "ns")
     raise ConfigError(
-        f"{KEY}={name} takes {lasts:.4g} s and moves by at most {fastest:.2g} m/s, hardly within an episode of "
+        f"{source} takes {lasts:.4g} s and moves by at most {fastest:.2g} m/s, hardly within an episode of "
         f"{seconds:g} s; if t is in {likely}, name its column t_{likely} or convert it, else raise env.episode_seconds"
     )
 

@@ -17,13 +17,22 @@ from multilift_marl.rig.system import System
 from multilift_marl.schema.files import read_pinned
 from multilift_marl.schema.sections import RandomizationConfig
 
-KEY = "task_options.waypoints"
 MAX_WAYPOINTS = 1000
 _STEP = 0.05  # [s] between the rows of a table, quintics between which are the polynomials to well below 1 µm
 _EXACT = 1e-6  # [m], [rad] by which way-points may be missed: round-off where times differ by orders of magnitude
 
 Waypoints = str | tuple[tuple[float, ...], ...]
 Range = tuple[float, float]
+
+
+class Keys(NamedTuple):
+    """By which way-points and their times are given, for messages."""
+
+    waypoints: str = "task_options.waypoints"
+    times: str = "task_options.waypoint_times"
+
+
+OF_TASK = Keys()
 
 
 class WaypointPath(NamedTuple):
@@ -63,8 +72,9 @@ def load_waypoints(
 
 
 def plan_waypoints(
-    waypoints: Waypoints, times: tuple[float, ...] | None, speed: Range, acceleration: Range, system: System
-) -> WaypointPath:
+    waypoints: Waypoints, times: tuple[float, ...] | None, speed: Range, acceleration: Range, system: System,
+    keys: Keys = OF_TASK,
+) -> WaypointPath:  # fmt: skip
     """Return the path from rest at the first way-point to rest at the last one.
 
     Args:
@@ -74,13 +84,16 @@ def plan_waypoints(
         speed, acceleration: largest ones of the payload, and of its slots where it turns, a range of one value [m/s],
             [m/s²].
         system: of the team.
+        keys: of way-points and times.
 
     Raises:
         ConfigError: no such file, or way-points or times that cannot be, and which.
     """
-    name, values, written = _read(waypoints)
+    name, values, written = _read(waypoints, keys.waypoints)
     given = written if times is None else np.array(times, float)
-    _check_waypoints(name, values, given, system)
+    _check_waypoints(name, values, system)
+    if given is not None:
+        _check_times(name, values, given, keys.times)
     values[:, 3] = np.unwrap(values[:, 3])
     timed = given is not None
     if given is None:
@@ -124,13 +137,13 @@ def sample_rows(table: np.ndarray) -> np.ndarray:
     return np.column_stack([t, sample_spline(table, t)[0]])
 
 
-def _read(waypoints: Waypoints) -> tuple[str, np.ndarray, np.ndarray | None]:
+def _read(waypoints: Waypoints, key: str) -> tuple[str, np.ndarray, np.ndarray | None]:
     """Return a name for messages, way-points (K, 4), and times (K,) [s] where a file has them."""
     if not isinstance(waypoints, str):
         rows = [(*place, 0.0) if len(place) == 3 else tuple(place) for place in waypoints]
-        return KEY, np.array(rows, float).reshape(-1, 4), None
-    path, content = read_pinned(KEY, waypoints)
-    name = f"{KEY}={path}"
+        return key, np.array(rows, float).reshape(-1, 4), None
+    path, content = read_pinned(key, waypoints)
+    name = f"{key}={path}"
     if path.suffix.lower() != ".csv":
         raise ConfigError(f"{name} is no .csv file; give one, or a list of places")
     columns = read_columns(name, content, ("x", "y", "z"))
@@ -148,8 +161,8 @@ def _check_limits(name: str, speed: Range, acceleration: Range) -> None:
             )
 
 
-def _check_waypoints(name: str, values: np.ndarray, times: np.ndarray | None, system: System) -> None:
-    """Refuse way-points and times that cannot be."""
+def _check_waypoints(name: str, values: np.ndarray, system: System) -> None:
+    """Refuse way-points that cannot be."""
     if not 2 <= len(values) <= MAX_WAYPOINTS:
         raise ConfigError(f"{name} has {len(values)} way-points; give 2 to {MAX_WAYPOINTS}")
     if not np.isfinite(values).all() or np.abs(values).max() > 1e6:
@@ -165,12 +178,12 @@ def _check_waypoints(name: str, values: np.ndarray, times: np.ndarray | None, sy
     if (same := (np.diff(values, axis=0) == 0).all(axis=1)).any():
         i = int(np.argmax(same))
         raise ConfigError(f"{name}: way-points {i + 1} and {i + 2} are equal; leave one of them out")
-    if times is None:
-        return
+
+
+def _check_times(name: str, values: np.ndarray, times: np.ndarray, key: str) -> None:
+    """Refuse times (K,) [s] of way-points (K, 4) that are not as many, or do not increase; `key` is theirs."""
     if len(times) != len(values):
-        raise ConfigError(
-            f"task_options.waypoint_times has {len(times)} times for {len(values)} way-points; give each one"
-        )
+        raise ConfigError(f"{key} has {len(times)} times for {len(values)} way-points; give each one")
     if not (rising := np.diff(times) > 0).all():
         i = int(np.argmin(rising))
         raise ConfigError(

@@ -150,6 +150,12 @@ def _balanced_forces(
     # The pseudoinverse solves least squares where nothing balances; what is left of the load shows that.
     residual = np.abs(balance @ force.ravel() - load).max()
     if residual > 1e-6 * weight:
+        if n == 1:
+            raise RigError(
+                f"env.num_drones=1 cannot hold the payload level by an anchor {np.round(anchors[0], 3).tolist()} m "
+                "from its centre of mass: raise env.num_drones, or place payload.anchors above the centre of mass",
+                anchors=range(n),
+            )
         raise RigError(
             f"payload.anchors {np.round(anchors, 3).tolist()} cannot hold the payload level: place them around its "
             "centre of mass",

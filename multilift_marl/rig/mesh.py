@@ -1,4 +1,4 @@
-"""Payloads of any shape: triangles of a file, with the exact integrals over the volume that they enclose."""
+"""Bodies of any shape: triangles of a file, with the exact integrals over the volume that they enclose."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.rig.mesh_file import read_triangles
 from multilift_marl.rig.surface import integrate, surface_fault
 from multilift_marl.schema.files import pin_file, read_pinned
-
-KEY = "payload.mesh"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,23 +49,24 @@ def add_mesh(spec: mujoco.MjSpec, name: str, mesh: Mesh) -> None:
     added.uservert, added.userface = mesh.points.ravel().tolist(), mesh.faces.ravel().tolist()
 
 
-def read_mesh(reference: str, size: Sequence[float] | None = None) -> Mesh:
+def read_mesh(reference: str, size: Sequence[float] | None = None, key: str = "payload.mesh") -> Mesh:
     """Return the mesh of a file, scaled to the bounding box `size` [m] (None: as it is, in metres).
 
     Args:
         reference: path of the file, or what `pin_file` made of it.
         size: edges (3,) [m].
+        key: of the configuration, for messages.
 
     Raises:
         ConfigError: there is no such file, it is not the one that was pinned, or it holds no closed surface.
     """
-    path, content = read_pinned(KEY, pin_file(reference))
+    path, content = read_pinned(key, pin_file(reference))
     if path.suffix.lower() not in (".obj", ".stl"):
-        raise ConfigError(f"{KEY}={path} is no .obj or .stl file; export the payload as one of these")
+        raise ConfigError(f"{key}={path} is no .obj or .stl file; export the body as one of these")
     try:
         points, faces = read_triangles(path, content)
     except ValueError as error:
-        raise ConfigError(f"cannot read {KEY}={path}: {error}") from None
+        raise ConfigError(f"cannot read {key}={path}: {error}") from None
     low, high = points.min(axis=0), points.max(axis=0)
     fault = "it is flat, so give it a thickness" if (high == low).any() else surface_fault(points, faces)
     scale = np.ones(3) if size is None or fault else np.asarray(size) / (high - low)
@@ -76,7 +75,7 @@ def read_mesh(reference: str, size: Sequence[float] | None = None) -> Mesh:
     if fault is None and volume <= 0:
         fault = "its faces look inwards, so turn their vertices round"
     if fault is not None:
-        raise ConfigError(f"{KEY}={path} is no closed surface: {fault}")
+        raise ConfigError(f"{key}={path} is no closed surface: {fault}")
     moments, rotation, axes = np.zeros(3), np.zeros(9), np.zeros(4)
     mujoco.mju_eig3(moments, rotation, axes, inertia.ravel())
     return Mesh(

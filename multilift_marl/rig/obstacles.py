@@ -89,7 +89,7 @@ def _resolve(given: ObstacleConfig, key: str) -> list[Obstacle]:
         return [_make(given, BOX, half, middle) for half, middle in parts]
     if given.shape == "mesh":
         assert given.mesh is not None
-        mesh = read_mesh(given.mesh, given.size)
+        mesh = read_mesh(given.mesh, given.size, f"{key}.mesh")
         return [_make(given, HULL, mesh.edges / 2, np.zeros(3), find_hull(mesh.points - mesh.middle))]
     size = np.array(given.size, float)
     half = {"box": size, "cylinder": size[[0, 0, -1]], "sphere": size[[0, 0, 0]]}[given.shape] / 2

@@ -10,7 +10,10 @@ from typing import Any
 from multilift_marl.errors import ConfigError, reason, shorten
 from multilift_marl.schema.yaml_text import parse_yaml
 
-FILE_KEYS = ("task_options.file", "task_options.waypoints", "payload.mesh", "vehicle.preset", "train.init")
+FILE_KEYS = (
+    "task_options.file", "task_options.waypoints", "payload.mesh", "scene.obstacles.mesh", "vehicle.preset",
+    "train.init",
+)  # fmt: skip
 MAX_BYTES = 100_000_000  # of a file
 _MARK = "#sha256="
 _DIGITS = 16  # of the hash
@@ -32,9 +35,9 @@ def pin_vehicles(preset: str | tuple[str, ...]) -> str | tuple[str, ...]:
     return _pin(key, preset) if isinstance(preset, str) else tuple(_pin(key, each) for each in preset)
 
 
-def pin_mesh(reference: str | None) -> str | None:
-    """Return the pinned reference to a mesh, None if there is none; see `pin_file`."""
-    return None if reference is None else pin_file(reference)
+def pin_text(value: Any) -> Any:
+    """Return the pinned reference to a file where a value is one, text; others as they are. See `pin_file`."""
+    return pin_file(value) if isinstance(value, str) else value
 
 
 def pin_policy(reference: str | None) -> str | None:
@@ -52,7 +55,7 @@ def _pin(key: str, reference: str) -> str:
 def change_files(values: Mapping[str, Any], change: Callable[[str, str], str], prefix: str = "") -> dict[str, Any]:
     """Return values of a configuration in which each reference to a file is changed.
 
-    Those of `train.overrides`, `train.rigs` and `train.stages` count, too.
+    Those of `scene.obstacles`, `train.overrides`, `train.rigs` and `train.stages` count, too.
 
     Args:
         values: nested or by dotted name.
@@ -65,7 +68,7 @@ def change_files(values: Mapping[str, Any], change: Callable[[str, str], str], p
         inside = "" if name in ("train.overrides", "train.stages.overrides") else f"{name}."
         if isinstance(value, Mapping):
             changed[key] = change_files(value, change, inside)
-        elif name in ("train.rigs", "train.stages") and isinstance(value, list | tuple):
+        elif name in ("scene.obstacles", "train.rigs", "train.stages") and isinstance(value, list | tuple):
             start = "" if name == "train.rigs" else f"{name}."
             changed[key] = [change_files(each, change, start) if isinstance(each, Mapping) else each for each in value]
         elif name in FILE_KEYS and isinstance(value, list | tuple):
@@ -151,7 +154,7 @@ def read_pinned(key: str, reference: str, most: int = MAX_BYTES) -> tuple[Path, 
     except (OSError, ValueError) as error:
         raise ConfigError(f"cannot read {key}={shorten(name)} ({reason(error)}); give the path of another") from error
     if content is None:
-        raise ConfigError(f"{key}={name} is missing; put the file back, or give the path of another by {key}=<path>")
+        raise ConfigError(f"{key}={name} is missing; put the file back, or give the path of another")
     if expected and _hash(content) != expected:
         raise ConfigError(
             f"{key}={name} has changed since this configuration was made (its sha256 began with {expected}); put the "

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from multilift_marl.schema.files import pin_mesh
+from multilift_marl.schema.files import pin_text
 from multilift_marl.schema.values import Between, Float, Int, Positive, Section, Vector
 
 NotNegative = Annotated[Float, Field(ge=0)]
-Gap = tuple[Float, Positive] | tuple[Float, Positive, NotNegative, Positive]
+
+
+def _gap(value: Any) -> Any:
+    """Refuse a list of another length than the two that there are, of which pydantic's message would name one."""
+    if not isinstance(value, list | tuple) or len(value) not in (2, 4):
+        raise ValueError("must be a list of 2 or 4 numbers")
+    return value
+
+
+Gap = Annotated[tuple[Float, Positive] | tuple[Float, Positive, NotNegative, Positive], BeforeValidator(_gap)]
 
 
 class ObstacleConfig(Section):
@@ -33,7 +42,7 @@ class ObstacleConfig(Section):
         description="[m] of a wall: middle along y from its own and width of each; a window with its lower and upper "
         "edge above the wall's foot as well",
     )
-    mesh: Annotated[str | None, AfterValidator(pin_mesh)] = Field(None, description="path of an .obj or .stl file")
+    mesh: Annotated[str | None, AfterValidator(pin_text)] = Field(None, description="path of an .obj or .stl file")
     travel: Annotated[Vector, Between(-1000, 1000, "m")] = Field(
         (0.0, 0.0, 0.0), description="[m] it moves along this to both sides of its position, by a sine of time"
     )

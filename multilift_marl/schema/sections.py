@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, create_model, field_validator, model_validator
 
 from multilift_marl.schema.control import ControlConfig
-from multilift_marl.schema.files import pin_mesh, pin_vehicles
+from multilift_marl.schema.files import pin_text, pin_vehicles
 from multilift_marl.schema.obstacle_sensing import ObstacleSensingConfig
 from multilift_marl.schema.scene import SceneConfig
 from multilift_marl.schema.values import (
@@ -151,7 +151,7 @@ class PayloadConfig(Section):
     shape: Literal["box", "cylinder", "mesh", "point"] = Field(
         "box", description="box, upright cylinder, mesh, or point: a mass without extent"
     )
-    mesh: Annotated[str | None, AfterValidator(pin_mesh)] = Field(
+    mesh: Annotated[str | None, AfterValidator(pin_text)] = Field(
         None, description="path of an .obj or .stl file, a closed surface, for shape mesh"
     )
     origin: Literal["center", "file"] = Field(

@@ -67,7 +67,7 @@ def check_magnitudes(options: Section, prefix: str) -> None:
 
 def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) -> str:
     """Return one sentence for the first key that pydantic complains about."""
-    section, path = _find_key(errors[0]["loc"], model)
+    section, path, annotation = _find_key(errors[0]["loc"], model)
     about = [error for error in errors if _find_key(error["loc"], model)[1] == path]
     about = [error for error in about if error["type"] != "tuple_type"] or about  # those: a list of lists was tried
     error = max(about, key=lambda error: len(error["loc"]))  # the deepest: an element rather than its list
@@ -79,12 +79,14 @@ def _sentence(errors: list[Any], model: type[Section], prefix: str, where: str) 
         return f"unknown key '{key}'{source}{nearest(path[-1], section.model_fields, lambda near: home + near)}"
     if kind == "too_short":
         return f"{key}{source} must not be empty"
+    if kind == "missing" and isinstance(error["loc"][-1], str):
+        return f"{key}{source} is missing; give it a value"
     if kind in ("missing", "too_long"):
-        count = error["ctx"]["max_length"] if kind == "too_long" else 1 + max(e["loc"][-1] for e in about)
+        missing = [1 + each["loc"][-1] for each in about if each["type"] == "missing"]
+        count = error["ctx"]["max_length"] if kind == "too_long" else max(missing)
         return f"{key}{source} must be a list of {count} numbers, but is {shorten(repr(value))}"
     if kind == "tuple_type":
-        wanted = _list_in_words(section.model_fields[path[-1]].annotation)
-        return f"{key}{source} must be {wanted}, but is {shorten(repr(value))}"
+        return f"{key}{source} must be {_list_in_words(annotation)}, but is {shorten(repr(value))}"
     if kind in ("model_type", "dict_type", "model_attributes_type"):
         return f"{key}{source} must be a section with keys of its own, but is {shorten(repr(value))}"
     message = error["msg"].removeprefix("Value error, ").replace("Input should", "must").replace("should", "must")
@@ -104,27 +106,36 @@ def _list_in_words(annotation: Any) -> str:
     return "a list"
 
 
-def _element(annotation: Any) -> type[Section] | None:
-    """Return the kind of section that a list in an annotation holds, None if it holds others."""
+def _element(annotation: Any) -> Any:
+    """Return what a list in an annotation holds if it holds sections or lists, None if it holds others."""
     inner = typing.get_args(annotation)
     if typing.get_origin(annotation) is tuple:
-        return inner[0] if isinstance(inner[0], type) and issubclass(inner[0], Section) else None
+        return inner[0] if _is_section(inner[0]) or _is_list(inner[0]) else None
     return next((found for each in inner if (found := _element(each))), None)
 
 
-def _find_key(location: tuple[Any, ...], model: type[Section]) -> tuple[type[Section], list[str]]:
-    """Return the section and the path of the key in pydantic's location, which goes on into unions and lists."""
+def _is_section(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, Section)
+
+
+def _is_list(annotation: Any) -> bool:
+    return typing.get_origin(annotation) is tuple or any(_is_list(each) for each in typing.get_args(annotation))
+
+
+def _find_key(location: tuple[Any, ...], model: type[Section]) -> tuple[type[Section], list[str], Any]:
+    """Return section, path and annotation of the key in pydantic's location, which goes on into unions and lists."""
     section, path, parts = model, [], [str(part) for part in location]
+    annotation: Any = None
     while parts:
         path.append(parts.pop(0))
         annotation = section.model_fields[path[-1]].annotation if path[-1] in section.model_fields else None
         if typing.get_origin(annotation) is dict and parts:  # of names that are free
             path.append(parts.pop(0))
             annotation = typing.get_args(annotation)[1]
-        if parts and parts[0].isdigit() and (element := _element(annotation)):  # of a list of sections
+        if parts and parts[0].isdigit() and (element := _element(annotation)):  # of a list of sections or lists
             path[-1] += f"[{parts.pop(0)}]"
             annotation = element
-        if not (isinstance(annotation, type) and issubclass(annotation, Section)):
+        if not _is_section(annotation):
             break
         section = annotation
-    return section, path
+    return section, path, annotation

@@ -246,6 +246,13 @@ def test_the_command_writes_what_is_flown_and_says_what_is_left(tmp_path, capsys
         (["file=a.csv", "acceleration=3"], "acceleration means nothing beside file"),
         (["waypoints=[[0,0,2],[1,1,2]]", "out=a.npz"], "out=a.npz is written as CSV; give a name that ends in .csv"),
         (["waypoints=[[0,0,2],[1,1,2]]", "plot=a.foo"], "plot=a.foo is written as PNG"),
+        (["waypoints=[[0,0,2],[1,1,2]]", "times=[0]"], "error: times has 1 times for 2 way-points"),
+        (["waypoints=[[0,0,2]]"], "error: waypoints has 1 way-points"),
+        (["waypoints=none.csv"], "error: waypoints=/"),
+        (["file=none.csv"], "none.csv is missing; put the file back, or give the path of another\n"),
+        ([f"file={'x' * 300}.csv"], "error: file must name a file that can be read"),
+        ([f"waypoints={'x' * 300}.csv"], "error: waypoints must name a file that can be read"),
+        (["waypoints=[[0,0,2],[1,1,2]]", "out=/proc/to/a.csv"], "give another folder by out=<path>"),
     ],
 )
 def test_the_command_refuses_in_a_sentence(arguments, said, capsys, tmp_path, monkeypatch):
@@ -253,3 +260,21 @@ def test_the_command_refuses_in_a_sentence(arguments, said, capsys, tmp_path, mo
     assert plan(arguments) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "said"),
+    [
+        ("file", "a,b\n1,2\n", " has no column t "),
+        ("file", "t,x,y,z\n0,0,0,2\n1,0,0,2\n1,0,0,2\n2,0,0,2\n", ": t does not increase from row 2 "),
+        ("file", "t,x,y,z,yaw\n0,0,0,2,0\n1,0,0,2,90\n2,0,0,2,0\n3,0,0,2,0\n", ": yaw goes from 0 to 90 rad "),
+        ("file", "t,x,y,z\n0,0,0,2\n1,0,0,1\n2,0,0,0\n3,0,0,0\n", " and the payload would touch the ground"),
+        ("waypoints", "a,b\n1,2\n", " has no column x "),
+        ("waypoints", "x,y,z,t\n0,0,2,1\n1,0,2,0\n", ": the times of way-points 1 and 2, 1 and 0 s, do not increase"),
+    ],
+)
+def test_the_command_blames_a_table_on_its_own_key(key, text, said, capsys, tmp_path):
+    path = save(tmp_path, text)
+    assert plan([f"{key}={path}"]) == 2
+    message = capsys.readouterr().err
+    assert f"error: {key}={path}" in message and said in message

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from conftest import make, make_system, refuse_system
 
+import multilift_marl as ml
 from multilift_marl.math3d import axis_angle
 from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.rig.mesh import read_mesh
+from multilift_marl.schema.files import pin_file
 from multilift_marl.sim.scene import build_model
 
 WEDGE = "v 0 0 0\nv 0.6 0 0\nv 0 0.8 0\nv 0 0 0.3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -190,6 +192,22 @@ def test_a_file_that_holds_no_body_is_refused(text, name, complaint, write, tmp_
     path = tmp_path / name if text is None else write(text, name)
     message = refuse_system(payload__shape="mesh", payload__mesh=str(path))
     assert re.match(complaint, message), message
+    stone = {"shape": "mesh", "mesh": str(path), "position": [5, 0, 1]}
+    message = refuse_system(scene__obstacles=[{"size": [1, 1, 1]}, stone])
+    assert re.match(complaint.replace(r"payload\.mesh", r"scene\.obstacles\[1\]\.mesh"), message), message
+
+
+def test_a_file_that_cannot_be_read_is_blamed_on_its_own_key(write):
+    text = str(write("v 0 0 0\nv 1\n", "torn.obj"))
+    stone = {"shape": "mesh", "mesh": text, "position": [5, 0, 1]}
+    assert refuse_system(scene__obstacles=[stone]).startswith(f"cannot read scene.obstacles[0].mesh={text}: ")
+
+
+def test_the_mesh_of_an_obstacle_may_lie_beside_its_configuration(write):
+    path = write(WEDGE, "wedge.obj")
+    mine = write("base: hover\nscene: {obstacles: [{shape: mesh, mesh: wedge.obj, position: [5, 0, 1]}]}\n")
+    config = ml.load_config(str(mine))
+    assert config.scene.obstacles[0].mesh == pin_file(str(path)) and len(config.system.scenery.obstacles) == 1
 
 
 def test_mesh_and_its_shape_belong_together():

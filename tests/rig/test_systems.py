@@ -30,6 +30,15 @@ def test_anchors_in_one_place_beside_the_centre_cannot_hold_level():
     assert re.match(r"payload\.anchors .* cannot hold the payload level: place them around", message)
 
 
+@pytest.mark.parametrize(
+    "payload",
+    [{"payload.anchor_radius": 0.2}, {"payload.anchors": [[0.2, 0, 0.08]]}, {"payload.center_of_mass": [-0.1, 0, 0]}],
+)
+def test_one_drone_cannot_hold_level_beside_the_centre(payload):
+    message = refuse_system(1, **payload)
+    assert re.match(r"env\.num_drones=1 cannot hold the payload level by an anchor .*: raise env\.num_drones", message)
+
+
 def test_anchors_on_one_side_would_need_a_cable_that_pushes():
     message = refuse_system(
         payload__anchors=[[0.25, 0.2, 0.08], [0.3, -0.2, 0.08], [0.28, 0.0, 0.08], [0.02, 0.0, 0.08]]

@@ -193,3 +193,9 @@ def test_who_joins_knows_its_anchor_while_its_slot_rises():
 )
 def test_what_cannot_be_is_refused(overrides, said):
     assert said in refusal(regroup, **overrides)
+
+
+@pytest.mark.parametrize("own", [{}, {"payload.anchor_radius": None}])
+def test_one_drone_is_too_few(own):
+    message = refusal(make, "regroup", num_drones=1, **own)
+    assert "payload.anchors [" not in message and "raise env.num_drones" in message
