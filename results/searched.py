@@ -27,7 +27,7 @@ _NAMES = {
     "gate_realistic_5": "gate_realistic",
     "gate_two": "gate_walls",
     "gate_three": "gate_walls",
-    "recover_realistic": "recover_success",
+    "recover_realistic": "recover_wash",
     "loss": "loss_realistic",
     "loss_snap": "loss_realistic",
     "loss_realistic": "loss_wash",
