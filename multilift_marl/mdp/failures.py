@@ -112,6 +112,11 @@ def make_limits(system: System, distance: float = MAX_DISTANCE) -> Limits:
     )
 
 
+def least_height(system: System) -> float:
+    """Return how high a payload that hangs level must be at least, so as not to touch the ground [m]."""
+    return float(TOUCH + system.payload_size[2] / 2 - system.payload_center[2])
+
+
 def ignore(*causes: int) -> int:
     """Return the value of `FailureMask.ignored` that lets `causes` pass."""
     return sum(1 << cause for cause in causes)

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from multilift_marl.control.formation import goal_hook, hook_arm
-from multilift_marl.errors import ConfigError, warn_once
+from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import inlined, kernel
 from multilift_marl.math3d import add, matrow, mul, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.mdp import rewards
@@ -245,16 +245,6 @@ def margin_ratio(margin: float, system: System) -> np.ndarray:
 def pace_of(pace: float, system: System) -> float:
     """Return the pace of a plan for cables of up to 2 m; longer ones swing slower, and take longer as they do."""
     return pace / max(1.0, sqrt(system.cable_length.max() / LONG))
-
-
-def warn_of_time(end: float, task: str, pace: float, seconds: float) -> None:
-    """Warn where a plan that is slower than usual, until `end` [s], does not fit into episodes of `seconds`."""
-    if pace < 1 and end > seconds:
-        warn_once(
-            "tasks",
-            f"so slowly, task {task} can succeed from {end:.1f} s on, but env.episode_seconds={seconds:g} ends before; "
-            f"raise it to {end + 1:.0f}",
-        )
 
 
 def paced(phase: tuple[float, float], pace: float, later: float = 0.0, longer: float = 0.0) -> tuple[float, float]:

@@ -26,7 +26,10 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
+from multilift_marl.mdp.failures import least_height
 from multilift_marl.rig.constants import RigArrays
+from multilift_marl.rig.system import System
+from multilift_marl.schema.validate import check_magnitudes
 from multilift_marl.schema.values import Float, Section
 from multilift_marl.sim.cables.catenary import cable_end
 from multilift_marl.sim.parameters import Parameters
@@ -127,10 +130,33 @@ class StartOptions(TargetOptions):
     start_speed: Float = Field(0.3, ge=0, description="[m/s] largest speed of the team at the start")
 
 
-def check_heights(option: TargetOptions) -> None:
-    """Refuse heights of a target in the wrong order, by a ConfigError."""
-    if option.target_height[0] > option.target_height[1]:
+def check_options(options: Section, system: System) -> None:
+    """Refuse, by a ConfigError, options of a task that are too large or, of targets that stay, in the ground."""
+    check_magnitudes(options, "task_options")
+    if isinstance(options, TargetOptions):
+        check_heights(options, system)
+
+
+def check_heights(option: TargetOptions, system: System) -> None:
+    """Refuse heights of a target in the wrong order, or in the ground, by a ConfigError."""
+    low, high = option.target_height
+    if low > high:
         raise ConfigError(f"task_options.target_height={option.target_height} must list the lower one first")
+    check_target_height(f"task_options.target_height={option.target_height}", low, system)
+
+
+def check_target_height(source: str, height: float, system: System) -> None:
+    """Refuse, by a ConfigError, a target [m] at which the payload, level, would touch the ground.
+
+    Args:
+        source: key of the target, and its value.
+        height: its lowest place [m].
+        system: the team.
+    """
+    if height < (least := least_height(system)):
+        raise ConfigError(
+            f"{source}: at a height of {height:.3g} m the payload would touch the ground; keep it above {least:.3g} m"
+        )
 
 
 class StartRanges(NamedTuple):
@@ -146,8 +172,7 @@ class StartRanges(NamedTuple):
 
 
 def make_ranges(option: StartOptions) -> StartRanges:
-    """Return the ranges of `option`; a ConfigError if the heights are in the wrong order."""
-    check_heights(option)
+    """Return the ranges of `option`."""
     return StartRanges(
         option.target_xy, *option.target_height, radians(option.target_yaw),
         option.start_radius, radians(option.start_tilt), option.start_speed,

@@ -7,7 +7,7 @@ from math import ceil, isfinite, pi
 import numpy as np
 
 from multilift_marl.errors import ConfigError, warn_once
-from multilift_marl.mdp.failures import TOUCH
+from multilift_marl.mdp.failures import least_height
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.feasibility import find_violation
 from multilift_marl.planning.path_table import COLUMNS, KEY, SAMPLING, read_table
@@ -232,7 +232,7 @@ def check_height(source: str, table: np.ndarray, system: System, cure: str = "")
     """
     t, motion = _sample_all(table)
     lowest = int(np.argmin(motion[0, :, 2]))
-    least = TOUCH + system.payload_size[2] / 2 - system.payload_center[2]
+    least = least_height(system)
     if motion[0, lowest, 2] < least:
         raise ConfigError(
             f"{source}: at {t[lowest]:.2f} s z is {motion[0, lowest, 2]:.3g} m and the payload would touch the "
@@ -244,29 +244,44 @@ def check_thrust(source: str, table: np.ndarray, system: System, ranges: Randomi
     """Refuse a path that is too fast for the team, its heaviest payload and its weakest rotors included.
 
     What begins or ends in motion is given a `cure`; for the others see `check_height`.
+    """
+    t, (_, rate, bend, _) = _sample_all(table)
+    if fault := find_overload(t, bend, rate[:, 3], system, ranges):
+        raise ConfigError(
+            f"{source} is too fast: {fault}; make the path slower or smoother (t in s, x, y, z in m, yaw in rad; it "
+            f"begins and ends at rest{cure})"
+        )
+
+
+def find_overload(
+    times: np.ndarray, bend: np.ndarray, yaw_rate: np.ndarray, system: System, ranges: RandomizationConfig
+) -> str:
+    """Return when and why a target is too fast for the team; nothing if it is not.
 
     A team that accelerates by a hangs as at rest, but in gravity g - a: hovering thrusts grow by |a + g e_z| / g.
     Drones of a formation that turns also accelerate about its middle.
+
+    Args:
+        times: (T,) [s].
+        bend: (T, 4) accelerations of x, y, z [m/s²] and yaw [rad/s²].
+        yaw_rate: (T,) [rad/s].
+        system, ranges: the team, and what its episodes draw.
     """
-    t, (_, rate, bend, _) = _sample_all(table)
     gravity = bend[:, :3] + [0.0, 0.0, GRAVITY]
     if gravity[:, 2].min() < _MIN_WEIGHT * GRAVITY:
         i = np.argmin(gravity[:, 2])
-        raise ConfigError(
-            f"{source} is too fast: at {t[i]:.2f} s its target falls at {-bend[i, 2]:.3g} m/s² and the cables "
-            f"would go slack; make the path slower or smoother (t in s, x, y, z in m; it begins and ends at rest{cure})"
-        )
+        return f"at {times[i]:.2f} s its target falls at {-bend[i, 2]:.3g} m/s² and the cables would go slack"
     own = (1 + ranges.vehicle_mass) * system.drone_mass
     hover = (1 + ranges.payload_mass) * system.hook_force + own[:, None] * [0.0, 0.0, GRAVITY]
-    swing = np.hypot(rate[:, 3] ** 2, bend[:, 3])[:, None] * np.linalg.norm(system.slots[:, :2], axis=1)
+    swing = np.hypot(yaw_rate**2, bend[:, 3])[:, None] * np.linalg.norm(system.slots[:, :2], axis=1)
     thrust = np.linalg.norm(gravity, axis=1)[:, None] / GRAVITY * np.linalg.norm(hover, axis=1) + own * swing
     most = 4 * np.array([vehicle.rotor_thrust_max for vehicle in system.vehicles])
     most = most * ranges.weakest_rotor
     i, n = np.unravel_index(np.argmax(thrust / most), thrust.shape)
-    if not isfinite(thrust[i, n]) or thrust[i, n] > most[n]:
-        raise ConfigError(
-            f"{source} is too fast: at {t[i]:.2f} s its target accelerates at {np.linalg.norm(bend[i, :3]):.3g} "
-            f"m/s² and {bend[i, 3]:.3g} rad/s², for which drone {n} would need {thrust[i, n]:.3g} N of its "
-            f"{most[n]:.3g} N; make the path slower or smoother (t in s, x, y, z in m, yaw in rad; it begins and ends "
-            f"at rest{cure})"
-        )
+    if isfinite(thrust[i, n]) and thrust[i, n] <= most[n]:
+        return ""
+    turns = f" and {bend[i, 3]:.3g} rad/s²" if bend[:, 3].any() else ""
+    return (
+        f"at {times[i]:.2f} s its target accelerates at {np.linalg.norm(bend[i, :3]):.3g} m/s²{turns}, for which drone "
+        f"{n} would need {thrust[i, n]:.3g} N of its {most[n]:.3g} N"
+    )

@@ -122,13 +122,23 @@ def set_goal(e, motion, goal):
     put(goal.jerk[e], motion[3])
 
 
-def draw_curve(rng: np.random.Generator, half: np.ndarray) -> np.ndarray:
+def draw_curve(rng: np.random.Generator, half: np.ndarray, lowest: float = -np.inf) -> np.ndarray:
     """Return (WAYPOINTS, 2, 3): way-points uniform in a box of half edges (3,) [m], and their spline's curvature.
 
-    The first way-point is the centre; the curve rests at both ends. Second derivatives follow from the smoothness of
-    the first ones, as in any textbook on splines.
+    The first way-point is the centre; the curve rests at both ends. It swings beyond its way-points, and is drawn again
+    where it is lower than `lowest` [m], which is -half[2] or less.
     """
-    points = rng.uniform(-half, half, (WAYPOINTS, 3))
+    curve = _join(rng.uniform(-half, half, (WAYPOINTS, 3)))
+    while _lowest(curve) < lowest:
+        curve = _join(rng.uniform(-half, half, (WAYPOINTS, 3)))
+    return curve
+
+
+def _join(points: np.ndarray) -> np.ndarray:
+    """Return the curve through way-points, the first one moved to the centre, see `draw_curve`.
+
+    Second derivatives follow from the smoothness of the first ones, as in any textbook on splines.
+    """
     points[0] = 0.0
     # Clamped ends, the speed zero at both: 2 M_0 + M_1 = 6 (p_1 - p_0), and the mirror image of it.
     matrix, right = np.zeros((WAYPOINTS, WAYPOINTS)), np.zeros((WAYPOINTS, 3))
@@ -140,13 +150,24 @@ def draw_curve(rng: np.random.Generator, half: np.ndarray) -> np.ndarray:
     return np.stack([points, np.linalg.solve(matrix, right)], axis=1)
 
 
-def largest_rates(curve: np.ndarray) -> tuple[float, float]:
-    """Return the largest speed and acceleration of a random path that passes one way-point in a second."""
+def _pieces(curve: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return, all along a curve, the row before and after, and the shares of the way from the one to the other."""
     u = np.linspace(0, WAYPOINTS - 1, 40 * WAYPOINTS + 1)
     i = np.minimum(u.astype(int), WAYPOINTS - 2)
     after = (u - i)[:, None]
-    before = 1 - after
-    first, second = curve[i], curve[i + 1]
+    return curve[i], curve[i + 1], 1 - after, after
+
+
+def _lowest(curve: np.ndarray) -> float:
+    """Return the lowest height of a curve [m], see `_spline`."""
+    first, second, before, after = _pieces(curve[:, :, 2:])
+    bend = (before**3 - before) * first[:, 1] + (after**3 - after) * second[:, 1]
+    return float((before * first[:, 0] + after * second[:, 0] + bend / 6).min())
+
+
+def largest_rates(curve: np.ndarray) -> tuple[float, float]:
+    """Return the largest speed and acceleration of a random path that passes one way-point in a second."""
+    first, second, before, after = _pieces(curve)
     velocity = second[:, 0] - first[:, 0] + ((3 * after**2 - 1) * second[:, 1] - (3 * before**2 - 1) * first[:, 1]) / 6
     acceleration = before * first[:, 1] + after * second[:, 1]
     return float(np.linalg.norm(velocity, axis=1).max()), float(np.linalg.norm(acceleration, axis=1).max())

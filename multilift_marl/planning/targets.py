@@ -41,6 +41,8 @@ class Bounds(NamedTuple):
     """(N, N) distance between cables [m]."""
     half: np.ndarray
     """(3,) half edges of the payload [m]."""
+    center: tuple[float, float, float]
+    """Its geometric centre from its centre of mass, in its frame [m]."""
     stiffness: np.ndarray
     """(N,) with which drones hold their places [N/m]."""
 
@@ -55,6 +57,7 @@ def make_bounds(system: System, control: ControlConfig, limits: Limits, load: fl
         separation=MARGIN * limits.separation,
         cables=MARGIN * limits.cables,
         half=limits.payload_half,
+        center=limits.payload_center,
         stiffness=SOFT * gains.mass * gains.k_p,
     )
 
@@ -111,7 +114,7 @@ def _within(e, goal, rig, bounds):
     target, position = matrow(goal.rotation, e), row(goal.position, e)
     half = bounds.half
     below = abs(target[6]) * half[0] + abs(target[7]) * half[1] + abs(target[8]) * half[2]
-    if position[2] - below < CLEARANCE:
+    if position[2] + mul(target, bounds.center)[2] - below < CLEARANCE:
         return False
     for n in range(rig.slots.shape[0]):
         slot, cable_weight = vec(goal.slots, e, n), (0.0, 0.0, rig.cable_weight[n])

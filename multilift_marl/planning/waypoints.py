@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.errors import ConfigError
-from multilift_marl.mdp.failures import TOUCH
+from multilift_marl.mdp.failures import least_height
 from multilift_marl.planning.feasibility import Margin, find_violation
 from multilift_marl.planning.minimum_snap import allocate_times, fit_minimum_snap
 from multilift_marl.planning.path_file import MAX_ROWS, check_height, check_thrust, warn_of_length
@@ -168,7 +168,7 @@ def _check_waypoints(name: str, values: np.ndarray, system: System) -> None:
     if not np.isfinite(values).all() or np.abs(values).max() > 1e6:
         i = int(np.argmax(~(np.abs(values) <= 1e6).all(axis=1)))
         raise ConfigError(f"{name}: way-point {i + 1} is at {values[i, :3].tolist()} m; give finite places")
-    lowest = TOUCH + system.payload_size[2] / 2 - system.payload_center[2]
+    lowest = least_height(system)
     if (low := values[:, 2] < lowest).any():
         i = int(np.argmax(low))
         raise ConfigError(

@@ -16,14 +16,14 @@ from multilift_marl.mdp.criteria import Criterion, rest_criteria
 from multilift_marl.mdp.env_data import INTEGRAL_LIMIT, Errors, View, reduce_view, true_load
 from multilift_marl.mdp.failures import CAUSES, FIRST_OWN, MAX_DISTANCE, SIGHT, FailureMask, make_limits
 from multilift_marl.mdp.global_state import state_components
-from multilift_marl.mdp.initial_states import true_equilibrium
+from multilift_marl.mdp.initial_states import check_options, true_equilibrium
 from multilift_marl.mdp.numpy_functions import NumpyFunctions
 from multilift_marl.mdp.observation_kernels import check_written, compose_observation, compose_state
 from multilift_marl.mdp.observations import Component, kernels_first, list_components, sensed_components
 from multilift_marl.mdp.rewards import RestBounds, Term, compose_reward, is_at_rest, resolve_reward
 from multilift_marl.mdp.rig_features import RIG, describe_rig, observed_units, scale_numbers
 from multilift_marl.mdp.stage_kernels import compose_check, compose_plan, in_turn
-from multilift_marl.schema.validate import check_magnitudes, validate
+from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Section
 from multilift_marl.sensing.measurement import Sensing
 from multilift_marl.sim.obstacles import make_hulls, restart_obstacles
@@ -143,7 +143,7 @@ class Task:
             raise ConfigError(f"task {self.name} has no chains; set cable.model=massless")
         self.config, self.world, self.reference, self._sensing = config, world, reference, sensing
         self.options = validate(self.Options, config.task_options, "task_options")
-        check_magnitudes(self.options, "task_options")
+        check_options(self.options, world.system)
         self.weights, self.margins = resolve_reward(self.name, self.REWARD, config.reward)
         self.dt, self.control_dt = 1.0 / config.env.policy_hz, 1.0 / config.sim.control_hz
         self.goal, self.errors = Goal.zeros(e, n), Errors.zeros(e)

@@ -32,6 +32,7 @@ from multilift_marl.planning.paths import STEP, differences, set_goal
 from multilift_marl.schema.values import Float, Int, Section, Span
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.tasks.base import Box, Kernels, Task
+from multilift_marl.tasks.target_checks import check_gaps, warn_of_time
 
 THICKNESS = 0.1  # [m] of the walls
 SPACING = 1.5  # [m] between walls
@@ -334,13 +335,17 @@ class Gate(Task):
                 "target leaves; raise it"
             )
         x = SPACING * (np.arange(option.gates) - (option.gates - 1) / 2)
+        reach = max(x[-1] + MARGIN, 2.0)
+        check_gaps(option, reach, SPACING - 0.5 if len(x) > 1 else reach - 0.25, system)
+        until = f"with task_options.arrival={option.arrival:g} s, task gate can succeed from"
+        warn_of_time(until, option.arrival + option.success_seconds, self.config.env.episode_seconds)
         drone = np.array([drone_half_size(vehicle) for vehicle in system.vehicles])
         clear = THICKNESS / 2 + np.linalg.norm(drone[:, :2], axis=1) + SPARE
         self.own = GateArrays(np.zeros((e, len(x))), np.zeros((e, len(x))), np.zeros(e))
         self.settings = GateSettings(
             x=x,
             gap_height=option.gap_height,
-            reach=max(x[-1] + MARGIN, 2.0),
+            reach=reach,
             begin=option.set_off,
             duration=option.arrival - option.set_off,
             arrival=option.arrival,

@@ -31,15 +31,15 @@ from multilift_marl.mdp.ground import (
     readiness,
     scale_cable_force,
     set_resting_goal,
-    warn_of_time,
 )
-from multilift_marl.mdp.initial_states import set_equilibrium
+from multilift_marl.mdp.initial_states import check_target_height, set_equilibrium
 from multilift_marl.mdp.observations import Component, target_velocity
 from multilift_marl.mdp.rewards import Term, action_rate, tolerance
 from multilift_marl.schema.values import Float, Section
 from multilift_marl.sim.contact import drone_half_size
 from multilift_marl.sim.state import SystemState
 from multilift_marl.tasks.base import Kernels, Task
+from multilift_marl.tasks.target_checks import check_way, warn_of_time
 
 APPROACH = (0.1, 2.7)  # begin and length of each phase [s], as of the next ones: level to the pad,
 DESCEND = (2.0, 2.8)  # down,
@@ -276,8 +276,14 @@ class Land(Task):
             clearance=option.clearance * min(ground.size, 1.0),
             drone_half=float(np.linalg.norm(half)),
         )
+        start, down = f"task_options.start_height={option.start_height:g} m", ground.payload - option.start_height
+        check_target_height(start, option.start_height, system)
+        check_way(start, "lower it", (0.0, 0.0, min(down + NEAR * ground.size, 0.0)), self.settings.descend[1], system)
+        pad = f"task_options.pad_xy={option.pad_xy:g} m"
+        check_way(pad, "lower it", (option.pad_xy, 0.0, 0.0), self.settings.approach[1], system)
         end = sum(self.settings.lower) + option.success_seconds
-        warn_of_time(end, self.name, pace, self.config.env.episode_seconds)
+        if end > sum(LOWER) + LandOptions().success_seconds:  # else the usual plan, cut on purpose
+            warn_of_time(f"by its plan, task {self.name} can succeed from", end, self.config.env.episode_seconds)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw the pad; the team hangs at rest above the origin. See `Task.start`."""

@@ -29,6 +29,7 @@ from multilift_marl.mdp.rewards import (
 from multilift_marl.schema.values import Between, Float, Section
 from multilift_marl.sensing.loss_detection import LEAST_CHANGE, SETTLED, WINDOW, expect_changes, notice_loss
 from multilift_marl.tasks.base import Kernels, Task
+from multilift_marl.tasks.target_checks import warn_of_time
 
 
 class LossOptions(StartOptions):
@@ -211,6 +212,8 @@ class Loss(Task):
         early, late = option.loss_time
         if not 0 <= early <= late:
             raise ConfigError(f"task_options.loss_time={option.loss_time} must list the earlier one first")
+        until = f"with task_options.loss_time={option.loss_time}, every episode of task loss can succeed from"
+        warn_of_time(until, late + option.success_seconds, self.config.env.episode_seconds)
         e, n, gains = world.num_envs, world.num_drones, make_gains(control, world.system)
         changes = expect_changes(world.system, gains.mass)
         by_cable = self._notice_by_cable(changes)

@@ -13,7 +13,7 @@ from multilift_marl.kernels.jit import drawing, inlined
 from multilift_marl.math3d import IDENTITY, add, ease, norm, put, putmat, row, scale, sub
 from multilift_marl.mdp.criteria import ArrivalOptions, Criterion, rest_criteria, tension_criterion
 from multilift_marl.mdp.failures import RANGE
-from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
+from multilift_marl.mdp.initial_states import check_target_height, in_ball, set_equilibrium
 from multilift_marl.mdp.observations import Component, target_velocity
 from multilift_marl.mdp.rewards import (
     RestBounds,
@@ -34,6 +34,7 @@ from multilift_marl.rig.system import System
 from multilift_marl.schema.values import Between, Counts, Float, Int, Section, Span, Vector
 from multilift_marl.sim.obstacles import Obstacles
 from multilift_marl.tasks.base import Kernels, Task
+from multilift_marl.tasks.target_checks import check_way, warn_of_time
 
 Place = Annotated[Vector, Between(-1e3, 1e3, "m")]
 SPARE = 0.10  # [m] of clearance that the reward asks for
@@ -201,7 +202,8 @@ def given_map(option: NavigateOptions, system: System, obstacles: Obstacles) -> 
     """Return the map of level `given`: obstacles are the scene's.
 
     Raises:
-        ConfigError: no start or goal, or one outside the payload's space, or where the team is in an obstacle.
+        ConfigError: no start or goal, or one in the ground or outside the payload's space, or where the team is in an
+            obstacle.
     """
     if option.start is None or option.goal is None:
         raise ConfigError("task_options.level=given needs task_options.start and task_options.goal, x, y, z [m] each")
@@ -217,6 +219,7 @@ def given_map(option: NavigateOptions, system: System, obstacles: Obstacles) -> 
     low = points.min(axis=0) - ROOM if option.low is None else np.array(option.low)
     high = points.max(axis=0) + ROOM if option.high is None else np.array(option.high)
     for name, place in (("start", start), ("goal", goal)):
+        check_target_height(f"task_options.{name}={place.tolist()}", place[2], system)
         if (place < low).any() or (place > high).any():
             raise ConfigError(
                 f"task_options.{name}={place.tolist()} is outside the payload's space from {low.tolist()} to "
@@ -264,6 +267,13 @@ class Navigate(Task):
             self._given = given_map(option, self.world.system, self.world.obstacles)
         elif scenery.reserved < (rows := option.course.capacity(option.level)):
             raise ConfigError(f"task navigate places up to {rows} obstacles; set scene.reserved={rows} or more")
+        way = np.array([option.length * unit_length(self.world.system), 0.0, 0.0])
+        if option.level == "given":
+            way = self._given.goal - self._given.start
+        lasts = PEAK * float(np.linalg.norm(way)) / option.speed
+        check_way(f"task_options.speed={option.speed:g} m/s", "lower it", way, lasts, self.world.system)
+        arrives = f"with task_options.speed={option.speed:g} m/s the target of task navigate arrives at"
+        warn_of_time(arrives, lasts, self.config.env.episode_seconds)
         self._first = len(scenery.obstacles)
         start, goal, low, high, place = (np.zeros((e, 3)) for _ in range(5))
         lengths = np.zeros(e), np.zeros(e)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import ceil, radians
+from math import ceil, radians, sqrt
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import inlined, kernel
 from multilift_marl.math3d import matmul, matrow, rotation_vector, row, sub, transpose
 from multilift_marl.mdp.criteria import Criterion
-from multilift_marl.mdp.initial_states import set_equilibrium
+from multilift_marl.mdp.initial_states import check_target_height, set_equilibrium
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import (
     RestBounds,
@@ -29,7 +29,7 @@ from multilift_marl.mdp.rewards import (
     spin,
     stillness,
 )
-from multilift_marl.planning.targets import Bounds, draw_plan, make_bounds
+from multilift_marl.planning.targets import MAX_LEAP, Bounds, draw_plan, make_bounds
 from multilift_marl.planning.trajectory import (
     Plan,
     advance_plan,
@@ -42,6 +42,7 @@ from multilift_marl.planning.trajectory import (
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Float, Section, Shares
 from multilift_marl.tasks.base import Kernels, Task
+from multilift_marl.tasks.target_checks import check_way, warn_of_time
 
 
 class PoseOptions(Section):
@@ -185,6 +186,8 @@ class Pose(Task):
         option, system, e, n = self.options, self.world.system, self.world.num_envs, self.world.num_drones
         if option.target_height[0] > option.target_height[1]:
             raise ConfigError(f"task_options.target_height={option.target_height} must list the lower one first")
+        low, high = option.target_height
+        check_target_height(f"task_options.target_height={option.target_height}", high, system)
         if option.way_seconds > option.target_seconds:
             raise ConfigError(
                 f"task_options.way_seconds={option.way_seconds:g} must not exceed target_seconds="
@@ -195,7 +198,15 @@ class Pose(Task):
         # The last target may have less time than the others; round-off must not add one that has none.
         targets = ceil(length / hold - 1e-9)
         self.own = PoseArrays(Plan.zeros(e, targets, n), np.zeros((e, targets), bool))
-        if option.plan:  # actions point as observations do
+        if option.plan:
+            # between places drawn uniformly, the root of the mean square
+            spans = np.array([2 * option.target_xy, 2 * option.target_xy, high - low]) / sqrt(6)
+            leap = min(option.target_share[1] * float(np.linalg.norm(spans)), MAX_LEAP)
+            way = f"task_options.way_seconds={option.way_seconds:g} for {leap:.3g} m"
+            check_way(way, "raise it", (leap, 0.0, 0.0), option.way_seconds, system)
+            last = f"with task_options.way_seconds={option.way_seconds:g} the plan of task pose ends at"
+            warn_of_time(last, (targets - 1) * hold + option.way_seconds, length)
+            # Actions point as observations do.
             self.planned = Goal.zeros(e, n)._replace(slot_frame=self.goal.slot_frame)
         heaviest = 1 + self.config.randomization.payload_mass
         self.settings = PoseSettings(

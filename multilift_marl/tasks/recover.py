@@ -29,7 +29,7 @@ from multilift_marl.math3d import (
 )
 from multilift_marl.mdp.criteria import Criterion, tension_criterion
 from multilift_marl.mdp.failures import BELOW, CABLE, GROUND, LOAD_GROUND, TILT, ignore
-from multilift_marl.mdp.initial_states import TargetOptions, check_heights, in_ball
+from multilift_marl.mdp.initial_states import TargetOptions, in_ball
 from multilift_marl.mdp.observations import Component, cable_vector
 from multilift_marl.mdp.rewards import (
     RestBounds,
@@ -247,7 +247,6 @@ class Recover(Task):
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option = self.options
-        check_heights(option)
         taut = self.world.cable_model.SLACK
         self._slack = min(option.start_slack, taut), taut
         self._early = ignore(TILT, CABLE)

@@ -28,6 +28,7 @@ from multilift_marl.mdp.rewards import (
 from multilift_marl.schema.values import Between, Float, Section
 from multilift_marl.sim.state import hover_drone
 from multilift_marl.tasks.base import Kernels, Task
+from multilift_marl.tasks.target_checks import warn_of_time
 
 SLACK = 0.08  # [-] of its cable's length, by which a drone that waits to join is below its slot
 TAKE_UP = 2.0  # [s] in which the slot of a drone that has joined rises, and the drone takes its share of the load
@@ -186,6 +187,10 @@ class Regroup(Task):
                 f"task_options.events={option.events} must leave task_options.success_seconds="
                 f"{option.success_seconds:g} before the first"
             )
+        if option.events:
+            until = f"with task_options.events={option.events}, every episode of task regroup can succeed from"
+            end = option.events[-1] + option.event_spread + option.success_seconds
+            warn_of_time(until, end, self.config.env.episode_seconds)
         if self.config.cable.breaking_load is not None:
             raise ConfigError("cables of task regroup do not break; leave cable.breaking_load out")
         self._ranges = make_ranges(option)

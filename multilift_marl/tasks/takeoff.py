@@ -34,12 +34,13 @@ from multilift_marl.mdp.ground import (
     resting_distance,
     scale_cable_force,
     set_resting_goal,
-    warn_of_time,
 )
+from multilift_marl.mdp.initial_states import check_target_height
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import RestBounds, Term, action_rate, is_at_rest
 from multilift_marl.schema.values import Float, Section
 from multilift_marl.tasks.base import Kernels, Task
+from multilift_marl.tasks.target_checks import check_way, warn_of_time
 
 RISE = (0.1, 1.6)  # begin and length of each phase [s], as of the next ones: drones rise,
 TIGHTEN = (1.7, 1.2)  # cables become taut,
@@ -246,8 +247,12 @@ class Takeoff(Task):
             lift=paced(LIFT, pace, later=creeping),
             margin=margin_ratio(option.margin, system),
         )
+        target = f"task_options.target_height={option.target_height:g} m"
+        check_target_height(target, option.target_height, system)
+        check_way(target, "lower it", (0.0, 0.0, self.settings.climb), self.settings.lift[1], system)
         end = sum(self.settings.lift) + option.success_seconds
-        warn_of_time(end, self.name, pace, self.config.env.episode_seconds)
+        if end > sum(LIFT) + TakeoffOptions().success_seconds:  # else the usual plan, cut on purpose
+            warn_of_time(f"by its plan, task {self.name} can succeed from", end, self.config.env.episode_seconds)
 
     def start(self, env: int, rng: np.random.Generator, mass: float) -> None:
         """Draw where the payload and the drones are on the ground; see `Task.start`."""

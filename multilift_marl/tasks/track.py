@@ -14,6 +14,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import drawing, inlined, kernel
 from multilift_marl.math3d import add, matrow, put, putmat, rot_z, row, scale, sub, vec
 from multilift_marl.mdp.criteria import Criterion
+from multilift_marl.mdp.failures import least_height
 from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
 from multilift_marl.mdp.observations import Component, target_velocity
 from multilift_marl.mdp.rewards import Term, action_rate, attitude, distance, failure, tolerance, velocity
@@ -42,6 +43,7 @@ from multilift_marl.planning.waypoints import load_waypoints
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Between, Choice, Float, Places, Section, Span, Vector
 from multilift_marl.tasks.base import Kernels, Task
+from multilift_marl.tasks.target_checks import check_paths
 
 AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
 _DRAWN = 400  # points of a path that is drawn
@@ -305,9 +307,10 @@ class Track(Task):
     def prepare(self) -> None:
         """See `Task.prepare`."""
         option, world, e = self.options, self.world, self.world.num_envs
-        seconds = self.config.env.episode_seconds
+        seconds, self._lowest = self.config.env.episode_seconds, least_height(world.system)
         self.rmse_after = option.rmse_from if option.rmse_from < seconds else 0.0
         self._check_forms()
+        check_paths(option, seconds, world.system)
         table, team = NO_FILE, (world.system, self.config.randomization)
         if option.file:
             smoothing = option.file_spacing, option.file_ramp, option.file_offset
@@ -353,7 +356,7 @@ class Track(Task):
         elif kind == LEMNISCATE:  # Bernoulli's: peak speed A ω and acceleration 3 A ω² at the ends
             path.size[env], path.rate[env] = 3 * v**2 / a, a / (3 * v)
         elif kind == RANDOM:
-            path.curve[env] = draw_curve(rng, np.array(option.room))
+            path.curve[env] = draw_curve(rng, np.array(option.room), self._lowest - option.height)
             fastest, hardest = largest_rates(path.curve[env])
             path.rate[env] = min(v / fastest, sqrt(a / hardest))
         start_on_path(env, rng, self.view_for(start_on_path), self.equilibrium)

@@ -106,6 +106,7 @@ def test_a_target_is_within_bounds_if_each_drone_can_carry_itself_its_cable_and_
     thrust[1] *= spare
     rig = record(slots=slots, anchors=anchors, mass=mass, cable_weight=weight, cable_length=np.ones(2))
     bounds = record(half=(0.3, 0.2, 0.1), load=load, thrust=thrust + [1.0, 0.0], separation=np.full((2, 2), 0.3))
+    bounds.center = (0.0, 0.0, 0.0)
     bounds.cables, is_within = np.full((2, 2), 0.1), plain(targets._within)
     is_within.__globals__["goal_hook"] = lambda e, n, goal, rig: tuple(goal.slots[e, n])
     assert is_within(0, goal, rig, bounds) == within

@@ -150,15 +150,12 @@ def test_episode_shorter_than_a_step():
 
 
 def test_start_that_always_fails_names_the_failure_and_the_cure():
-    vec = ml.make_vec(
-        "hover",
-        num_envs=1,
-        num_threads=1,
-        **{"task_options.target_height": [0.01, 0.02], "task_options.start_radius": 0},
-    )
+    block = {"shape": "box", "size": [9, 9, 3], "position": [0, 0, 2]}
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1, **{"scene.obstacles": [block]})
     message = refusal(vec.reset)
     assert re.match(
-        r"no start of task hover is free of failure \(ground\).*; narrow the start ranges in task_options", message
+        r"no start of task hover is free of failure \(obstacle_collision\).*, narrow the start ranges in task_options",
+        message,
     )
 
 
