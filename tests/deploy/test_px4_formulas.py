@@ -181,7 +181,7 @@ class Rehearsal(Flight):
 
     def __init__(self, cause: int, failing: str):
         self.config, self.failing, self.phases, self.did = record(task="hover"), failing, [], []
-        self._task = self._landing = record(world=record(), failure_causes=("none", "ground"))
+        self._task = self._landing = record(world=record(obstacles=()), task=None, failure_causes=("none", "ground"))
         self.team = record(offboard=[], settle=lambda world: self.did.append("disarmed"))
         self.cause, self._say, self._begun = cause, lambda text: None, {}
         self._orders, self._watch = Orders(), lambda vec, stage: None
@@ -192,7 +192,7 @@ class Rehearsal(Flight):
         if name == self.failing:
             raise FlightError(f"{name} failed after 1.0 s: tilt")
 
-    _make = _arm = _take_over = _part = lambda self, *_: record(world=None)
+    _make = _arm = _take_over = _part = lambda self, *_: record(world=record(obstacles=()))
 
     def _run(self, vec, observation, what, stage):
         self.part(what)

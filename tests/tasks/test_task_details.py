@@ -142,6 +142,7 @@ def landed_team():
         drone_half=0.1,
         settle=(4.8, 1.6),
         ground=record(cable_weight=np.array([0.5, 0.4])),
+        origin=(0.0, 0.0),
     )
     state.cable_tension[0] = [0.5, 0.4]
     return record(
