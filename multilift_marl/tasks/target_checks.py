@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import ceil, pi, sin, sqrt
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,10 +14,6 @@ from multilift_marl.planning.path_file import find_overload
 from multilift_marl.planning.paths import RAMP, draw_curve, largest_rates
 from multilift_marl.rig.system import System
 from multilift_marl.schema.sections import RandomizationConfig
-
-if TYPE_CHECKING:
-    from multilift_marl.tasks.gate import GateOptions
-    from multilift_marl.tasks.track import TrackOptions
 
 _LEAP = 0.5  # [m] a target may as well leap by less
 _SHARES = np.linspace(0.0, 1.0, 101)  # of a motion's time, at which it is looked at
@@ -73,8 +69,8 @@ def _check_thrust(source: str, cure: str, times: np.ndarray, bend: np.ndarray, s
         raise ConfigError(f"{source} is too fast: {fault}; {cure}")
 
 
-def check_paths(option: TrackOptions, seconds: float, system: System) -> None:
-    """Refuse, by a ConfigError, forms of a path that go too low or too fast in an episode of `seconds`.
+def check_paths(option: Any, seconds: float, system: System) -> None:
+    """Refuse, by a ConfigError, forms of a path (TrackOptions) that go too low or too fast in `seconds`.
 
     Those of a file and of way-points are checked where they are read.
     """
@@ -105,11 +101,11 @@ def check_paths(option: TrackOptions, seconds: float, system: System) -> None:
             check_curve(limits, "lower them", speed, acceleration, system)
 
 
-def check_gaps(option: GateOptions, reach: float, apart: float, system: System) -> None:
+def check_gaps(option: Any, reach: float, apart: float, system: System) -> None:
     """Refuse, by a ConfigError, gaps that a payload does not fit through, and a target too fast or low.
 
     Args:
-        option: of the gates.
+        option: GateOptions.
         reach: the target moves from x = -reach to x = reach [m].
         apart: from the end of one gap to the begin of the next [m].
         system: the team.
