@@ -18,9 +18,7 @@ from math import acos, acosh, exp, sqrt
 
 STIFFNESS = 6e4  # [1/s²] over the effective mass; with DAMPING a penetration fades with a time constant of 80 ms
 DAMPING = 5e3  # [1/s] over the effective mass: stops an approach within a step, without bouncing or passing through
-FRICTION = (
-    0.3  # [-] damping of sliding, times the step: more throws up what slides, with less what tumbles gains energy
-)
+FRICTION = 0.3  # [-] damping of sliding, times the step: more throws up what slides, less feeds what tumbles
 STICKING = 10.0  # [-] by how much friction yields less than contact: what sticks does not creep
 _BOUNCE = 0.3  # [-] ω h of a contact that bounces: it lasts for ten steps
 
