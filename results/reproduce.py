@@ -44,6 +44,7 @@ from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.metrics import summarize
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import fitting_scripts, make_scripted
+from multilift_marl.tasks import find_task
 
 
 def train(recipe: str, seeds: list[int], workers: int, address: str = "") -> None:
@@ -88,7 +89,7 @@ def keep(recipe: str, run: Path) -> None:
         writer.writerows(row for row in rows if row["eval/success_rate"] != "")
     duration = {"frames": last["frames"], "minutes": round(last["seconds"] / 60, 1)}
     (folder / "training.json").write_text(json.dumps(duration) + "\n", encoding="utf-8")
-    plot_training(folder / "training.png", rows)
+    plot_training(folder / "training.png", rows, metric=find_task(load_config(recipe).task).ERROR)
     strip_checkpoint(run / "checkpoints" / "best.pt", folder / "policy.pt")
     kept = load_checkpoint(folder / "policy.pt")  # a run that was resumed may have got more frames since
     save_checkpoint(folder / "policy.pt", kept | {"config": last["config"]})

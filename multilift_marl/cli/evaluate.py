@@ -270,9 +270,10 @@ def _draw(config: Config, makers: dict[str, Any], team: _Team, options: Options,
     plots.plot_paths(out / "paths.png", traces[team.name], above, pdf)
     if options.policy is None:
         from multilift_marl.agents.logging import read_metrics
+        from multilift_marl.tasks import find_task
 
         if rows := read_metrics(team.folder):
-            plots.plot_training(out / "training.png", rows, pdf)
+            plots.plot_training(out / "training.png", rows, pdf, find_task(config.task).ERROR)
     print(f"wrote plots in {out}")
     if options.video:
         try:

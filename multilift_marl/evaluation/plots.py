@@ -129,7 +129,9 @@ def plot_plan(path: str | Path, table: np.ndarray, feasibility: Feasibility) -> 
     _save(figure, path)
 
 
-def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]], pdf: bool = False) -> None:
+def plot_training(
+    path: str | Path, rows: Iterable[Mapping[str, Any]], pdf: bool = False, metric: str = Task.ERROR
+) -> None:
     """Plot success rate [%], the error that policies are compared by [cm] and return over the steps of a training.
 
     Args:
@@ -138,13 +140,12 @@ def plot_training(path: str | Path, rows: Iterable[Mapping[str, Any]], pdf: bool
             episodes with exploration, dots the evaluations of the deterministic policy. Their returns have a panel
             each, as training may pay by other weights.
         pdf: whether there is a PDF beside it, too.
+        metric: the error that policies are compared by, see `Task.ERROR`; that of most tasks if no row has it.
     """
     rows = list(rows)
     figure = Figure(figsize=(6.4, 8.0), layout="constrained")
     success, error, total, paid = figure.subplots(4, 1, sharex=True)
-    # Only rows of `track` hold an RMSE; those of older runs were compared by the position error.
-    tracks = len(_column(rows, "eval/payload_rmse_m")[0]) > 0
-    metric = "payload_rmse_m" if tracks else Task.ERROR
+    metric = metric if len(_column(rows, f"eval/{metric}")[0]) else Task.ERROR
     panels = (
         (success, "success", "eval/success_rate", 100, "success [%]"),
         (error, None, f"eval/{metric}", 100, f"{name_error(metric)} [cm]"),

@@ -278,6 +278,9 @@ def test_every_line_of_the_training_plot_is_its_column(tmp_path, monkeypatch):
     assert [line.get_xydata().tolist() for line in total.lines] == [[[200, 9]]]
     assert [line.get_xydata().tolist() for line in paid.lines] == [[[100, 7]]]
     assert error.get_ylabel() == "position error [cm]"
-    plots.plot_training(tmp_path / "training.png", [row | {"eval/payload_rmse_m": 0.05} for row in rows[1:]])
-    error = drawn[1].axes[1]  # of `track`, whose policies are compared by the RMSE
+    rows = [row | {"eval/payload_rmse_m": 0.05} for row in rows[1:]]  # as those of every task
+    plots.plot_training(tmp_path / "training.png", rows)
+    assert drawn[1].axes[1].get_ylabel() == "position error [cm]"
+    plots.plot_training(tmp_path / "training.png", rows, metric="payload_rmse_m")
+    error = drawn[2].axes[1]  # of `track`, whose policies are compared by the RMSE
     assert [line.get_xydata().tolist() for line in error.lines] == [[[200, 5]]] and error.get_ylabel() == "RMSE [cm]"
