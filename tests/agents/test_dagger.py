@@ -94,6 +94,7 @@ def test_numbers_that_the_network_does_not_take_are_not_kept(monkeypatch):
 RIGS = ({"env.num_drones": 3}, {"env.num_drones": 4, "payload.mass": 1.2})
 
 
+@pytest.mark.slow
 def test_one_network_learns_of_teams_that_differ():
     """Each team flies better by what was learned of all than by what the training began with."""
     trainer = Trainer(config(**{"train.rigs": RIGS, "env.num_envs": 8, "train.frames": 8000}), Path("unused"))

@@ -133,6 +133,7 @@ def wandb(monkeypatch):
     return fake
 
 
+@pytest.mark.slow
 def test_a_run_of_wandb_gets_parameters_and_numbers_and_goes_on_where_it_is_resumed(tmp_path, wandb):
     folder = trained(tmp_path, "wandb")
     (run,) = wandb.runs

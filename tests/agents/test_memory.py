@@ -126,7 +126,8 @@ def test_a_reset_empties_the_memory_of_its_environments(tmp_path):
     np.testing.assert_allclose(one.act(observation[0]), first[0], atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["local", pytest.param("attention", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["local", "attention"])
+@pytest.mark.slow
 def test_the_exported_policy_remembers_as_the_policy_does(tmp_path, kind):
     policy = make_policy(tmp_path, **{"train.actor": kind})
     contract = export_policy(policy, tmp_path / "export")

@@ -73,6 +73,7 @@ def test_a_training_in_a_call_that_does_not_come_back_is_saved_and_ended(tmp_pat
     assert status == 143 and saved and errors == "" and output.startswith("stopping after this iteration")
 
 
+@pytest.mark.slow
 def test_a_rescue_that_fails_does_not_keep_it_alive(tmp_path):
     status, _, _, saved = interrupt_busy(tmp_path, "full", 0.3, [signal.SIGTERM])
     assert status == 143 and saved
@@ -166,6 +167,7 @@ def test_a_program_that_trains_gets_an_exception_from_a_second_signal():
         assert caught.type is KeyboardInterrupt and len(stopper._timers) == 1  # a nudge, nothing that ends the process
 
 
+@pytest.mark.slow
 def test_the_first_signal_to_a_resumed_training_loses_nothing(tmp_path, monkeypatch):
     settings = {"train.frames": 100 * 128, "eval.every": 1000, "train.checkpoint_every": 1000}
     trainer = make_trainer(tmp_path, **settings)
@@ -193,6 +195,7 @@ def signal_in_iteration(trainer, iteration, monkeypatch):
     monkeypatch.setattr(trainer, "step", stop)
 
 
+@pytest.mark.slow
 def test_an_iteration_given_up_on_a_full_disk_is_saved_elsewhere(tmp_path, monkeypatch):
     trainer = make_trainer(tmp_path, **{"train.frames": 100 * 128, "eval.every": 1000})
     spares, save = tmp_path / "spares", trainers.save_checkpoint

@@ -7,7 +7,7 @@ from math import cos, radians
 
 import numpy as np
 import pytest
-from conftest import GRAVITY, make, make_system, refusal
+from conftest import GRAVITY, make, make_system, refusal, slow
 
 from multilift_marl.config.load import load_config
 from multilift_marl.control.formation import Goal, place_formation
@@ -104,6 +104,8 @@ def test_an_action_moves_the_slot_outward_sideways_and_up_and_turns_it(commanded
 
 # Scripts
 
+COMPILED = "formation_redistributed", "hold_full_state", "hold_ctbr"  # for these tests alone
+
 
 def observed(vec, spread=1.0, **values) -> np.ndarray:
     """Return random observations (5, N, D) of this deviation with some numbers, by name, set."""
@@ -114,7 +116,7 @@ def observed(vec, spread=1.0, **values) -> np.ndarray:
     return observation
 
 
-@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("name", [slow(name) if name in COMPILED else name for name in LINEAR])
 def test_scripts_act_on_any_batch_within_the_limits(name):
     task = {"formation_narrow": "gate", "formation_redistributed": "loss"}.get(name, "track")
     vec = make(task, num_envs=1, **{"control.action": LINEAR[name].INTERFACE, "control.heading": "outward"})

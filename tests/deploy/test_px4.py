@@ -157,6 +157,7 @@ def test_motor_controls_beyond_full_thrust_are_full_thrust():
         np.testing.assert_allclose(world.thrust[0], full * np.array([[0.25, 1, 1, 0], [0, 0, 0, 0]]))
 
 
+@pytest.mark.slow
 def test_rubbish_between_answers_is_skipped():
     system = make_system(2)
     world = World(system, 1, 1)

@@ -11,7 +11,7 @@ import sys
 import time
 
 import pytest
-from conftest import make_system
+from conftest import make_system, slow
 
 import multilift_marl as ml
 from multilift_marl.errors import ConfigError, FlightError
@@ -108,7 +108,7 @@ def test_one_that_ends_at_once_is_named_at_once_with_its_last_words(tmp_path):
 
 
 @pytest.mark.parametrize("twice", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGTERM, *map(slow, [signal.SIGINT, signal.SIGHUP, signal.SIGKILL])])
 def test_a_command_that_is_ended_leaves_nothing_behind(number, twice, tmp_path):
     stub(tmp_path, f"echo $$ >> {tmp_path}/pids; exec sleep 1000")
     process = subprocess.Popen(

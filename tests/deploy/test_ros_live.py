@@ -121,6 +121,7 @@ def test_dds_carries_the_bytes_of_the_bags(distribution):
         assert bytes(store.serialize_cdr(message, kinds[name])) == bytes(store.serialize_cdr(sent[name], kinds[name]))
 
 
+@pytest.mark.slow
 def test_others_fly_the_team_by_set_points():
     vec = ml.make_vec(
         "hover", num_envs=1, num_threads=1, num_drones=2, **{"payload.mass": 0.7, "env.episode_seconds": 20}
@@ -287,6 +288,7 @@ def warnings_of(node: Node, caplog, seconds: float = 20.0) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_other_publishers_of_the_same_team_are_named_once(caplog):
     own, peer, listener = (Node(domain=DOMAIN + 40) for _ in range(3))
     setpoints = Topic("/drone_0/setpoint", "geometry_msgs/msg/PoseStamped")
@@ -301,6 +303,7 @@ def test_other_publishers_of_the_same_team_are_named_once(caplog):
         assert warnings_of(node, caplog, 0.2) == []
 
 
+@pytest.mark.slow
 def test_a_node_that_takes_the_place_of_another_is_no_second_one(caplog):
     listener, first = Node(domain=DOMAIN + 41), Node(domain=DOMAIN + 41)
     take = listener.subscription(ODOMETRY)

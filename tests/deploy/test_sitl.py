@@ -193,6 +193,7 @@ def test_cpu_time_counts_those_that_a_process_waited_for():
     assert 0.05 < process.cpu_seconds <= process.seconds + 0.1
 
 
+@pytest.mark.slow
 def test_the_flight_ends_before_the_nodes_and_what_is_deaf_is_killed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("multilift_marl.deploy.sitl.running._END_FLIGHT", ((signal.SIGINT, 0.3),))
     monkeypatch.setattr("multilift_marl.deploy.sitl.running._END_NODES", ((signal.SIGINT, 0.3), (signal.SIGINT, 1.0)))

@@ -141,6 +141,7 @@ def test_a_damaged_file_counts_as_missing(package, tmp_path, damage):
     assert bad[0].read_bytes() != bad[1]  # mended
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_written_kernels_are_compiled_each_time(package, tmp_path):
     (package / "__pycache__").write_text("a file in the folder's place: nobody can write there, root neither")
     value, warnings = run(NORM, tmp_path, HOME="/dev/null", XDG_CACHE_HOME="/dev/null/caches")
@@ -202,6 +203,7 @@ def test_kernels_go_where_numba_is_told(package, tmp_path):
     assert kernels(tmp_path / "told") and not kernels(package)
 
 
+@pytest.mark.slow
 def test_a_full_disk_costs_time_alone(package, tmp_path):
     value, warnings = run(NORM, tmp_path, limit=1000)
     assert value == pytest.approx(1) and not kernels(package)

@@ -231,6 +231,7 @@ def test_fields_that_are_used_by_closure_are_kept(registries):
     assert view.errors.distance is vec.task.errors.distance and view.cause is vec.task.cause and view.reference is None
 
 
+@pytest.mark.slow
 def test_kernels_of_a_factory_act_by_their_own_numbers(registries):
     ends = []
     for radius in (1e-6, 2.9):

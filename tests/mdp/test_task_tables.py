@@ -130,6 +130,7 @@ def test_a_reward_that_is_not_finite_is_refused_by_name(registries):
     assert "reward term broken is not finite in environment 2; mend what computes it" in said
 
 
+@pytest.mark.slow
 def test_the_stages_of_a_step_can_be_read_and_reading_changes_nothing():
     vec = make("pose", num_envs=2, **{"randomization.action_delay": 1, "randomization.observation_noise": "standard",
                                       "control.disturbance": "indi", "env.history": 2})  # fmt: skip

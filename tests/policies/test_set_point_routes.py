@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import slow
 
 import multilift_marl as ml
 from multilift_marl.errors import ConfigError
@@ -83,7 +84,9 @@ def test_without_nearest_points_nothing_is_pushed():
         make_scripted("formation_repelled", make([], **{"env.obstacle_sensing": "ranges", "train.observe": None}))
 
 
-@pytest.mark.parametrize(("sensing", "fits"), [("local", True), ("map", True), ("ranges", False), ("none", False)])
+@pytest.mark.parametrize(
+    ("sensing", "fits"), [("local", True), slow("map", True), slow("ranges", False), ("none", False)]
+)
 def test_it_is_offered_where_drones_observe_points(sensing, fits):
     vec = make([], **{"env.obstacle_sensing": sensing, "train.observe": None})
     assert ("formation_repelled" in fitting_scripts(vec)) == fits

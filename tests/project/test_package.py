@@ -67,6 +67,7 @@ def test_wheel_works_where_nothing_else_is(wheel, tmp_path):
     assert done.stdout.strip() == "(2, 4)", done.stderr
 
 
+@pytest.mark.slow
 def test_the_wheel_plans_paths(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
     code = (
@@ -110,6 +111,7 @@ def test_every_recipe_can_be_trained_where_nothing_but_the_wheel_is(wheel, tmp_p
         assert ":" not in base and (most > 0) == (base != "formation"), name
 
 
+@pytest.mark.slow
 def test_base_needs_neither_torch_nor_a_display(tmp_path):
     code = (
         "import sys\n"

@@ -28,7 +28,8 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(not RESULTS.is_dir(), reason="an sdist holds no results")
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.slow
 def test_processes_of_an_evaluation_that_is_killed_end_too(tmp_path, number):
     (tmp_path / "evaluate.py").write_text(EVALUATE)
     process = subprocess.Popen([sys.executable, "evaluate.py", str(RESULTS)], cwd=tmp_path)

@@ -173,6 +173,7 @@ def test_the_best_baseline_is_the_most_exact_of_those_that_succeed_as_often_with
     assert tables.best_baseline("gate") == "formation_gusts"
 
 
+@pytest.mark.slow
 def test_judging_can_be_stopped_and_started_again(tmp_path, monkeypatch):
     monkeypatch.setattr(reproduce, "HERE", tmp_path)
     monkeypatch.setattr(reproduce, "episodes_of", lambda team: 2)

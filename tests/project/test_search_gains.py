@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import refusal
+from conftest import refusal, slow
 
 import multilift_marl as ml
 from multilift_marl.agents.rigs import evaluated_rigs
@@ -92,7 +92,7 @@ def test_a_search_flies_some_of_the_rigs_in_turn():
 
 
 @pytest.mark.parametrize(
-    ("script", "drones"), [(searched.GateTeams, 3), (searched.GateTeams, 6), (searched.GateTeamsLarge, 8)]
+    ("script", "drones"), [slow(searched.GateTeams, 3), (searched.GateTeams, 6), slow(searched.GateTeamsLarge, 8)]
 )
 def test_rings_of_many_drones_become_ellipses_in_a_gate(script, drones):
     config = ml.load_config("gate", {"env.num_envs": 4, "env.num_drones": drones})

@@ -5,7 +5,7 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 import pytest
-from conftest import TASKS, make, zeros
+from conftest import COMMON, TASKS, make, slow, zeros
 
 from multilift_marl.planning.paths import own_time
 from multilift_marl.rendering import Stage
@@ -145,7 +145,7 @@ def test_the_path_of_a_track_is_dashed_through_its_targets():
     assert np.linalg.norm(lines[:, None] - target_path[None], axis=2).min(axis=1).max() < 0.1
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [task if task in COMMON else slow(task) for task in TASKS])
 def test_a_target_path_is_of_points_in_space(task):
     vec = make(task, num_envs=1)
     vec.reset(seed=0)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from conftest import slow
 
 from multilift_marl.envs import multilift_v0
 from multilift_marl.envs.gymnasium_env import MultiliftGymnasiumEnv
@@ -41,7 +42,7 @@ def without_display(**more):
     return {key: value for key, value in os.environ.items() if key not in hidden} | more
 
 
-@pytest.mark.parametrize("api", ["multilift_v0.parallel_env", "MultiliftGymnasiumEnv"])
+@pytest.mark.parametrize("api", ["multilift_v0.parallel_env", slow("MultiliftGymnasiumEnv")])
 def test_without_a_display_one_sentence_names_the_alternatives(api):
     code = (
         "from multilift_marl.envs import multilift_v0\n"

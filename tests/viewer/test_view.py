@@ -167,6 +167,7 @@ def test_what_cannot_be_watched_is_said_in_one_sentence(capsys, arguments, messa
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_without_viser_the_error_names_the_extra():
     code = (
         "import sys; sys.modules['viser'] = None\nfrom multilift_marl.viewer.__main__ import main; sys.exit(main([]))"
