@@ -135,6 +135,13 @@ FLIGHTS: dict[str, Flight] = {
         "navigate, unknown obstacles, own late senses",
         scripts=("formation", "formation_repelled"),
     ),
+    "navigate_senses_px4": Flight(
+        "navigate_senses_px4",
+        {},
+        "navigate_senses_px4",
+        "navigate, unknown obstacles, own late senses, loops of PX4",
+        scripts=("formation", "formation_repelled"),
+    ),
     "navigate_course": Flight(
         "navigate_course",
         {},

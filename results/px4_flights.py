@@ -38,6 +38,8 @@ ROWS: dict[str, list[str]] = {
     "hover_rtk_halved": ["config=hover", "policy=formation_integral", "position_errors=0.5"],
     "hover_conditions": ["config=hover_px4", "policy=formation_integral"],
     "navigate": ["config=navigate_px4", "policy=formation_route"],
+    "navigate_learned": ["policy=navigate_senses_px4"],
+    "navigate_repelled": ["config=navigate_senses_px4", "policy=formation_repelled"],
 }
 EIGHT = ("task_options.speed=2", "task_options.acceleration=2")
 LONGER = [f"{part}.env.episode_seconds=20" for part in ("flight", "nodes.planner")]  # integrals begin with the task

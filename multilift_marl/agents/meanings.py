@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from operator import attrgetter
 
 from multilift_marl.config.config import Config
@@ -26,4 +27,4 @@ def changed_meanings(there: Config, here: Config) -> list[str]:
 def spell(key: str, config: Config) -> str:
     """Return key=value of a configuration as a command takes it."""
     value = attrgetter(key)(config)
-    return f"{key}={list(value) if isinstance(value, tuple) else value}"
+    return f"{key}={value if isinstance(value, str) else json.dumps(value)}"

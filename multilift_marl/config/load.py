@@ -13,7 +13,7 @@ from multilift_marl.config.aliases import stored_names
 from multilift_marl.config.config import Config
 from multilift_marl.config.precedence import give_way
 from multilift_marl.errors import ConfigError, UnknownKeywordError, called_elsewhere, nearest, reason, shorten
-from multilift_marl.plugins import identify, import_modules, load_entry_points, named, refused
+from multilift_marl.plugins import describe_unregistered, identify, import_modules, load_entry_points, named, refused
 from multilift_marl.schema.files import as_mapping, change_files, is_yaml
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Section
@@ -317,7 +317,8 @@ def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
     if name not in CONFIGS:
         load_entry_points()
     if name not in CONFIGS:
-        hint = nearest(name, [*list_configs(), *CONFIGS], otherwise="; one's own needs import=<module>, or is a file")
+        otherwise = "; one's own needs import=<module>, or is a file"
+        hint = describe_unregistered(name) or nearest(name, [*list_configs(), *CONFIGS], otherwise=otherwise)
         raise ConfigError(f"no configuration named '{shorten(name)}'{hint}")
     source = CONFIGS[name]
     return (

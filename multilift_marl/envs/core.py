@@ -110,7 +110,7 @@ class MultiliftVec:
         self._checked = False  # whether all components were seen to be written
         self._bind()
         self.commander: Commander | None = find_commander(config.control.action)(self) if planned else None
-        self._first_sense = self._sensing.bind_sense(self.task.view, first=True) if self._sensing.measures else None
+        self._first_sense = self._sensing.bind_first(self.task.view)
         delays = self._sensing.delays_observation
         self._first_delay = self._sensing.bind_delay(observation) if delays else None
 
@@ -344,8 +344,7 @@ class MultiliftVec:
 
     def _observe(self, e: int) -> None:
         """Write the first observation and global state of an episode."""
-        if self._first_sense is not None:
-            self._first_sense(e, e + 1)
+        self._first_sense(e, e + 1)
         # The global state first: its kernel computes the task's `preview`, which observations read, too.
         self.task.stages["observe state"](e, e + 1)
         self.task.stages["observe"](e, e + 1)

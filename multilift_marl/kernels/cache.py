@@ -213,7 +213,7 @@ def _collect(function: Callable[..., Any], seen: set[Any], files: set[str], cont
         return
     seen.add(function)
     files.add(file)
-    contents.add(_code_text(function.__code__))
+    contents.add(f"{function.__module__} {_code_text(function.__code__)}")
     for name, value in used_values(function):
         if isinstance(value, Dispatcher):
             _collect(value.py_func, seen, files, contents)

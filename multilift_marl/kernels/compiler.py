@@ -16,6 +16,7 @@ import pickle
 import sys
 from collections.abc import Callable, Iterable
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from multilift_marl.errors import warn_once
 from multilift_marl.kernels.cache import cache_folder, foreign_digest, forget_composed, homes, other_folders
 from multilift_marl.kernels.progress import progress
 
+_LIBRARIES = "numba", "llvmlite", "numpy", "multilift_marl"
 _SETTINGS = ("BOUNDSCHECK", "OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "DEBUGINFO_DEFAULT")  # of Numba, by NUMBA_<name>
 
 _compiling = 0  # kernels whose compilation has begun, one for the sake of another; under Numba's lock
@@ -261,7 +263,7 @@ class KernelCache(NumbaCache):
             checksum, content = _split(path.read_bytes())
             if hashlib.sha256(content).digest() != checksum:
                 return None
-            stored, data = pickle.loads(content)
+            stored, data = _Unpickler(BytesIO(content)).load()
             rebuild = rebuild_inner if is_inner() else self._impl.rebuild
             return rebuild(target_context, data) if stored == key else None
         except Exception:  # missing or unreadable: compile again
@@ -290,6 +292,16 @@ class KernelCache(NumbaCache):
         """Forget nothing: a file belongs to one version of the sources."""
 
 
+class _Unpickler(pickle.Unpickler):
+    """Reads what was compiled, and imports nothing of a user's for it: a module of that name may be another's."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return what is stored by name; of modules that are neither imported nor libraries, raise an error."""
+        if module not in sys.modules and module.partition(".")[0] not in _LIBRARIES:
+            raise pickle.UnpicklingError(f"{module} is not imported")
+        return super().find_class(module, name)
+
+
 def make_cache(function: Callable[..., Any]) -> KernelCache:
     """Return where a kernel's compiled versions are kept and looked for."""
     return KernelCache(function, cache_folder(function.__module__), other_folders(function.__module__))
@@ -303,9 +315,10 @@ def _compiler_name() -> str:
 
 
 def _fields(types: Iterable[Any]) -> list[Any]:
-    """Return the names of the fields of named tuples among Numba's types, which neither their names nor keys state."""
+    """Return modules and fields of named tuples among Numba's types, which neither their names nor keys state."""
     records: list[Any] = [each for each in types if isinstance(each, BaseNamedTuple)]
-    return [(record.fields, _fields(record.types)) for record in records]
+    kinds = [(record.instance_class, record) for record in records]
+    return [(kind.__module__, kind.__qualname__, each.fields, _fields(each.types)) for kind, each in kinds]
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:

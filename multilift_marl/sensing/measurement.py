@@ -148,8 +148,19 @@ class Sensing:
             own, load = np.random.SeedSequence(int(self.memory.generator[env])).spawn(2)
             self._estimator.start(env, own)
             self._load_sensing.start(env, load)
-        if self.obstacles is not None:
-            self.obstacles.sense(env, env + 1)
+
+    def bind_first(self, view: View) -> Call:
+        """Return the call of (lo, hi) that measures for the first time in an episode, after `start_sensors`."""
+        measure = self.bind_sense(view, first=True) if self.measures else None
+
+        def call(lo: int, hi: int) -> None:
+            if measure is not None:
+                measure(lo, hi)
+            # By where the drones now know themselves to be.
+            if self.obstacles is not None:
+                self.obstacles.begin(lo, hi)
+
+        return call
 
     def bind_sense(self, view: View, first: bool = False) -> Call:
         """Return the call of (lo, hi) that measures what drones know; `first` of an episode, not to be integrated."""

@@ -115,9 +115,13 @@ class ObstacleSensing:
         )
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:
-        """Begin an episode of one environment: its next measurement is the first, and is observed until another is."""
+        """Begin an episode of one environment."""
         self.readings.generator[env] = seed.generate_state(1, np.uint64)[0]
-        self.readings.steps[env] = 0
+
+    def begin(self, lo: int, hi: int) -> None:
+        """Measure in environments lo to hi for the first time in an episode; that is observed until another is."""
+        self.readings.steps[lo:hi] = 0
+        self.sense(lo, hi)
 
 
 def _needed(obstacles: Obstacles) -> Obstacles:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from multilift_marl.config.load import register_config
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.plugins import load_entry_points, registers
+from multilift_marl.plugins import describe_unregistered, load_entry_points, registers
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.gate import Gate
 from multilift_marl.tasks.hover import Hover
@@ -86,6 +86,6 @@ def find_task(name: str) -> type[Task]:
     if name in failures:
         raise ConfigError(failures[name])
     if name not in TASKS:
-        cure = "; one's own needs import=<module>"
-        raise ConfigError(f"unknown task '{name}'{nearest(name, TASKS, otherwise=cure)}")
+        cure = describe_unregistered(name) or nearest(name, TASKS, otherwise="; one's own needs import=<module>")
+        raise ConfigError(f"unknown task '{name}'{cure}")
     return TASKS[name]

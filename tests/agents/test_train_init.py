@@ -121,6 +121,10 @@ def test_a_file_is_found_beside_the_yaml_that_names_it(tmp_path, origin, monkeyp
             "train.residual=formation_feedback there and train.residual=formation_integral here; set",
         ),
         ({"train.overrides": {"control.max_yaw": 0.2}}, "in units of control.max_yaw=0.5 there"),
+        (
+            {"train.observe": ["slot_error", "payload_error"]},
+            'train.observe=null there and train.observe=["slot_error", "payload_error"] here; set train.observe=null',
+        ),
     ],
 )
 def test_what_does_not_agree_is_refused_by_its_first_difference(tmp_path, change, said):

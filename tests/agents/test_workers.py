@@ -69,17 +69,21 @@ def test_one_worker_learns_what_one_process_does(tmp_path, local_ray):
     assert_equal(alone, one)
 
 
-@pytest.mark.slow
-def test_workers_replay_bit_for_bit_also_where_one_dies(tmp_path, local_ray):
-    whole, wounded = (learn(make_trainer(tmp_path, **{"train.workers": 2}), kill=kill) for kill in (False, True))
-    assert_equal(whole, wounded)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, local_ray):
+    """What a training of two workers learns to which nothing happens."""
+    return learn(make_trainer(tmp_path_factory.mktemp("whole"), **{"train.workers": 2}))
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_stopped_is_replaced_bit_for_bit(tmp_path, local_ray, monkeypatch):
+def test_workers_replay_bit_for_bit_also_where_one_dies(tmp_path, whole):
+    assert_equal(whole, learn(make_trainer(tmp_path, **{"train.workers": 2}), kill=True))
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_stopped_is_replaced_bit_for_bit(tmp_path, whole, monkeypatch):
     import ray
 
-    whole = learn(make_trainer(tmp_path, **{"train.workers": 2}))
     monkeypatch.setattr(_ray, "SILENCE", 3.0)
     wounded = make_trainer(tmp_path, **{"train.workers": 2})
     wounded.step()

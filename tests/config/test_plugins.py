@@ -379,3 +379,13 @@ def test_exported_policies_need_no_torch(exported):
     code += f"print(m.ExportedPolicy(Path({str(exported)!r})).action_names[0])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "outward\n", done.stderr
+
+
+@pytest.mark.parametrize("key", ["config", "task"])
+def test_a_task_that_is_not_registered_is_named_where_it_is_asked_for(tmp_path, monkeypatch, capsys, registries, key):
+    (tmp_path / "forgot.py").write_text(
+        "from multilift_marl.tasks.hover import Hover\n\n\nclass Pole(Hover):\n    name = 'pole'\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert evaluate(["import=forgot.py", f"{key}=pole", "policy=formation"]) == 2
+    assert "; class Pole of forgot.py is not registered: put @ml.register_task above it" in capsys.readouterr().err

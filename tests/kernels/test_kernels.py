@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
 import subprocess
 import sys
+from io import BytesIO
 from pathlib import Path
 
 import pytest
 from conftest import make, zeros
+from numba.core import types
 
 import multilift_marl as ml
 from multilift_marl.kernels import cache as _kernel_cache
+from multilift_marl.kernels.compiler import _Unpickler
 
 WEIGHTS = """
 from multilift_marl.physical import GRAVITY
@@ -50,6 +54,24 @@ DEEP = 100.0
 @kernel
 def shifted(x):
     return x + 1000.0
+"""
+
+SHARED = """
+from multilift_marl.kernels.jit import kernel
+
+@kernel
+def first(values):
+    return values.size + 0.5
+"""
+VERSION = """
+from typing import NamedTuple
+from shared import first
+
+class Numbers(NamedTuple):
+    size: float
+
+def value():
+    return first(Numbers({size}))
 """
 
 
@@ -272,3 +294,27 @@ def test_it_flies_without_the_compiler(package, tmp_path):
     vec.reset(seed=3)
     compiled = vec.step(zeros(vec))[1].sum()
     assert run(code, tmp_path, NUMBA_DISABLE_JIT="1")[0] == pytest.approx(compiled, rel=1e-6)
+
+
+def test_kernels_of_another_module_with_tuples_of_the_same_name_are_not_read_nor_is_it_imported(tmp_path):
+    """Two versions of a user's file: reading the kernels of the one would import it, and register its task anew."""
+    (tmp_path / "shared.py").write_text(SHARED)
+    (tmp_path / "old.py").write_text(VERSION.format(size="1.0"))
+    (tmp_path / "new.py").write_text(VERSION.format(size="2.0"))
+    keep = {
+        "NUMBA_CACHE_DIR": str(tmp_path / "kept"),
+        "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(ml.__file__).parents[1]}",
+    }
+    code = "import sys, {0}; value = {0}.value(); assert {1!r} not in sys.modules; print(value)"
+    assert run(code.format("old", "new"), tmp_path, **keep) == (1.5, COMPILING)
+    assert run(code.format("new", "old"), tmp_path, **keep) == (2.5, COMPILING)
+
+
+def test_reading_kernels_imports_nothing_of_ones_own(tmp_path, monkeypatch):
+    (tmp_path / "strange.py").write_text("class Numbers: pass")
+    monkeypatch.syspath_prepend(tmp_path)
+    stored = b"cstrange\nNumbers\n."  # a reference to the class
+    with pytest.raises(pickle.UnpicklingError, match="strange is not imported"):
+        _Unpickler(BytesIO(stored)).load()
+    assert "strange" not in sys.modules
+    assert _Unpickler(BytesIO(b"cnumba.core.types\nArray\n.")).load() is types.Array

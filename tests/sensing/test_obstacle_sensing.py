@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import make
 
+from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError
 
 SPHERES = [(2.0, 0.5, 1.6), (-1.8, 1.0, 2.2), (0.5, -3.0, 1.0), (4.5, 1.0, 2.0), (-2.5, -2.5, 2.5)]
@@ -139,6 +140,37 @@ def test_what_is_seen_late_is_observed_where_it_is_if_it_is_small():
         assert one == pytest.approx(other, abs=3e-3)
         moved.append(other)
     assert np.abs(moved[10] - moved[0]).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "more", [{}, {"randomization.observation_noise": 0.01, "randomization.observation_bias": 0.01}]
+)
+def test_first_points_are_those_about_the_start_whatever_was_flown_before(more):
+    """Drones place them by where they know themselves to be: at the start that has to be the start."""
+    vec = among("local", delay=2, points=5, range=20.0, **more)
+    place, flown = columns(vec, "obstacle_points"), []
+    for _ in range(2):
+        flown.append([])
+        for observation in fly(vec, 6):
+            flown[-1].append(observation)
+            # Their order is that of the measurement.
+            seen, there = (
+                np.sort(each.reshape(2, 3, 5, 3), axis=2)
+                for each in (observation[:, :, place], nearest_by_hand(vec, 5))
+            )
+            assert seen == pytest.approx(there, abs=0.3)
+    np.testing.assert_array_equal(*flown)
+
+
+def test_a_measured_team_first_observes_obstacles_from_where_it_is():
+    team = MeasuredTeam(among("local", num_envs=1, delay=2, points=3, range=20.0).config)
+    team.reset(seed=1)
+    state = team.world.state
+    measured = {name: getattr(state, name)[0].copy() for name in state._fields if name.startswith(("payload", "drone"))}
+    for name in ("payload_position", "drone_position"):
+        measured[name] += [0.0, 1.0, 0.0]
+    for observation in (team.begin(measured, seed=1), team.observe(measured)):
+        assert observation[:, :, columns(team, "obstacle_points")] == pytest.approx(nearest_by_hand(team, 3), abs=1e-6)
 
 
 @pytest.mark.parametrize("mode, name", [("local", "obstacle_points"), ("ranges", "obstacle_ranges")])
