@@ -41,7 +41,9 @@ class Options(CommandOptions):
     waypoints: Annotated[Places, AfterValidator(pin_text)] = Field(
         None, description="list of [x, y, z] or [x, y, z, yaw], or a CSV file of such columns"
     )
-    times: tuple[Float, ...] | None = Field(None, description="[s] at which they are passed; None: the least allowed")
+    times: tuple[Float, ...] | None = Field(
+        None, description="[s] at which they are passed, from the first; None: the least"
+    )
     speed: Annotated[Float, Between(1e-3, 100, "m/s")] = Field(1.0, description="[m/s] largest, without times")
     acceleration: Annotated[Float, Between(1e-3, 1000, "m/s²")] = Field(
         0.5, description="[m/s²] largest, without times"

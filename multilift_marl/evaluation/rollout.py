@@ -10,10 +10,12 @@ import numpy as np
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
+from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.evaluation.outline import obstacle_corners, payload_surface
 from multilift_marl.evaluation.shortfalls import ShortfallMeter
 from multilift_marl.mdp.failures import MAX_DISTANCE
 from multilift_marl.policies.policy import Policy
+from multilift_marl.sim.parameters import Parameters
 
 SETTLED = 0.05  # [m] settling time counts until the payload stays within this
 PRECISE = (0.01, 1.0)  # [m], [deg] mean errors of an episode that counts as precise
@@ -61,8 +63,8 @@ def run_episodes(
         purpose: of the seeds.
         progress: called with the number of episodes finished.
         first: number of the first episode.
-        factors: hidden parameters by name that are the same in all episodes, as factors of the nominal values: one
-            for all drones or (N,).
+        factors: hidden parameters that are the same in all episodes, by their names in `Parameters` (all but the centre
+            of mass), as factors of the nominal values: one for all drones or (N,).
         record: called with the number of each batch's first episode, counted from `first`; what it returns is called
             with the environments at the start and after every step.
 
@@ -72,7 +74,7 @@ def run_episodes(
         `shortfalls.is_shortfall` are for `shortfalls.explain`.
 
     Raises:
-        ConfigError: see `MultiliftVec`.
+        ConfigError: see `MultiliftVec`; or there is no factor of a name.
         ValueError: the policy's actions do not fit the environment.
     """
     parts = []
@@ -93,12 +95,13 @@ def run_episodes(
 
 def _fix_parameters(vec: MultiliftVec, factors: Mapping[str, Any]) -> dict[str, Any]:
     """Return options of a reset that fix hidden parameters."""
-    nominal, fixed = vec.world.parameters, {}
+    fixed, known = {}, [name for name in Parameters._fields if name != "payload_center_of_mass"]
     for name, factor in factors.items():
-        whole = getattr(nominal, name)
-        relative = name.startswith("vehicle_")  # these are factors themselves
-        # `whole[:1]`: before a reset the parameters of all environments are the nominal ones.
-        fixed[name] = np.broadcast_to(np.asarray(factor) * (1.0 if relative else whole[:1]), whole.shape)
+        if name not in known:
+            raise ConfigError(f"factors has no '{name}'{nearest(name, known)}")
+        # Before a reset the parameters of all environments are the nominal ones; those that are factors are 1.
+        whole = getattr(vec.world.parameters, name)
+        fixed[name] = np.broadcast_to(np.asarray(factor) * whole[:1], whole.shape)
     return {"randomization": fixed}
 
 

@@ -30,25 +30,28 @@ def fit_minimum_snap(times: np.ndarray, values: np.ndarray) -> BSpline:
     return _scipy("interpolate").make_interp_spline(times, values, _DEGREE, bc_type=(rest, rest))
 
 
-def allocate_times(values: np.ndarray, speed: float, acceleration: float) -> np.ndarray:
-    """Return times (K,) [s] at which minimum-snap polynomials pass values (K, D) just within these limits.
+def allocate_times(poses: np.ndarray, slots: np.ndarray, speed: float, acceleration: float) -> np.ndarray:
+    """Return times (K,) [s] at which minimum-snap polynomials pass poses (K, 4) just within these limits.
 
-    The shares of the pieces in the time are those of the least J (Mellinger and Kumar, section V-B). Twice the time
-    is half the speed and a quarter of the acceleration, which gives the time of all.
+    The shares of the pieces in the time are those of the least J (Mellinger and Kumar, section V-B), to which yaw
+    counts as the way of the outermost slot. Twice the time is half the speed and a quarter of the acceleration, which
+    gives the time of all.
 
     Args:
-        values: the first three of each are a place [m]; the others are limited each on its own, as lengths are.
-        speed, acceleration: largest ones [m/s], [m/s²].
+        poses: places [m] and yaw [rad].
+        slots: (N, 2) from the payload, which turn with it [m].
+        speed, acceleration: largest ones of the payload and of every slot [m/s], [m/s²].
     """
+    values = poses * [1, 1, 1, max(float(np.linalg.norm(slots, axis=1).max()), 1e-3)]
     gaps = np.diff(values, axis=0)
     shares = np.linalg.norm(gaps, axis=1) ** 0.5
     if len(shares) > 1:
         found = _scipy("optimize").minimize(_relative_cost, np.log(shares), (values,), "L-BFGS-B", jac=True)
         shares = np.exp(found.x)
     times = np.append(0.0, np.cumsum(shares)) / shares.sum()
-    spline = fit_minimum_snap(times, values)
+    spline = fit_minimum_snap(times, poses)
     t = np.unique(times[:-1, None] + np.diff(times)[:, None] * np.linspace(0, 1, _SAMPLES + 1))
-    fastest, hardest = (_largest(spline(t, derivative)) for derivative in (1, 2))
+    fastest, hardest = _fastest(spline(t), spline(t, 1), spline(t, 2), slots)
     return times * max(fastest / speed, np.sqrt(hardest / acceleration))
 
 
@@ -76,7 +79,13 @@ def _relative_cost(logs: np.ndarray, values: np.ndarray) -> tuple[float, np.ndar
     return np.log(cost) + 7 * np.log(steps.sum()), steps * (7 / steps.sum() - energy / cost)
 
 
-def _largest(derivatives: np.ndarray) -> float:
-    """Return the largest length of the first three of numbers (T, D), and of each other one."""
-    lengths = np.linalg.norm(derivatives[:, :3], axis=1).max()
-    return float(max(lengths, np.abs(derivatives[:, 3:]).max(initial=0.0)))
+def _fastest(pose: np.ndarray, first: np.ndarray, second: np.ndarray, slots: np.ndarray) -> tuple[float, float]:
+    """Return largest speed and acceleration of the payload and its slots, by poses (T, 4) and their derivatives."""
+    c, s = np.cos(pose[:, 3:]), np.sin(pose[:, 3:])
+    points = np.vstack([np.zeros(2), slots])  # the payload itself first
+    x, y = c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]
+    rate, change = first[:, 3:], second[:, 3:]
+    speed = np.sqrt((first[:, :1] - rate * y) ** 2 + (first[:, 1:2] + rate * x) ** 2 + first[:, 2:3] ** 2)
+    ahead = second[:, :1] - change * y - rate**2 * x
+    aside = second[:, 1:2] + change * x - rate**2 * y
+    return float(speed.max()), float(np.sqrt(ahead**2 + aside**2 + second[:, 2:3] ** 2).max())

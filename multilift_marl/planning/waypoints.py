@@ -80,9 +80,9 @@ def plan_waypoints(
     Args:
         waypoints: places x, y, z [m], each perhaps with a yaw [rad], which is turned to the short way; or the reference
             to a CSV file of columns x, y, z and, if it has them, yaw and t, see `pin_file`.
-        times: at which they are passed [s]; None: those of the file, else as short as speed and acceleration allow.
-        speed, acceleration: largest ones of the payload, and of its slots where it turns, a range of one value [m/s],
-            [m/s²].
+        times: at which they are passed [s], counted from the first; None: those of the file, else as short as speed and
+            acceleration allow.
+        speed, acceleration: largest ones of the payload and of its slots, a range of one value [m/s], [m/s²].
         system: of the team.
         keys: of way-points and times.
 
@@ -98,9 +98,7 @@ def plan_waypoints(
     timed = given is not None
     if given is None:
         _check_limits(name, speed, acceleration)
-        # The yaw counts as the way of the outermost slot.
-        radius = float(np.linalg.norm(system.slots[:, :2], axis=1).max())
-        given = allocate_times(values * [1, 1, 1, max(radius, 1e-3)], speed[0], acceleration[0])
+        given = allocate_times(values, system.slots[:, :2], speed[0], acceleration[0])
     passed = given - given[0]
     spline = fit_minimum_snap(passed, values)
     missed = np.abs(spline(passed) - values).max()

@@ -223,8 +223,13 @@ class Regroup(Task):
             absent = int(own.who[env, k]) if absent is None else None
 
     def begin(self, env: int) -> bool:
-        """See `Task.begin`; of a state that is given, too, broken cables are those that are not attached."""
-        self.own.attached[env] = ~self.world.state.cable_broken[env]
+        """See `Task.begin`; who is absent is drawn, and with it who joins: a given state cannot say otherwise."""
+        if (self.world.state.cable_broken[env] == self.own.attached[env]).any():
+            raise ValueError(
+                f"the given state of environment {env} has cable_broken={self.world.state.cable_broken[env].tolist()}, "
+                f"but its draw has {(~self.own.attached[env]).tolist()}; leave it out: who is absent is drawn, with "
+                "the probability task_options.absent"
+            )
         return super().begin(env)
 
     def _detach(self, env: int, n: int) -> None:

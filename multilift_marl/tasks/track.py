@@ -76,7 +76,7 @@ class TrackOptions(Section):
         "x, y, z and perhaps yaw and t [s]",
     )
     waypoint_times: tuple[Float, ...] | None = Field(
-        None, description="[s] at which they are passed; None: those of the file, or as speed and acceleration allow"
+        None, description="[s] at which they are passed, from the first; None: the file's, or by speed and acceleration"
     )
     speed: Span = Field(
         (1.0, 1.0), description="[m/s] peak speed v of figure8, lemniscate, random and waypoints, or its range"

@@ -8,18 +8,20 @@ import shlex
 import numpy as np
 import pytest
 import yaml
+from conftest import refusal
 
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.cli import benchmark as command
 from multilift_marl.cli.benchmark import main as benchmark
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.config import load as loading
-from multilift_marl.config.load import config_dir, load_config
+from multilift_marl.config.load import build_config, config_dir, load_config
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.evaluation import plots, suites
 from multilift_marl.evaluation.rollout import measure_episodes, run_episodes
 from multilift_marl.evaluation.suites import SUITES, list_shifts, load_suite
 from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.sim.parameters import Parameters
 
 DIGESTS = {
     "standard": "05a96dd8ea1a7f0b9b46e5e2b2534a4b2ba9b90f4c48db2b853ad90f47d47beb",
@@ -105,6 +107,34 @@ def test_factors_fix_hidden_parameters_at_shares_of_the_nominal():
     for name, values in expected.items():
         np.testing.assert_array_equal(heavier[name], values, err_msg=name)
     assert not np.isin(heavier["return"], usual["return"]).any()
+
+
+@pytest.mark.parametrize("name", [name for name in Parameters._fields if name != "payload_center_of_mass"])
+def test_a_factor_is_of_the_nominal_value_whatever_its_unit(name):
+    config, seen = load_config("hover", {"env.num_threads": 1, "env.episode_seconds": 0.02}), []
+
+    def script(vec):
+        seen.append(np.array(getattr(vec.world.parameters, name)))
+        return make_scripted("formation", vec)
+
+    config = build_config(config.model_dump(), {f"randomization.{name}": 0.3, "payload.mass": 0.5})
+    nominal = getattr(MultiliftVec(config, EVALUATION).world.parameters, name)[:1]
+    run_episodes(config, script, 1, seed=3, factors={name: 1.25})
+    np.testing.assert_allclose(seen[0], 1.25 * nominal, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("wind", "factors has no 'wind'; known: "),
+        ("payload_center_of_mass", "factors has no 'payload_center_of_mass'"),
+        ("vehicle_masss", "factors has no 'vehicle_masss'; did you mean 'vehicle_mass'?"),
+    ],
+)  # fmt: skip
+def test_what_is_no_factor_is_refused(name, said):
+    config = load_config("hover", {"env.num_threads": 1, "env.episode_seconds": 0.02})
+    message = refusal(run_episodes, config, lambda vec: make_scripted("formation", vec), 1, 3, factors={name: 1.0})
+    assert message.startswith(said)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import GRAVITY, make, refusal, zeros
+from conftest import GRAVITY, make, refusal, same, zeros
 
 from multilift_marl.policies.baselines import make_scripted
 
@@ -161,12 +161,19 @@ def test_starts_that_are_drawn_again_leave_no_cable_broken():
     assert (vec.world.state.cable_broken.sum(axis=1) <= 1).all()
 
 
-def test_a_given_state_says_whose_cables_are_attached():
-    vec = regroup(num_envs=1, **{"task_options.absent": 0.0})
-    broken = np.array([[False, True, False, False, False, False]])
-    vec.reset(seed=0, options={"state": {"cable_broken": broken}})
-    vec.step(zeros(vec))
-    assert (vec.task.own.attached == ~broken).all() and vec.world.state.cable_tension[0, 1] == 0
+@pytest.mark.parametrize("absent", [0.0, 1.0])
+def test_a_given_state_does_not_say_who_is_absent(absent):
+    """Events follow the draw: a drone that is absent by the state alone would never join."""
+    vec = regroup(num_envs=1, **{"task_options.absent": absent})
+    vec.reset(seed=0)
+    drawn = vec.world.state.cable_broken.copy()
+    assert drawn.sum() == absent
+    vec.reset(seed=0, options={"state": {"cable_broken": drawn}})
+    before = vec.state_dict()
+    vec.reset(seed=0)
+    assert same(vec.state_dict(), before)
+    with pytest.raises(ValueError, match="leave it out: who is absent is drawn, with the probability"):
+        vec.reset(seed=0, options={"state": {"cable_broken": np.roll(drawn, 1) | ~drawn.any()}})
 
 
 def test_who_joins_knows_its_anchor_while_its_slot_rises():
