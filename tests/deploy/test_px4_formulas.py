@@ -111,10 +111,16 @@ def test_a_way_is_a_straight_line_on_which_the_team_turns_the_shorter_way_round(
     assert first == begin.pose and last[:3] == end.pose[:3] and start == 0.0
     assert last[3] - first[3] == pytest.approx((turn + np.pi) % (2 * np.pi) - np.pi)
     assert seconds == arrival + 2.0
-    # as fast as the limits of payload and outermost slot allow: from rest to rest the peaks are 35/16 and 7.51
-    length = np.sqrt(6.0)
-    outer = abs(last[3] - first[3]) * np.linalg.norm(config.system.slots[:, :2], axis=1).max()
-    peaks = [max(length, outer) * 35 / 16 / arrival / 1.0, max(length, outer) * 7.51 / arrival**2 / 0.7]
+    # as fast as the limits of payload and slots allow: from rest to rest least snap is this share of the way
+    t = np.linspace(0, 1, 20_001)
+    share = (35 * t**4 - 84 * t**5 + 70 * t**6 - 20 * t**7)[:, None]
+    pose = first + share * np.subtract(last, first)
+    c, s = np.cos(pose[:, 3:]), np.sin(pose[:, 3:])
+    x, y = np.vstack([np.zeros(3), config.system.slots])[:, :2].T
+    way, peaks = np.stack([pose[:, :1] + c * x - s * y, pose[:, 1:2] + s * x + c * y, pose[:, 2:3] + 0 * c * x], -1), []
+    for limit in (1.0, 0.7):
+        way = np.gradient(way, t * arrival, axis=0)
+        peaks.append(np.linalg.norm(way[2:-2], axis=2).max() / limit)
     assert max(peaks) == pytest.approx(1.0, abs=0.01)
     assert plan_way(config, begin, begin) is None
 
