@@ -8,7 +8,7 @@ import shlex
 import numpy as np
 import pytest
 import yaml
-from conftest import refusal
+from conftest import ALL, refusal
 
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.cli import benchmark as command
@@ -117,7 +117,7 @@ def test_a_factor_is_of_the_nominal_value_whatever_its_unit(name):
         seen.append(np.array(getattr(vec.world.parameters, name)))
         return make_scripted("formation", vec)
 
-    config = build_config(config.model_dump(), {f"randomization.{name}": 0.3, "payload.mass": 0.5})
+    config = build_config(config.model_dump(), ALL | {f"randomization.{name}": 0.3, "payload.mass": 0.5})
     nominal = getattr(MultiliftVec(config, EVALUATION).world.parameters, name)[:1]
     run_episodes(config, script, 1, seed=3, factors={name: 1.25})
     np.testing.assert_allclose(seen[0], 1.25 * nominal, rtol=1e-12)
