@@ -128,10 +128,11 @@ def describe_error(error: BaseException) -> str:
 
 
 def describe_unregistered(name: str) -> str:
-    """Return what to do about an imported class of this name that is not registered; "" if there is none."""
+    """Return what to do about an imported task of this name that is not registered; "" if there is none."""
     for module in _imported.values():
         for each in vars(module).values():
-            if isinstance(each, type) and each.__module__ == module.__name__ and vars(each).get("name") == name:
+            own = isinstance(each, type) and each.__module__ == module.__name__ and hasattr(each, "REWARD")
+            if own and vars(each).get("name") == name:
                 file = Path(getattr(module, "__file__", None) or module.__name__).name
                 return f"; class {each.__name__} of {file} is not registered: put @ml.register_task above it"
     return ""

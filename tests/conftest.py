@@ -249,6 +249,20 @@ def zeros(vec: MultiliftVec) -> np.ndarray:
     return np.zeros((vec.num_envs, vec.num_drones, vec.action_size))
 
 
+def largest_motion(poses: np.ndarray, t: np.ndarray, slots: np.ndarray) -> list[float]:
+    """Return largest speed and acceleration, by differences, of a payload at poses (T, 4) and of its slots (N, 2)."""
+    c, s = np.cos(poses[:, 3:]), np.sin(poses[:, 3:])
+    x, y = np.vstack([np.zeros(2), slots]).T
+    way, found = (
+        np.stack([poses[:, :1] + c * x - s * y, poses[:, 1:2] + s * x + c * y, poses[:, 2:3] + 0 * c * x], -1),
+        [],
+    )
+    for _ in range(2):
+        way = np.gradient(way, t, axis=0)
+        found.append(float(np.linalg.norm(way[2:-2], axis=2).max()))
+    return found
+
+
 def level(vec: MultiliftVec) -> None:
     """Put the first environment's team at rest in its formation at the target."""
     world, goal = vec.world, vec.task.goal

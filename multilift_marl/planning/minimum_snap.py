@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
 _DEGREE = 7
+_LEVER = 0.1  # [m] a team whose slots are nearer, such as one drone above its payload, turns as a point so far away
 _SAMPLES = 100  # of each piece, where speeds and accelerations are measured
 
 
@@ -42,7 +43,9 @@ def allocate_times(poses: np.ndarray, slots: np.ndarray, speed: float, accelerat
         slots: (N, 2) from the payload, which turn with it [m].
         speed, acceleration: largest ones of the payload and of every slot [m/s], [m/s²].
     """
-    values = poses * [1, 1, 1, max(float(np.linalg.norm(slots, axis=1).max()), 1e-3)]
+    if np.linalg.norm(slots, axis=1).max() < _LEVER:
+        slots = np.array([[_LEVER, 0.0]])
+    values = poses * [1, 1, 1, np.linalg.norm(slots, axis=1).max()]
     gaps = np.diff(values, axis=0)
     shares = np.linalg.norm(gaps, axis=1) ** 0.5
     if len(shares) > 1:

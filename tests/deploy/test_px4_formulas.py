@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import make_system
+from conftest import largest_motion, make_system
 from plain_kernels import record
 
 pytest.importorskip("pymavlink")  # of the px4 extra
@@ -115,13 +115,8 @@ def test_a_way_is_a_straight_line_on_which_the_team_turns_the_shorter_way_round(
     t = np.linspace(0, 1, 20_001)
     share = (35 * t**4 - 84 * t**5 + 70 * t**6 - 20 * t**7)[:, None]
     pose = first + share * np.subtract(last, first)
-    c, s = np.cos(pose[:, 3:]), np.sin(pose[:, 3:])
-    x, y = np.vstack([np.zeros(3), config.system.slots])[:, :2].T
-    way, peaks = np.stack([pose[:, :1] + c * x - s * y, pose[:, 1:2] + s * x + c * y, pose[:, 2:3] + 0 * c * x], -1), []
-    for limit in (1.0, 0.7):
-        way = np.gradient(way, t * arrival, axis=0)
-        peaks.append(np.linalg.norm(way[2:-2], axis=2).max() / limit)
-    assert max(peaks) == pytest.approx(1.0, abs=0.01)
+    fastest, hardest = largest_motion(pose, t * arrival, config.system.slots[:, :2])
+    assert max(fastest / 1.0, hardest / 0.7) == pytest.approx(1.0, abs=0.01)
     assert plan_way(config, begin, begin) is None
 
 
