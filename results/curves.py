@@ -1,7 +1,7 @@
 """Draw learning curves without a base policy: evaluations during training, the band and the median of the seeds.
 
-python results/curves.py [folder]      quickstart.png, imitation.png, from_nothing.png, in docs/images unless a folder
-                                       is given
+python results/curves.py [folder]      quickstart.png, imitation.png, from_nothing.png, auto_multilift_weights.png, in
+                                       docs/images unless a folder is given
 """
 
 from __future__ import annotations
@@ -51,6 +51,9 @@ PICTURES = {  # file: recipes and their labels, panels
     ),
 }  # fmt: skip
 
+THEIR_EPISODES = 19, 30  # after which training ends, in five trainings (arXiv 2406.04858 and its repository)
+THEIR_LOSSES = 1.8e5 / 9e6, 3.8e5 / 9e6  # at the end over that at the start
+
 
 def read_curves(recipe: str, column: str) -> tuple[np.ndarray, np.ndarray]:
     """Return steps (K,) in millions and the values (S, K) of each seed's evaluations."""
@@ -81,8 +84,27 @@ def draw_panel(axes: Axes, panel: Panel, recipes: dict[str, str]) -> None:
         axes.set_yscale("log")
 
 
+def draw_losses(folder: Path) -> None:
+    """Draw the loss of each training on Auto-Multilift's path, and where their five trainings end."""
+    with (ROOT / "docs" / "data" / "auto_multilift_weights.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["way"] == "adam"]
+    figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
+    for i, row in enumerate(rows):
+        untrained = float(row["untrained_loss"])
+        shares = [1.0, *(float(loss) / untrained for loss in row["losses"].split())]
+        axes.plot(range(len(shares)), shares, "C0", lw=1.2, label=None if i else f"this package, {len(rows)} seeds")
+    (first, last), (low, high) = THEIR_EPISODES, THEIR_LOSSES
+    axes.fill_between([first, last], low, high, color="C1", alpha=0.4, lw=0, label="Auto-Multilift, end of 5 trainings")
+    axes.axhline(1 / 30, color="0.4", ls="--", lw=1, label="a thirtieth")
+    axes.set(xlabel="episodes", ylabel="loss over that without learning", yscale="log", xlim=(0, last))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    figure.savefig(folder / "auto_multilift_weights.png", dpi=110)
+
+
 def main(folder: Path) -> None:
     """Write the pictures."""
+    draw_losses(folder)
     for name, (recipes, panels) in PICTURES.items():
         figure, all_axes = plt.subplots(1, len(panels), figsize=(10, 3.6), layout="constrained")
         for axes, panel in zip(all_axes, panels, strict=True):
