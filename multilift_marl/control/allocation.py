@@ -2,7 +2,9 @@
 
 Rotors that saturate cannot give both. The order of priority is roll and pitch torque, then total thrust, then yaw
 torque (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude Control", TCST 2018; so does PX4's sequential
-desaturation): thrust is of no use to a drone that cannot turn it upward.
+desaturation): thrust is of no use to a drone that cannot turn it upward. Each comes as near to what is commanded as
+those before it leave. The share of roll and pitch is found without yaw, which could raise it where rotors that turn
+alike are not opposite: by 2 % with arms that differ by 30 %.
 """
 
 from __future__ import annotations
@@ -41,11 +43,7 @@ def allocate(thrust, torque, inverse, low, high):
         roll, pitch = share * torque[0], share * torque[1]
 
         # Thrust: as near to the commanded one as that leaves, and what it leaves of yaw.
-        least, most = -1e30, 1e30
-        for k in range(4):
-            tilt = inverse[k, 1] * roll + inverse[k, 2] * pitch
-            least = max(least, (low - tilt) / inverse[k, 0])
-            most = min(most, (high - tilt) / inverse[k, 0])
+        least, most = _thrust_range(roll, pitch, torque[2], inverse, low, high)
         total = min(max(thrust, least), most)
         least, most = _yaw_range(total, roll, pitch, torque[2], inverse, low, high)
     wrench = (total, roll, pitch, max(most, 0.0) * torque[2])
@@ -54,6 +52,44 @@ def allocate(thrust, torque, inverse, low, high):
     f2 = _rotor(2, wrench, inverse, low, high)
     f3 = _rotor(3, wrench, inverse, low, high)
     return (f0, f1, f2, f3)
+
+
+@kernel
+def _thrust_range(roll, pitch, yaw, inverse, low, high):
+    """Return the least and the largest total thrust that some share of a yaw torque, from 0 to 1, makes possible [N].
+
+    Limits of rotors and share are ten half planes, `a y + b T <= c`; of two of which one bounds the share y from above
+    and one from below, their sum in which it cancels bounds the thrust T (Fourier and Motzkin's elimination).
+    """
+    least, most = -1e30, 1e30
+    for i in range(10):
+        a, b, c = _half_plane(i, roll, pitch, yaw, inverse, low, high)
+        if a == 0.0 and b != 0.0:
+            least, most = (least, min(most, c / b)) if b > 0.0 else (max(least, c / b), most)
+        if not a > 0.0:
+            continue
+        for j in range(10):
+            below, slope, bound = _half_plane(j, roll, pitch, yaw, inverse, low, high)
+            if not below < 0.0:
+                continue
+            first, second = -below * b, a * slope
+            # Rotors that turn alike leave the thrust out, but for round-off.
+            if abs(first + second) > 1e-9 * (abs(first) + abs(second)):
+                limit = (-below * c + a * bound) / (first + second)
+                least, most = (least, min(most, limit)) if first + second > 0.0 else (max(least, limit), most)
+    return least, most
+
+
+@kernel
+def _half_plane(i, roll, pitch, yaw, inverse, low, high):
+    """Return a, b, c of limit i on a share of a yaw torque and the thrust: of a rotor 0 to 7, of the share 8 and 9."""
+    if i > 7:
+        return (1.0, 0.0, 1.0) if i == 8 else (-1.0, 0.0, 0.0)
+    k = i // 2
+    tilt = inverse[k, 1] * roll + inverse[k, 2] * pitch
+    if i % 2 == 0:
+        return inverse[k, 3] * yaw, inverse[k, 0], high - tilt
+    return -inverse[k, 3] * yaw, -inverse[k, 0], tilt - low
 
 
 @kernel

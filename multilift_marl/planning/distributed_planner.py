@@ -103,7 +103,7 @@ class DistributedPlanner(TeamPlanner):
         shape = num_envs, links.delay + 1, n, steps + 1, SAID
         self.post = Post(
             np.zeros(num_envs, np.uint64), np.zeros(num_envs, np.int64), np.zeros(shape), np.zeros((*shape[:3], 7)),
-            np.zeros((num_envs, n, n, 7)), np.zeros((num_envs, n, n), bool),
+            np.zeros((num_envs, n, n, 7)), np.zeros((num_envs, n, n), bool), np.ones((num_envs, n, n), bool),
         )  # fmt: skip
         self.weights = TeamWeights.of(self.objective, n * num_envs)
         self._apart = ApartWork.of(steps, n)
@@ -125,6 +125,11 @@ class DistributedPlanner(TeamPlanner):
         team = self._flat, self.objective, self.weights, self.around
         plan_apart(given, settings, team, (self.links, self.post), self.plans, self._work, self._apart)
         return self.plans
+
+    def measure_ranges(self, positions: np.ndarray) -> None:
+        """Note which drones the radio connects, by their true positions (E, N, 3) [m]."""
+        apart = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
+        self.post.in_range[:] = apart <= self.links.range
 
     def _agree(self, loads: np.ndarray) -> np.ndarray:
         """Say loads (E N, 7) as each drone estimates them, and return the means of its own and those it has heard."""

@@ -28,6 +28,8 @@ class Post(NamedTuple):
     """(E, N, N, 7) what the first last heard of the second's estimate."""
     has_loads: np.ndarray
     """(E, N, N) bool, whether it has."""
+    in_range: np.ndarray
+    """(E, N, N) bool, whether the radio of the second reaches the first now."""
 
 
 @kernel
@@ -64,7 +66,8 @@ def hear(e, slot, later, links, post, plans, h):
     count = said.shape[0]
     for n in range(count):
         for m in range(count):
-            if links.partners[n, m] and uniform(e, post) > links.loss:
+            # A loss is drawn in any case: the draws of others stay the same.
+            if links.partners[n, m] and uniform(e, post) > links.loss and post.in_range[e, n, m]:
                 t = e * count + n
                 believe(m, said[m], later, plans.states[t], plans.inputs[t], h)
                 post.has_loads[e, n, m] = True

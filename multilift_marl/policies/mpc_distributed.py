@@ -74,6 +74,7 @@ class DistributedMpc(TeamMpc):
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `TeamMpc._measure`, (E N, ...): as each drone knows the payload, and plans of the others."""
         e, n = self._vec.num_envs, self._vec.num_drones
+        self.planner.measure_ranges(self._vec.world.state.drone_position)
         parts = [super(DistributedMpc, self)._measure_by(m) for m in range(n)]
         states = np.stack([part[0] for part in parts], axis=1).reshape(e * n, -1)
         rotations = np.stack([part[1] for part in parts], axis=1).reshape(e * n, 3, 3)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multilift_marl.errors import ConfigError, RigError, warn_once
+from multilift_marl.math3d import segment_distance
 from multilift_marl.rig.system import System
 from multilift_marl.schema.sections import RandomizationConfig, SystemConfig
 
@@ -36,7 +37,7 @@ class Gap(NamedTuple):
 
 
 def check_separation(config: SystemConfig, system: System, build: Build, check: Check) -> None:
-    """Refuse drones that rest too close, nominally or with the lightest payload on the shortest and stiffest cables.
+    """Refuse drones that rest too close, nominally or by a draw of the payload's mass and of the cables.
 
     Args:
         config: of the system.
@@ -68,16 +69,30 @@ def check_separation(config: SystemConfig, system: System, build: Build, check: 
 
 
 def find_gap(system: System, ranges: RandomizationConfig, spare: float) -> Gap | None:
-    """Return the two drones that rest closest, below `spare` [-] times the limit; None where all keep that."""
+    """Return the two drones that rest closest, below `spare` [-] times the limit; None where all keep that.
+
+    Cables are drawn one by one: a drone with its shortest may be beside one with its longest.
+    """
     strain = np.linalg.norm(system.formation_force, axis=1) / (system.cable_stiffness * system.cable_length)
-    slackest = strain * (1 - ranges.payload_mass) / ((1 + ranges.cable_stiffness) * (1 - ranges.cable_length))
-    shorter = 1 - (1 - ranges.cable_length) * (1 + slackest) / (1 + strain)
-    for verb, share in (("would", 0.0 * shorter), ("may", shorter)):
-        slots = system.slots - share[:, None] * (system.cable_ends - system.anchors)
-        apart = np.linalg.norm(slots[:, None] - slots[None], axis=-1) + 1e9 * np.eye(system.num_drones)
-        i, j = (int(k) for k in np.unravel_index(np.argmin(apart - spare * system.min_separation), apart.shape))
-        if apart[i, j] < spare * system.min_separation[i, j]:
-            return Gap((i, j), float(apart[i, j]), float(system.min_separation[i, j]), verb)
+    cables = system.cable_ends - system.anchors
+
+    def grown(mass: float, stiffness: float, length: float) -> np.ndarray:
+        """Return by which share of a resting cable it is longer, under factors on mass, stiffness and length (N, 1)."""
+        stretched: np.ndarray = length * (1 + strain * mass / (stiffness * length)) / (1 + strain) - 1
+        return stretched[:, None]
+
+    short = grown(1 - ranges.payload_mass, 1 + ranges.cable_stiffness, 1 - ranges.cable_length) * cables
+    long = grown(1 + ranges.payload_mass, 1 - ranges.cable_stiffness, 1 + ranges.cable_length) * cables
+    least = system.min_separation
+    for verb in ("would", "may"):
+        apart = np.linalg.norm(system.slots[:, None] - system.slots[None], axis=-1)
+        if verb == "may" and (short != long).any():
+            ends = list(zip(map(tuple, system.slots + short), map(tuple, system.slots + long), strict=True))
+            apart = np.array([[segment_distance(*one, *other) for other in ends] for one in ends])
+        apart += 1e9 * np.eye(system.num_drones)
+        i, j = (int(k) for k in np.unravel_index(np.argmin(apart - spare * least), apart.shape))
+        if apart[i, j] < spare * least[i, j]:
+            return Gap((i, j), float(apart[i, j]), float(least[i, j]), verb)
     return None
 
 

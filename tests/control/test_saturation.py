@@ -5,41 +5,56 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import floats, make, zeros
+from scipy.optimize import linprog
 
 from multilift_marl.control.allocation import allocate
 from multilift_marl.rig.presets import PRESETS
 from multilift_marl.validation.bodies import attitudes, release_drones
 
 
-def best_by_search(vehicle, thrust, torque, low, high):
-    """Return share of roll and pitch and total thrust by brute force, first the largest, then the nearest."""
-    inverse = np.linalg.inv(vehicle.allocation)
-    for share in np.linspace(0, 1, 2001):  # of yaw that helps
-        rotors = inverse @ [thrust, torque[0], torque[1], share * torque[2]]
-        if (rotors >= low - 1e-3 * high).all() and (rotors <= high * (1 + 1e-3)).all():
-            return 1.0, thrust
+def best_wrench(vehicle, thrust, torque, low, high):
+    """Return shares of roll and pitch, total thrust and share of yaw that three linear programs find, one by one."""
+    total, roll, pitch, yaw = vehicle.allocation
+    # Unknowns: four rotors, the share of roll and pitch, that of yaw, the distance from the commanded thrust.
+    equal = [[*roll, -torque[0], 0, 0], [*pitch, -torque[1], 0, 0], [*yaw, 0, -torque[2], 0]]
+    below, limits = [[*total, 0, 0, -1], [*-total, 0, 0, -1]], [(low, high)] * 4 + [(0, 1), (0, 1), (0, None)]
 
-    def range_of_thrust(share):
-        tilt = share * (inverse[:, 1] * torque[0] + inverse[:, 2] * torque[1])
-        return ((low - tilt) / inverse[:, 0]).max(), ((high - tilt) / inverse[:, 0]).min()
+    def smallest(cost, bounds):
+        found = linprog(cost, below, [thrust, -thrust], equal, [0, 0, 0], bounds, method="highs")
+        assert found.status == 0
+        return found
 
-    shares = [share for share in np.linspace(1, 0, 20001) if np.subtract(*range_of_thrust(share)) <= 1e-12]
-    return shares[0], float(np.clip(thrust, *range_of_thrust(shares[0])))
+    share = smallest([0, 0, 0, 0, -1, 0, 0], limits).x[4]
+    limits[4] = (share - 1e-9, 1)
+    limits[6] = (0, smallest([0, 0, 0, 0, 0, 0, 1], limits).fun + 1e-8 * high)
+    best = smallest([0, 0, 0, 0, 0, -1, 0], limits).x
+    return share, float(total @ best[:4]), best[5]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
-def test_roll_and_pitch_come_first_then_thrust(name):
+def test_roll_and_pitch_come_first_then_thrust_then_yaw(name):
     vehicle, rng = PRESETS[name], np.random.default_rng(3)
     inverse, high = np.ascontiguousarray(np.linalg.inv(vehicle.allocation)), vehicle.rotor_thrust_max
     for _ in range(12):
-        thrust, torque = rng.uniform(0, 6) * high, rng.normal(0, 2 * high * vehicle.arm, 3)
-        torque[2] *= 0.1
-        share, total = best_by_search(vehicle, thrust, torque, 0.05 * high, high)
+        thrust, torque = rng.uniform(0, 5) * high, rng.normal(0, 1.2 * high * vehicle.arm, 3)
+        torque[2] = rng.normal(0, 1.4) * np.abs(vehicle.allocation[3]).mean() * high
+        share, total, turned = best_wrench(vehicle, thrust, torque, 0.05 * high, high)
         wrench = vehicle.allocation @ allocate(thrust, floats(torque), inverse, 0.05 * high, high)
-        np.testing.assert_allclose(wrench[1:3], share * torque[:2], atol=2e-4 * np.abs(torque).max())
-        assert wrench[0] == pytest.approx(total, abs=1e-2 * high)
-        assert -1e-9 <= wrench[3] / torque[2] <= 1 + 1e-9
+        np.testing.assert_allclose(wrench[1:3], share * torque[:2], atol=1e-7 * np.abs(torque).max())
+        assert wrench[0] == pytest.approx(total, abs=1e-6 * high)
+        assert wrench[3] == pytest.approx(turned * torque[2], abs=1e-4 * abs(torque[2]))
+
+
+@pytest.mark.parametrize("name", ["falcon", "hummingbird", "x500"])
+def test_thrust_does_not_leap_where_rotors_begin_to_saturate(name):
+    vehicle, rng = PRESETS[name], np.random.default_rng(1)
+    inverse, high = np.ascontiguousarray(np.linalg.inv(vehicle.allocation)), vehicle.rotor_thrust_max
+    thrusts = np.linspace(0, 5 * high, 2001)
+    for _ in range(4):
+        torque = rng.normal(0, 1.2 * high * vehicle.arm, 3)
+        torque[2] = rng.normal(0, 2) * np.abs(vehicle.allocation[3]).mean() * high
+        totals = [sum(allocate(thrust, floats(torque), inverse, 0.0, high)) for thrust in thrusts]
+        assert np.abs(np.diff(totals)).max() < 1.001 * (thrusts[1] - thrusts[0])
 
 
 @pytest.mark.parametrize("seed", range(5))

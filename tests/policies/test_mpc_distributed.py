@@ -49,6 +49,18 @@ def test_without_any_message_it_is_worse():
     assert lost["payload_rmse_m"].mean() > 1.2 * heard["payload_rmse_m"].mean()
 
 
+@pytest.mark.parametrize("reach, heard", [(0.05, 0), (1.5, 8), (None, 12)])
+def test_who_hears_whose_plan_is_by_the_radios_range(reach, heard):
+    """Four drones rest in a square: each has two neighbours within 1.5 m."""
+    overrides = BY_RATES | LOSSY | {"env.communication_loss": 0.0, "env.communication_range": reach}
+    vec = make("hover", 1, 4, **overrides)
+    observation, _ = vec.reset(seed=1)
+    policy = make_scripted("mpc_distributed", vec)
+    for _ in range(20):
+        observation, *_ = vec.step(policy.act(observation))
+    assert policy.planner.post.has_loads.sum() == heard
+
+
 @pytest.mark.parametrize("overrides", [{}, LOSSY])
 def test_forests_are_passed(overrides):
     result = fly("mpc_route_distributed", "navigate_dense", overrides, episodes=4, seconds=24.0)

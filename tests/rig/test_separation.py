@@ -25,7 +25,19 @@ TIGHT = {
     "mixed": (4, {"vehicle.preset": ["falcon", "falcon", "hummingbird", "iris"], **SMALL_BOX}),
     "chains": (2, POINT | {"cable.model": "chain", "cable.angle": 8, "cable.length": 1.0}),
 }
+DRAWN = {"randomization__cable_length": 0.15, "randomization__payload_mass": 0.0}
 NUMBER = r"(\[[\d., ]+\]|[\d.]+)"
+
+
+def test_a_short_cable_beside_a_long_one_may_bring_drones_too_close():
+    """Both are in one plane through the point, at angles of 3 and 3 deg: heights differ by what cables differ."""
+    odd = POINT | {"cable.length": [1.0, 1.6], "cable.angle": 3}
+    nominal = make_system(2, **odd)
+    assert least_ratio(nominal) > 1.5
+    message = refuse_system(2, **{key.replace(".", "__"): value for key, value in odd.items()}, **DRAWN)
+    short, long = nominal.slots[0] * 1.15, nominal.slots[1] * 0.85  # from the point, but for a little stretch
+    assert re.match(rf"neighbouring drones 0 and 1 may rest {np.linalg.norm(short - long):.2f} m apart", message)
+    assert "lower randomization.cable_length" in message
 
 
 def suggested(message: str) -> dict[str, object]:
