@@ -113,7 +113,14 @@ def _enter(own: Config, k: int, stage: Stage) -> Config:
 def _check_alike(environments: list[Config]) -> None:
     """Refuse stages in which observations, actions or the critic's state are others than in the training's own."""
     alone = {"env.num_envs": 1, "env.num_threads": 1}
-    vecs = [MultiliftVec(build_config(divide_rigs(each)[0].model_dump(), alone)) for each in environments]
+    vecs = []
+    for k, each in enumerate(environments, 1):
+        try:
+            vecs.append(MultiliftVec(build_config(divide_rigs(each)[0].model_dump(), alone)))
+        except ConfigError as error:
+            if k == len(environments):
+                raise
+            raise ConfigError(f"stage {k} of train.stages: {error}") from error
     own, train = vecs[-1], environments[-1].train
     for k, vec in enumerate(vecs[:-1], 1):
         difference = first_difference("actions", vec.action_names, own.action_names)

@@ -18,12 +18,12 @@ from multilift_marl.agents.policy import LearnedPolicy
 from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.config.config import Config
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
+from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.evaluation.metrics import is_better, summarize
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_base_policy
 from multilift_marl.policies.policy import Policy
 from multilift_marl.tasks import find_task
-from multilift_marl.tasks.base import Task
 
 _METRICS = (
     "success_rate", "payload_position_error_m", "payload_rmse_m", "payload_attitude_error_deg", "settling_time_s",
@@ -60,7 +60,7 @@ class Evaluator:
     Attributes:
         error: metric by which policies that succeed alike are compared, the task's `ERROR`.
         best: what a checkpoint holds of the policy that is kept, its `iteration`, and its `score` in its evaluation,
-            success and negative error, which is `compared_by`; None before the first.
+            success and negative error, which is `compared_by`, over so many `episodes`; None before the first.
         initial: the same of the policy of `train.init`, without score; None where there is none.
     """
 
@@ -80,15 +80,14 @@ class Evaluator:
             The evaluation's numbers by name, the iteration of the best policy among them.
         """
         start, policy = time.perf_counter(), LearnedPolicy(content, "the run")
-        summary = summarize(self._fly(policy.bind, 0))
+        flown = self._fly(policy.bind, 0)
+        summary, score = summarize(flown), self._score(flown)
         values = {f"eval/{name}": summary[name]["mean"] for name in self._metrics}
-        score = [values["eval/success_rate"], -values[f"eval/{self.error}"]]
+        self._score_anew()
         best, keep_last = self.best, self.config.eval.keep == "last"
-        if best is not None and best.get("compared_by", Task.ERROR) != self.error:
-            best["score"] = [0.0, -np.inf]  # of a run that an older version began: fresh episodes decide
         if best is None or keep_last or (score > best["score"] and self._confirm(policy, content["iteration"])):
             weights = {name: tensor.clone() for name, tensor in content["actor"].items()}  # learning changes them
-            best = self.best = content | {"actor": weights, "score": score, "compared_by": self.error}
+            best = self.best = content | {"actor": weights, "score": score} | self._measure
         return values | {
             "eval/best_iteration": float(best["iteration"]),
             "eval/seconds": time.perf_counter() - start,
@@ -111,6 +110,23 @@ class Evaluator:
     @property
     def _metrics(self) -> tuple[str, ...]:
         return _METRICS if self.error in _METRICS else (*_METRICS, self.error)
+
+    @property
+    def _measure(self) -> dict[str, Any]:
+        """What scores have to have in common to be compared."""
+        return {"compared_by": self.error, "episodes": self.config.eval.episodes}
+
+    def _score(self, flown: dict[str, np.ndarray]) -> list[float]:
+        if self.error not in flown:
+            hint = nearest(self.error, [name for name, value in flown.items() if value.dtype == float])
+            raise ConfigError(f"task {self.config.task}: ERROR names no metric, '{self.error}'{hint}")
+        return [float(flown["success_rate"].mean()), -float(flown[self.error].mean())]
+
+    def _score_anew(self) -> None:
+        """Score the best policy where a resumed training has other episodes, or another error, than it had before."""
+        best = self.best
+        if best is not None and {name: best.get(name) for name in self._measure} != self._measure:
+            best |= {"score": self._score(self._fly(self.best_policy().bind, 0))} | self._measure
 
     def _beginning(self) -> Callable[[MultiliftVec], Policy]:
         if self.initial is None:

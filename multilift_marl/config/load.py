@@ -11,7 +11,7 @@ from typing import Any
 
 from multilift_marl.config.aliases import stored_names
 from multilift_marl.config.config import Config
-from multilift_marl.config.precedence import give_way
+from multilift_marl.config.precedence import give_way, leaves, without
 from multilift_marl.errors import ConfigError, UnknownKeywordError, called_elsewhere, nearest, reason, shorten
 from multilift_marl.plugins import describe_unregistered, identify, import_modules, load_entry_points, named, refused
 from multilift_marl.schema.files import as_mapping, change_files, is_yaml
@@ -390,6 +390,8 @@ def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         known = merged.get(key)
         if str(key).startswith("reward.") and isinstance(known, Mapping) and _is_number(value):  # in train.overrides
             value = {"weight": value}
+        if key == "overrides" and isinstance(known, Mapping) and isinstance(value, Mapping):
+            known = without(known, [name for name, _ in leaves(value)])  # however each of them is written
         merged[key] = (
             _merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
         )

@@ -24,12 +24,12 @@ def give_way(values: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, A
     ]
     kept = dict(train)
     if isinstance(overrides := kept.get("overrides"), Mapping):
-        kept["overrides"] = _without(overrides, names)
+        kept["overrides"] = without(overrides, names)
     if isinstance(rigs := kept.get("rigs"), list | tuple):
-        kept["rigs"] = [_without(rig, names) if isinstance(rig, Mapping) else rig for rig in rigs]
+        kept["rigs"] = [without(rig, names) if isinstance(rig, Mapping) else rig for rig in rigs]
     if isinstance(stages := kept.get("stages"), list | tuple):
         kept["stages"] = [
-            {**stage, "overrides": _without(changes, names)}
+            {**stage, "overrides": without(changes, names)}
             if isinstance(stage, Mapping) and isinstance(changes := stage.get("overrides"), Mapping)
             else stage
             for stage in stages
@@ -37,7 +37,7 @@ def give_way(values: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, A
     return {**values, "train": kept}
 
 
-def _without(overrides: Mapping[str, Any], asked: list[str]) -> dict[str, Any]:
+def without(overrides: Mapping[str, Any], asked: list[str]) -> dict[str, Any]:
     """Return overrides as they are, but for those that are asked for; of a term's numbers each for itself."""
     kept = {}
     for key, value in overrides.items():

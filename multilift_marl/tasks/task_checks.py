@@ -57,6 +57,10 @@ def _find_problems(task: Any) -> Iterator[str]:
     if not isinstance(task.REWARD, dict):
         yield f"REWARD is {_text(task.REWARD)}; give a dict of rewards.Term by name"
     for name, term in task.REWARD.items():
+        if not _is_word(name):
+            yield f"REWARD holds {_text(name)}; give words of letters, digits and _"
+        if name == "total":
+            yield "REWARD holds 'total', the name of the sum of all terms in the records of training; give it another"
         if not isinstance(term, Term):
             yield f"REWARD['{name}'] is {_text(term)}; give Term(weight, kernel, margin=...)"
         if term.unit != "deg" and any(mark in term.unit for mark in ("deg", "°")):
@@ -105,7 +109,7 @@ def _find_failure_problems(names: Any) -> Iterator[str]:
     if not isinstance(names, tuple | dict):
         yield f"FAILURES is {_text(names)}; give a tuple of names, ('hit_wall',) for one, or a dict of functions"
     for name in names:
-        if not (isinstance(name, str) and re.fullmatch(r"\w+", name)):
+        if not _is_word(name):
             yield f"FAILURES holds {_text(name)}; give words of letters, digits and _"
         if name in CAUSES:
             yield f"FAILURES holds '{name}', a cause that all tasks have; give it another name, or write that cause"
@@ -115,6 +119,10 @@ def _find_failure_problems(names: Any) -> Iterator[str]:
     for name, value in names.items() if isinstance(names, dict) else ():
         if why := _misfit(value, "e", "v"):
             yield f"FAILURES['{name}'] is {why}"
+
+
+def _is_word(name: object) -> bool:
+    return isinstance(name, str) and re.fullmatch(r"\w+", name) is not None
 
 
 def _misfit(value: Any, *arguments: str) -> str:
@@ -208,6 +216,8 @@ def _find_component_problems(parts: Any, where: str) -> Iterator[str]:
     for part in parts:
         if not isinstance(part, Component):
             yield f"{where} holds {_text(part)}; give observations.Component(...)"
+        if not _is_word(part.name):
+            yield f"{where} has a component {_text(part.name)}; give words of letters, digits and _"
         if part.frame not in (*FRAMES, "-"):
             yield f"component '{part.name}' has an unknown frame '{part.frame}'{nearest(part.frame, [*FRAMES, '-'])}"
         turned = "slot" if where == "EXTRA" else "target"

@@ -45,7 +45,7 @@ from multilift_marl.schema.values import Between, Choice, Float, Places, Section
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.target_checks import check_paths
 
-AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s]
+AHEAD = (0.1, 0.2, 0.4, 0.8)  # [s], with env.units=cable, too
 _DRAWN = 400  # points of a path that is drawn
 
 

@@ -13,8 +13,9 @@ import pytest
 import torch
 from conftest import make, slow
 
+from multilift_marl.agents import export as export_module
 from multilift_marl.agents.checkpoint import save_checkpoint
-from multilift_marl.agents.export import export_policy, make_contract
+from multilift_marl.agents.export import _convert, export_policy, make_contract
 from multilift_marl.agents.networks import Actor
 from multilift_marl.agents.policy import LearnedPolicy, load_policy
 from multilift_marl.cli.export import main as export
@@ -98,8 +99,24 @@ def test_a_network_whose_actions_are_not_numbers_is_not_taken_for_the_policy(tmp
             return [np.full_like(output, np.nan) for output in super().run(*arguments)]
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", Broken)
-    with pytest.raises(RuntimeError, match="differs from the test by nan"):
-        export_policy(policy(), tmp_path)
+    with pytest.raises(CheckpointError, match="the test as an ONNX network differs by nan"):
+        export_policy(policy(), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_network_may_differ_by_what_rounding_makes_of_it_and_by_no_more(tmp_path, monkeypatch):
+    """Actions so steep that single precision is off by more than the tolerance of others."""
+    content = checkpoint()
+    for name, weight in content["actor"].items():
+        if name.endswith("weight") and weight.ndim == 2:
+            content["actor"][name] = 20.0 * weight
+    steep = LearnedPolicy(content, "the test")
+    assert export_policy(steep, tmp_path)["network"]["largest_difference"] > 1e-5
+    last = max(name for name in content["actor"] if name.endswith("weight"))
+    other = LearnedPolicy(content | {"actor": content["actor"] | {last: 1.01 * content["actor"][last]}}, "another")
+    monkeypatch.setattr(export_module, "_convert", lambda policy, opset: _convert(other, opset))
+    with pytest.raises(CheckpointError, match="where rounding makes"):
+        export_policy(steep, tmp_path)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import SMALL, make_trainer
+from conftest import SMALL, make_trainer, refusal
 
 from multilift_marl.agents import evaluator
 from multilift_marl.agents.checkpoint import load_checkpoint
@@ -149,12 +149,33 @@ def test_a_team_that_tracks_is_judged_by_its_error_along_the_path(tmp_path, monk
     trainer.gain = trainer.evaluator.measure_gain(2)
     assert "RMSE" in _compare(trainer) and "5.00 cm" in _compare(trainer)
     assert set(asked) == {"payload_rmse_m"}
-    # A run that an older version began: its score, of the other error, would refuse what is better.
-    old = trainer.evaluator.best
-    del old["compared_by"]
-    old["score"] = [1.0, -0.001]
-    trainer.iteration = 2
-    assert trainer.evaluator.evaluate(trainer._content())["eval/best_iteration"] == 2
+
+
+@pytest.mark.parametrize("before", [{}, {"compared_by": "payload_rmse_m", "episodes": 3}, {"episodes": 1}])
+def test_a_score_of_other_episodes_or_another_error_is_measured_anew(tmp_path, monkeypatch, before):
+    """A run that an older version began, or that is resumed with other eval.episodes: a lucky score would stay."""
+    trainer = make_trainer(tmp_path, **{"eval.episodes": 3})
+    errors = {0: 0.2, 1: 0.1}
+    monkeypatch.setattr(evaluator, "run_episodes", lambda *a, **k: flight(np.full(3, errors[flying[0]])))
+    flying, own = [0], trainer.evaluator
+    own.evaluate(trainer._content())
+    assert own.best["score"] == pytest.approx([1.0, -0.2])
+    lucky = {name: value for name, value in own.best.items() if name not in ("compared_by", "episodes")}
+    own.best = lucky | before | {"score": [1.0, -0.001]}
+    # What flies next: the candidate, then the best policy, and both on fresh episodes.
+    turns = iter([1, 0, 1, 0])
+    fly = own._fly
+    monkeypatch.setattr(own, "_fly", lambda *arguments: flying.__setitem__(0, next(turns)) or fly(*arguments))
+    trainer.iteration = 1
+    assert own.evaluate(trainer._content())["eval/best_iteration"] == 1
+    assert own.best["score"] == pytest.approx([1.0, -0.1]) and own.best["episodes"] == 3
+
+
+def test_an_error_that_no_metric_has_is_named(tmp_path, monkeypatch):
+    trainer = make_trainer(tmp_path)
+    monkeypatch.setattr(trainer.evaluator, "error", "payload_rms_m")
+    message = refusal(trainer.evaluator.evaluate, trainer._content())
+    assert message.startswith("task hover: ERROR names no metric, 'payload_rms_m'; did you mean 'payload_rmse_m'?")
 
 
 def test_one_lost_payload_on_each_side_does_not_hide_a_smaller_error():

@@ -128,6 +128,7 @@ def test_the_stage_is_logged_and_announced(tmp_path, capsys, monkeypatch):
         ([], "train.stages must not be empty"),
         ([{"overrides": {"payload.mas": 1.0}}], "stage 1 of train.stages: unknown key 'payload.mas'; did you mean"),
         ([{"overrides": {"payload.mass": 900.0}}], "stage 1 of train.stages: "),
+        ([{"overrides": {"task_options.foo": 3}, "until": {"frames": 100}}], "stage 1 of train.stages: unknown key"),
         ([{"override": {}}], "unknown key 'train.stages[0].override'; did you mean 'train.stages[0].overrides'?"),
         ([{"until": {"frame": 1}}], "unknown key 'train.stages[0].until.frame'; did you mean"),
         ([{"until": {"success": 80}}], "train.stages[0].until.success must be less than or equal to 1, but is 80"),

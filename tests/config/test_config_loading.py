@@ -8,6 +8,7 @@ import pytest
 import yaml
 from conftest import TASKS
 
+from multilift_marl.config import precedence
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import (
     CONFIGS,
@@ -177,6 +178,29 @@ def test_so_does_what_a_file_says_before_its_bases_and_a_rig_before_the_task(tmp
         assert load_config(tmp_path / "rig.yaml", {"task": "calm"}).train.overrides == {"wind.wash": True}
     finally:
         del CONFIGS["calm"]
+
+
+WRITTEN = {"wind.wash": False}, {"wind": {"wash": False}}, {"wind": {"wash": False, "gust": 0}}
+
+
+@pytest.mark.parametrize("typed", WRITTEN)
+@pytest.mark.parametrize("filed", [{"wind.wash": True}, {"wind": {"wash": True}}, {"wind": {"wash": True, "gust": 1}}])
+def test_the_last_of_two_overrides_counts_however_each_is_written(write, typed, filed):
+    """Sections and dotted keys: values are applied in turn, so that none may be left of what was overridden."""
+    file = write(yaml.safe_dump({"base": "loss", "train": {"overrides": filed}}))
+    found = load_config(file, {"train.overrides": typed}).train.overrides
+    numbers = [(name, value) for name, value in precedence.leaves(found) if name.startswith("wind.")]
+    assert numbers[-1] == ("wind.gust", 0) if "gust" in str(typed) else ("wind.wash", False) in numbers
+    assert len({name for name, _ in numbers}) == len(numbers) and ("wind.wash", True) not in numbers
+
+
+def test_a_terms_weight_may_be_overridden_in_either_form():
+    filed = {"train": {"overrides": {"reward.precision.weight": 7.0, "reward.precision.margin": 0.1}}}
+    for typed in ({"reward.precision": 5.0}, {"reward": {"precision": 5.0}}, {"reward.precision.weight": 5.0}):
+        found = dict(
+            precedence.leaves(build_config({"task": "hover", **filed}, {"train.overrides": typed}).train.overrides)
+        )
+        assert found == {"reward.precision.weight": 5.0, "reward.precision.margin": 0.1}
 
 
 def test_rigs_of_training_have_what_is_typed():
