@@ -10,7 +10,7 @@ import numpy as np
 
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.kernels.cache import code_names, used_values
-from multilift_marl.kernels.jit import inlined
+from multilift_marl.kernels.jit import inlined, prebind
 from multilift_marl.math3d import clip, mat, matmul, matrow, norm, put, rotation_vector, row, sub, transpose, vec
 from multilift_marl.mdp.failures import FailureMask, Limits
 from multilift_marl.rig.constants import RigArrays
@@ -19,6 +19,7 @@ from multilift_marl.sim.obstacles import Obstacles
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.state import HiddenLoads, SystemState
 
+Call = Callable[[int, int], None]  # of environments lo to hi
 INTEGRAL_LIMIT = 0.5  # of each component of the error integrals, as observed: a full action's worth of the baselines
 
 
@@ -155,6 +156,21 @@ def reduce_view(view: View, *kernels: Callable[..., Any]) -> View:
         _collect_names(getattr(each, "py_func", each), names, seen)
     reduced: View = _keep(view, names)
     return reduced
+
+
+def bind_kernel(kernel: Callable[..., Any], view: View, *arguments: Any) -> Call:
+    """Return a call of (lo, hi) of a kernel of (lo, hi, View, *arguments), which gets what it names of the view."""
+    return prebind(kernel, reduce_view(view, kernel), *arguments)
+
+
+def in_turn(*calls: Call) -> Call:
+    """Return a call of (lo, hi) that makes all, one after the other."""
+
+    def call(lo: int, hi: int) -> None:
+        for each in calls:
+            each(lo, hi)
+
+    return call
 
 
 def _collect_names(function: Any, names: set[str], seen: set[Any]) -> None:

@@ -208,20 +208,35 @@ class DroneNumbers(NamedTuple):
 
 
 class StateComponents(NamedTuple):
-    """What the global state holds, in order: `team`, for each drone `drone` and its last action, `rest`."""
+    """What the global state holds: `team`, for each drone `drones` and its last action, `rest`."""
 
     team: tuple[Component, ...]
     drone: tuple[Component, ...]
-    rest: tuple[Component, ...]
+    hidden_drone: tuple[Component, ...]
+    """Of each drone, what is hidden in an episode."""
+    extra: tuple[Component, ...]
+    """What the task adds."""
+    hidden: tuple[Component, ...]
+    """Of the team."""
+
+    @property
+    def drones(self) -> tuple[Component, ...]:
+        """What there is of each drone before its last action."""
+        return self.drone + self.hidden_drone
+
+    @property
+    def rest(self) -> tuple[Component, ...]:
+        """What comes after the drones."""
+        return kernels_first((*self.extra, *self.hidden))
 
     def drone_numbers(self, num_drones: int, action_size: int) -> DroneNumbers:
         """Return where the drones' numbers stand."""
-        return DroneNumbers(count_numbers(self.team), num_drones, count_numbers(self.drone) + action_size)
+        return DroneNumbers(count_numbers(self.team), num_drones, count_numbers(self.drones) + action_size)
 
     def listed(self, num_drones: int, action_size: int) -> tuple[Component, ...]:
         """Return all components, one after the other."""
-        # The order in which `observation_kernels.compose_state` writes.
-        return (*self.team, *num_drones * (*self.drone, previous_action(action_size)), *self.rest)
+        # The order in which the kernels of `observation_kernels` write.
+        return (*self.team, *num_drones * (*self.drones, previous_action(action_size)), *self.rest)
 
     def size(self, num_drones: int, action_size: int) -> int:
         """Return how many numbers they are."""
@@ -236,4 +251,4 @@ def state_components(varied: Set[str], extra: tuple[Component, ...] = ()) -> Sta
         extra: what the task adds.
     """
     hidden, of_drone = (tuple(part for key, part in table.items() if key in varied) for table in (HIDDEN, DRONE_HIDDEN))
-    return StateComponents(STATE, (*DRONE_STATE, *of_drone), kernels_first((*extra, *hidden)))
+    return StateComponents(STATE, DRONE_STATE, of_drone, extra, hidden)

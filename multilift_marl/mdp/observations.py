@@ -291,7 +291,7 @@ def list_components(action: str, extra: tuple[Component, ...] = ()) -> tuple[Com
 def previous_action(size: int) -> Component:
     """Return the component of the last action, which is copied rather than computed."""
     # `own_velocity` only fills the place of a value: kernels copy the action and never call it.
-    return Component("previous_action", size, "-", "-", "own last action", own_velocity, False)
+    return Component("previous_action", size, "-", "-", "own last action", own_velocity, False, "action")
 
 
 def observation_names(action: str, extra: tuple[Component, ...] = (), ages: tuple[int, ...] = (0,)) -> tuple[str, ...]:

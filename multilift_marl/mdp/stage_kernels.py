@@ -10,7 +10,7 @@ import numpy as np
 from multilift_marl.control.formation import place_formation
 from multilift_marl.kernels.jit import compose, kernel
 from multilift_marl.math3d import matrow, put, putmat, row, scale, sub
-from multilift_marl.mdp.env_data import update_errors
+from multilift_marl.mdp.env_data import Call, View, bind_kernel, in_turn, update_errors
 from multilift_marl.mdp.failures import find_cause, find_obstacle
 
 
@@ -56,48 +56,77 @@ def compose_plan(plan: Callable[..., Any]) -> Callable[..., Any]:
     return compose("advance_plan", source, {"plan": plan})
 
 
-def compose_check(
-    check: Callable[..., Any] | None,
-    advances: bool,
-    own: Mapping[int, Callable[..., Any]] | None = None,
-    obstacles: bool = False,
-) -> Callable[..., Any]:
-    """Return the kernel of (lo, hi, View, dt) that measures errors, integrates them over `dt` [s], finds failures.
+@kernel
+def measure_errors(lo, hi, v, dt, passed):
+    """Advance the time of environments lo to hi by `passed`, measure their errors, integrate these over `dt` [s]."""
+    for e in range(lo, hi):
+        v.time[e] += passed
+        update_errors(e, 0, v.payload, v.true_errors, v, dt)
 
-    A failure that the task has found by itself, here or earlier in the step, stays the cause.
+
+@kernel
+def find_failures(lo, hi, v):
+    """Find the failures that all tasks share in environments lo to hi; a cause that is there stays."""
+    for e in range(lo, hi):
+        cause = find_cause(e, v)  # in any case, for it also keeps the least separation
+        v.cause[e] = cause if v.cause[e] == 0 else v.cause[e]
+
+
+@kernel
+def find_touches(lo, hi, v):
+    """Find out in which environments lo to hi something touches an obstacle; a cause that is there stays."""
+    for e in range(lo, hi):
+        touched = find_obstacle(e, v)
+        v.cause[e] = touched if v.cause[e] == 0 else v.cause[e]
+
+
+def compose_check(check: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the kernel of (lo, hi, View) that calls `check` of (e, View), which finds a task's own failures."""
+    source = """def check(lo, hi, v):
+    for e in range(lo, hi):
+        find_own(e, v)
+"""
+    return compose("check", source, {"find_own": check})
+
+
+def compose_failures(own: Mapping[int, Callable[..., Any]]) -> Callable[..., Any]:
+    """Return the kernel of (lo, hi, View) that finds a task's own failures; a cause that is there stays.
 
     Args:
-        check: inlined kernel of (e, View) that finds the task's own failures; None for none.
-        advances: whether time advances here, because no plan does that.
-        own: inlined kernels of (e, View), whether the task's own failures with these numbers have happened, which count
-            after all others.
-        obstacles: whether there are any, which cost some compilation.
+        own: inlined kernels of (e, View), whether the failures with these numbers have happened.
     """
-    lines = ["def check(lo, hi, v, dt):", "    for e in range(lo, hi):"]
-    lines += ["        v.time[e] += dt"] if advances else []
-    lines.append("        update_errors(e, 0, v.payload, v.true_errors, v, dt)")
-    lines += ["        find_own(e, v)"] if check else []
-    # In any case, for it also keeps the least separation.
-    lines.append("        cause = find_cause(e, v)")
-    lines.append("        v.cause[e] = cause if v.cause[e] == 0 else v.cause[e]")
-    if obstacles:
-        lines.append("        touched = find_obstacle(e, v)")
-        lines.append("        v.cause[e] = touched if v.cause[e] == 0 else v.cause[e]")
-    functions: dict[str, Callable[..., Any]] = {"update_errors": update_errors, "find_cause": find_cause}
-    functions |= {"find_obstacle": find_obstacle} if obstacles else {}
-    functions |= {"find_own": check} if check else {}
-    for number, has_failed in (own or {}).items():
+    lines = ["def find_own_failures(lo, hi, v):", "    for e in range(lo, hi):"]
+    for number in own:
         lines.append(f"        if v.cause[e] == 0 and failure_{number}(e, v):")
         lines.append(f"            v.cause[e] = {number}")
-        functions[f"failure_{number}"] = has_failed
-    return compose("check", "\n".join(lines) + "\n", functions)
+    functions = {f"failure_{number}": has_failed for number, has_failed in own.items()}
+    return compose("find_own_failures", "\n".join(lines) + "\n", functions)
 
 
-def in_turn(first: Callable[[int, int], None], then: Callable[[int, int], None]) -> Callable[[int, int], None]:
-    """Return a call of (lo, hi) that makes both, one after the other."""
+def bind_check(
+    view: View,
+    dt: float,
+    check: Callable[..., Any] | None,
+    own: Mapping[int, Callable[..., Any]],
+    obstacles: bool,
+    passed: float,
+) -> Call:
+    """Return the call of (lo, hi) that measures errors, integrates them over `dt` [s] and finds failures.
 
-    def call(lo: int, hi: int) -> None:
-        first(lo, hi)
-        then(lo, hi)
+    A failure that the task has found by itself, here or earlier in the step, stays the cause. What tasks have in common
+    are kernels of their own, compiled once.
 
-    return call
+    Args:
+        view: what they read and write.
+        dt: [s].
+        check: inlined kernel of (e, View) that finds the task's own failures; None for none.
+        own: see `compose_failures`; they count after all others.
+        obstacles: whether there are any.
+        passed: by which time advances [s].
+    """
+    calls = [bind_kernel(measure_errors, view, dt, passed)]
+    calls += [bind_kernel(compose_check(check), view)] if check else []
+    calls.append(bind_kernel(find_failures, view))
+    calls += [bind_kernel(find_touches, view)] if obstacles else []
+    calls += [bind_kernel(compose_failures(own), view)] if own else []
+    return in_turn(*calls)

@@ -13,16 +13,16 @@ from multilift_marl.control.formation import Goal, Reference, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import inlined, is_plain, prebind
 from multilift_marl.mdp.criteria import Criterion, rest_criteria
-from multilift_marl.mdp.env_data import INTEGRAL_LIMIT, Errors, View, reduce_view, true_load
+from multilift_marl.mdp.env_data import INTEGRAL_LIMIT, Call, Errors, View, bind_kernel, in_turn, reduce_view, true_load
 from multilift_marl.mdp.failures import CAUSES, FIRST_OWN, MAX_DISTANCE, SIGHT, FailureMask, make_limits
 from multilift_marl.mdp.global_state import state_components
 from multilift_marl.mdp.initial_states import check_options, true_equilibrium
 from multilift_marl.mdp.numpy_functions import NumpyFunctions
-from multilift_marl.mdp.observation_kernels import check_written, compose_observation, compose_state
+from multilift_marl.mdp.observation_kernels import bind_state, check_written, compose_observation
 from multilift_marl.mdp.observations import Component, kernels_first, list_components, sensed_components
 from multilift_marl.mdp.rewards import RestBounds, Term, compose_reward, is_at_rest, resolve_reward
 from multilift_marl.mdp.rig_features import RIG, describe_rig, observed_units, scale_numbers
-from multilift_marl.mdp.stage_kernels import compose_check, compose_plan, in_turn
+from multilift_marl.mdp.stage_kernels import bind_check, compose_plan
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Section
 from multilift_marl.sensing.measurement import Sensing
@@ -39,7 +39,6 @@ _HANDED_ON = (
 )  # fmt: skip
 """Attributes of a task that its kernels read and write as fields of the view."""
 FINAL_SECONDS = 2.0  # reported errors are means over these last seconds
-Call = Callable[[int, int], None]  # of environments lo to hi
 
 
 @inlined
@@ -372,29 +371,27 @@ class Task:
         """Return the stages of a step that are the task's kernels, each a call of (lo, hi)."""
         v, kernels, size = self.view, self.KERNELS, self.action.shape[2]
         extra, action = self.extra(self.config), self.config.control.action
-        observe = self._bind(compose_observation(extra, action), v, self.observation)
+        observe = bind_kernel(compose_observation(extra, action), v, self.observation)
         if self.config.env.units != "si":
             units = [part.unit for part in list_components(action, extra) for _ in range(part.size)]
             factors = 1 / observed_units(self.config, units)
             observe = in_turn(observe, prebind(scale_numbers, self.observation, factors))
         own = enumerate(self.own_failures().values(), FIRST_OWN)
         failures = {number: has_failed for number, has_failed in own if not is_plain(has_failed)}
-        check = compose_check(kernels.check, kernels.plan is None, failures, self.world.system.scenery.count > 0)
+        has_obstacles = self.world.system.scenery.count > 0
+        found: dict[str, Any] = {"check": kernels.check, "own": failures, "obstacles": has_obstacles}
         stages = {
-            "measure": self._bind(check, v._replace(nodes=None), 0.0),  # chains are placed later, by `World.load`
-            "check": self._bind(check, v, self.dt),
-            "reward": self._bind(
+            # In a reset time stands still, and chains are placed later, by `World.load`.
+            "measure": bind_check(v._replace(nodes=None), 0.0, **found, passed=0.0),
+            "check": bind_check(v, self.dt, **found, passed=self.dt if kernels.plan is None else 0.0),
+            "reward": bind_kernel(
                 compose_reward(self.REWARD, kernels.is_good, kernels.update), v, self.weights, self.margins
             ),
             "observe": observe,
         }
-        stages["observe state"] = self._bind(compose_state(self._state, kernels.preview, size), true, self.critic)
+        stages["observe state"] = bind_state(self._state, kernels.preview, true, self.critic, size)
         if self.numpy.plans:
             stages["plan"] = self.numpy.bind_approach()
         elif kernels.plan is not None:
-            stages["plan"] = self._bind(compose_plan(kernels.plan), v)
+            stages["plan"] = bind_kernel(compose_plan(kernels.plan), v)
         return stages
-
-    @staticmethod
-    def _bind(kernel: Callable[..., Any], view: View, *arguments: Any) -> Call:
-        return prebind(kernel, reduce_view(view, kernel), *arguments)

@@ -82,7 +82,7 @@ def unknown(e, v):
         ({"REWARD": {"odd": Term(1.0, mixed)}}, "add(float64, Literal[str](s)) (|test_declared.py|return v.time[e]"),
         ({"REWARD": {"odd": Term(1.0, unknown)}}, "'nowhere' is not defined"),
         ({"KERNELS": Kernels(update=misspelt)}, "'resting_tensions' of type View (|test_declared.py"),
-        ({"EXTRA": (OWN._replace(size=2),)}, "<observe |own[50 + 0], own[50 + 1] = mine_"),
+        ({"EXTRA": (OWN._replace(size=2),)}, "<observe |own[at + 0], own[at + 1] = mine_"),
     ],
 )
 def test_kernels_that_cannot_be_compiled_are_refused_in_a_sentence(registries, declared, words):
