@@ -86,7 +86,7 @@ def plan_weighted(given, settings, team, plans, work, recorded):
     t, tape = recorded
     for e in range(starts.shape[0]):
         prepare_team(e, given, (elapsed, h), flat, plans, work)
-        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, around.others)
+        here = Surroundings(e, around.obstacles, around.ahead, around.points, around.others)
         own = weigh(e, weights, objective)
         problem = Problem(work.targets, work.asked, h, flat.model, loads[e : e + 1], own, here)
         if tape.gain.shape[0] == 0:

@@ -18,7 +18,7 @@ from multilift_marl.planning.soft_limits import Surroundings, make_points
 from multilift_marl.planning.team_model import TeamModel, make_model, state_size, step_state
 from multilift_marl.rig.system import System
 from multilift_marl.schema.planner import PlannerConfig
-from multilift_marl.sim.obstacles import Obstacles, make_hulls
+from multilift_marl.sim.obstacles import Obstacles
 
 LIMIT_TOLERANCES = 0.03, 0.1  # of thrust over the thrust at rest [-], of separation [m]
 
@@ -71,8 +71,8 @@ def make_surroundings(
     """Return what the first team is to stay clear of; None: nothing."""
     if obstacles is None:
         obstacles = Obstacles.zeros(1, 0)
-    hulls, points = make_hulls(system), make_points(settings, system, model)
-    return Surroundings(0, obstacles, hulls, settings.delay, points, np.zeros((settings.steps + 1, 0, 4)))
+    points = make_points(settings, system, model)
+    return Surroundings(0, obstacles, settings.delay, points, np.zeros((settings.steps + 1, 0, 4)))
 
 
 class TeamPlanner:
@@ -168,7 +168,7 @@ def plan_teams(given, settings, team, plans, work):
     starts, loads, _ = given
     for e in range(starts.shape[0]):
         prepare_team(e, given, (elapsed, h), flat, plans, work)
-        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, around.others)
+        here = Surroundings(e, around.obstacles, around.ahead, around.points, around.others)
         problem = Problem(work.targets, work.asked, h, flat.model, loads[e : e + 1], objective, here)
         improve(e, starts[e], problem, iterations, plans, work)
 
