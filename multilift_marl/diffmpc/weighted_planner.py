@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.diffmpc.sensitivity import (
+    Adjoint,
     Gradient,
     Tape,
     pull_flight_back,
@@ -150,5 +151,6 @@ class FlightGradient:
         tape, planner = self.tape, self._planner
         used = tape._replace(inputs=tape.inputs[:, :-1].copy())
         around = planner.objective, planner.around
-        pull_flight_back(costs, self._times, self.weights, planner.model, around, used, self._work, self.gradient)
+        adjoint = Adjoint(used, self._work, self.gradient)
+        pull_flight_back(costs, self._times, self.weights, planner.model, around, adjoint)
         return self.gradient
