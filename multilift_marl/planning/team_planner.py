@@ -12,7 +12,15 @@ import numpy as np
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.physical import GRAVITY
-from multilift_marl.planning.flatness import SAMPLES, STEP, FlatWork, make_flat_team, set_flat_state, steady_shape
+from multilift_marl.planning.flatness import (
+    SAMPLES,
+    STEP,
+    FlatMotion,
+    FlatWork,
+    make_flat_team,
+    set_flat_state,
+    steady_shape,
+)
 from multilift_marl.planning.riccati import IterationWork, Objective, Problem, find_gains, take_step
 from multilift_marl.planning.soft_limits import Surroundings, make_points
 from multilift_marl.planning.team_model import TeamModel, make_model, state_size, step_state
@@ -198,7 +206,8 @@ def prepare_team(e, given, times, flat, plans, work):
     shape = shapes[min(e, shapes.shape[0] - 1)]
     for k in range(steps + 1):
         at = min(k, shape.shape[0] - 1)
-        set_flat_state(positions[e, k], rotations[e, k], shape[at], starts[e, 5], loads[e], flat, work.flat, targets[k])
+        motion = FlatMotion(positions[e, k], rotations[e, k], shape[at])
+        set_flat_state(motion, starts[e, 5], loads[e], flat, work.flat, targets[k])
     # Numbers of a state: 6 of the payload's pose, 2 N of the cables' directions, their rates, then 3 N of thrust.
     q = 6 + 2 * (nu // 3)
     for k in range(steps + 1):
