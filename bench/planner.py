@@ -26,7 +26,7 @@ from multilift_marl.config.load import load_config, parse_overrides
 from multilift_marl.diffmpc.weighted_planner import FlightGradient, WeightedPlanner
 from multilift_marl.planning.distributed_planner import DistributedPlanner
 from multilift_marl.planning.expert import TeamExpert
-from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
+from multilift_marl.planning.flatness import FlatMotion, FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.goals import pose_goal
 from multilift_marl.planning.riccati import IterationWork, Problem, find_gains, take_step
 from multilift_marl.planning.team_model import ModelWork, state_size, step_state
@@ -57,7 +57,7 @@ def measure(config: Config, repeats: int) -> tuple[np.ndarray, ...]:
     rest, still = np.zeros(state_size(n)), np.zeros(7)
     pose = np.tile([0.0, 0.0, 1.0], (5, 1)), np.tile(np.eye(3), (5, 1, 1))
     team = make_flat_team(planner.model, system)
-    set_flat_state(*pose, steady_shape(team), 0.0, still, team, FlatWork.of(n), rest)
+    set_flat_state(FlatMotion(*pose, steady_shape(team)), 0.0, still, team, FlatWork.of(n), rest)
     start = rest.copy()
     start[0] += 0.1
     states, inputs = np.tile(rest, (steps + 1, 1)), np.zeros((steps, 3 * n))

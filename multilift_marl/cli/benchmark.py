@@ -34,7 +34,7 @@ from multilift_marl.config.load import build_config, load_config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, reason
 from multilift_marl.evaluation.metrics import compare, format_card, summarize
-from multilift_marl.evaluation.parallel import cluster
+from multilift_marl.evaluation.parallel import Evaluation, cluster
 from multilift_marl.evaluation.shortfalls import explain
 from multilift_marl.evaluation.suites import BenchmarkTask, Suite, load_suite
 from multilift_marl.schema.values import Between, Int
@@ -223,11 +223,9 @@ def _fly(
     task: BenchmarkTask, teams: dict[str, _Contender], suite: Suite, episodes: int, options: Options
 ) -> dict[str, Any]:  # fmt: skip
     """Return the row of a task."""
+    evaluation = Evaluation(episodes, suite.seed, options.workers, task.factors)
     flown = {
-        label: fly(
-            team.config, team.make, f"{task.name}: {team.name}", episodes, suite.seed, options.workers, task.factors
-        )
-        for label, team in teams.items()
+        label: fly(team.config, team.make, f"{task.name}: {team.name}", evaluation) for label, team in teams.items()
     }
     causes = find_task(task.config.task).causes()
     return {

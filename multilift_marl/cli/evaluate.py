@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from multilift_marl.config.load import build_config, list_configs, load_config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError
 from multilift_marl.evaluation.metrics import format_reasons, format_table, make_report, write_report
-from multilift_marl.evaluation.parallel import cluster, evaluate_parallel
+from multilift_marl.evaluation.parallel import Evaluation, cluster, evaluate_parallel
 from multilift_marl.evaluation.rollout import Trace, run_episodes, trace_episode
 from multilift_marl.evaluation.trajectories import TrajectoryWriter
 from multilift_marl.policies.baselines import SCRIPTED, fitting_scripts
@@ -224,34 +224,31 @@ def _fly_all(
     config: Config, makers: dict[str, Any], team: _Team, options: Options, writer: TrajectoryWriter | None
 ) -> dict[str, dict[str, np.ndarray]]:
     """Return the metrics of each policy's episodes by name; record those of the team."""
+    evaluation = Evaluation(options.episodes, options.seed, options.workers)
     order = sorted(makers, key=lambda name: ":" not in name)  # one's own first: should they fail, nothing is lost
     with interrupted_by_signals(), ExitStack() as stack:
         if options.workers:
             stack.enter_context(cluster(options.ray, options.workers))
             stack.enter_context(interrupted_by_signals())  # in place of Ray's handler
         return {
-            name: fly(
-                config, makers[name], name, options.episodes, options.seed, options.workers,
-                writer=writer if name == team.name else None,
-            )
-            for name in order
-        }  # fmt: skip
+            name: fly(config, makers[name], name, evaluation, writer if name == team.name else None) for name in order
+        }
 
 
 def fly(
-    config: Config, maker: Any, name: str, episodes: int, seed: int, workers: int = 0,
-    factors: Mapping[str, Any] | None = None, writer: TrajectoryWriter | None = None,
-) -> dict[str, np.ndarray]:  # fmt: skip
+    config: Config, maker: Any, name: str, evaluation: Evaluation, writer: TrajectoryWriter | None = None
+) -> dict[str, np.ndarray]:
     """Do as `run_episodes`, or `evaluate_parallel` with workers, beside a bar with the name of what flies."""
     from tqdm import tqdm
 
+    episodes, seed, workers, factors = evaluation
     with tqdm(total=episodes, desc=name, unit="episode", leave=False) as bar:
 
         def progress(done: int) -> None:
             bar.update(done - bar.n)
 
         if workers:
-            return evaluate_parallel(config, maker, episodes, seed, workers, progress, factors, writer)
+            return evaluate_parallel(config, maker, evaluation, progress, writer)
         record = None if writer is None else writer.record
         return run_episodes(config, maker, episodes, seed, progress=progress, factors=factors, record=record)
 

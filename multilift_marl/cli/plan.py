@@ -15,7 +15,7 @@ from multilift_marl.command import CommandOptions, make_folder, run_command, spl
 from multilift_marl.config.load import load_config
 from multilift_marl.errors import ConfigError
 from multilift_marl.planning.feasibility import Feasibility, assess_path
-from multilift_marl.planning.path_file import load_path
+from multilift_marl.planning.path_file import PathFile, load_path
 from multilift_marl.planning.path_table import COLUMNS
 from multilift_marl.planning.team_model import has_model
 from multilift_marl.planning.waypoints import Keys, describe_violation, plan_waypoints, sample_rows
@@ -82,8 +82,8 @@ def _plan(values: dict[str, Any]) -> int:
     option = validate(TrackOptions, config.task_options, "task_options")
     refusal = ""
     if option.waypoints is None:
-        smoothing = option.file_spacing, option.file_ramp, option.file_offset
-        table = load_path(str(option.file), *smoothing, _WHOLE, system, ranges, "file")
+        file = PathFile(str(option.file), option.file_spacing, option.file_ramp, option.file_offset)
+        table = load_path(file, _WHOLE, system, ranges, "file")
         feasibility = assess_path(table, system, ranges)
     else:
         limits = option.speed, option.acceleration

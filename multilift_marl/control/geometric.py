@@ -8,6 +8,9 @@ of them, `fly_rates` begins at the body rates; `setpoints` prepares the referenc
 from __future__ import annotations
 
 from math import cos, sin
+from typing import NamedTuple
+
+import numpy as np
 
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.gains import drone_gains
@@ -31,6 +34,17 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.physical import GRAVITY
+
+
+class AttitudeCommand(NamedTuple):
+    """What the autopilots of E teams are asked for."""
+
+    attitude: np.ndarray
+    """(E, N, 3, 3) desired."""
+    rates: np.ndarray
+    """(E, N, 3) at which to turn to it, body frame [rad/s]."""
+    thrust: np.ndarray
+    """(E, N) of all rotors [N]."""
 
 
 @kernel
@@ -172,7 +186,7 @@ def thrust_along(force, attitude):
 
 
 @kernel
-def command_attitude(lo, hi, state, reference, cable_force, desired, rates, total, g):
+def command_attitude(lo, hi, state, reference, cable_force, command, g):
     """Compute attitudes, body rates and total thrusts by which drones follow their references, for autopilots.
 
     The rates are those at which the torque of eq 32 vanishes but for the gyroscopic part: Rᵀ R_d Ω_d - k_R/k_Ω e_R.
@@ -180,12 +194,10 @@ def command_attitude(lo, hi, state, reference, cable_force, desired, rates, tota
     Args:
         lo, hi: the environments.
         state, reference, cable_force, g: see `fly`.
-        desired: written, (E, N, 3, 3).
-        rates: written, (E, N, 3) body frame [rad/s].
-        total: written, (E, N) [N].
+        command: AttitudeCommand, written.
     """
     for e in range(lo, hi):
-        for n in range(total.shape[1]):
+        for n in range(command.thrust.shape[1]):
             d = drone_gains(g, n)
             attitude = mat(state.drone_rotation, e, n)
             force = following_force(e, n, state, reference, vec(cable_force, e, n), d)
@@ -194,10 +206,10 @@ def command_attitude(lo, hi, state, reference, cable_force, desired, rates, tota
             turning = desired_rates(frame, force, force_rate, reference.yaw[e, n], reference.yaw_rate[e, n])
             e_r, turning = attitude_error(attitude, frame, turning)
             for k in range(9):
-                desired[e, n, k // 3, k % 3] = frame[k]
+                command.attitude[e, n, k // 3, k % 3] = frame[k]
             for k in range(3):
-                rates[e, n, k] = turning[k] - d.k_R[k] / d.k_w[k] * e_r[k]
-            total[e, n] = thrust_along(force, attitude)
+                command.rates[e, n, k] = turning[k] - d.k_R[k] / d.k_w[k] * e_r[k]
+            command.thrust[e, n] = thrust_along(force, attitude)
 
 
 @kernel

@@ -21,7 +21,7 @@ import numpy as np
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.planning.newton import find_step
-from multilift_marl.planning.riccati import Problem, advance, linearise, pull_back
+from multilift_marl.planning.riccati import IterationWork, Problem, advance, linearise, pull_back
 from multilift_marl.planning.team_model import solve_factorised, state_size
 
 ACTIVE = 1e-9  # multiplier from which a limit counts as active, in costs by tolerances
@@ -100,6 +100,15 @@ class Gradient(NamedTuple):
             (num_envs, size), (steps, nu),
         )  # fmt: skip
         return cls(*(np.zeros(shape) for shape in shapes))
+
+
+class Adjoint(NamedTuple):
+    """What costs go back by: what the plans have left, arrays to work in, and the gradient that this gives."""
+
+    tape: Tape
+    work: IterationWork
+    """Of a plan of as many steps, or more."""
+    gradient: Gradient
 
 
 @kernel
@@ -188,7 +197,7 @@ def record_converged(t, e, path, task, m, w, tape):
 
 
 @kernel
-def pull_plan_back(t, e, slope, h, objective, tape, w, gradient):
+def pull_plan_back(t, e, slope, h, objective, adjoint):
     """Add to the gradient what slope·u gains by a plan's cost, u its first input.
 
     Args:
@@ -196,10 +205,9 @@ def pull_plan_back(t, e, slope, h, objective, tape, w, gradient):
         slope: (3 N,); overwritten.
         h: step of the plan [s].
         objective: state, end and rate: the weights (12 + 7 N,), (12 + 7 N,), (3 N,) of this plan.
-        tape: Tape.
-        w: IterationWork.
-        gradient: Gradient.
+        adjoint: Adjoint, whose gradient is added to.
     """
+    tape, w, gradient = adjoint
     weights, end, rate = objective
     nu, size, steps = slope.shape[0], weights.shape[0], tape.gain.shape[2]
     f, factor, moved = size - nu, tape.factor[t, e], w.force
@@ -246,7 +254,7 @@ def _add_thrusts(t, e, k, f, tape, moved, gradient):
 
 
 @kernel
-def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradient):
+def pull_flight_back(costs, times, weights, model, surroundings, adjoint):
     """Write the gradient of a flight's cost.
 
     Args:
@@ -255,10 +263,9 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
         weights: state and end (T, E, 12 + 7 N), and rate (T, E, 3 N) of the plans.
         model: TeamModel.
         surroundings: Objective and Surroundings, which do not count.
-        tape: Tape.
-        w: IterationWork of a plan of as many steps, or more.
-        gradient: Gradient, overwritten.
+        adjoint: Adjoint, whose gradient is overwritten.
     """
+    tape, w, gradient = adjoint
     dt, h, response, lead = times
     stiff = response / dt
     state, end, rate = weights
@@ -300,6 +307,6 @@ def pull_flight_back(costs, times, weights, model, surroundings, tape, w, gradie
                 for j in range(nu):
                     before[i] += tape.gain[t, e, 0, j, i] * slope[j]
                 costate[i] = before[i] + costs[e, t, i]
-            pull_plan_back(t, e, slope, h, (state[t, e], end[t, e], rate[t, e]), tape, w, gradient)
+            pull_plan_back(t, e, slope, h, (state[t, e], end[t, e], rate[t, e]), adjoint)
         for i in range(size):
             gradient.starts[e, i] = costate[i]

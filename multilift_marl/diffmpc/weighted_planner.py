@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from multilift_marl.diffmpc.sensitivity import (
+    Adjoint,
     Gradient,
     Tape,
     pull_flight_back,
@@ -86,7 +87,7 @@ def plan_weighted(given, settings, team, plans, work, recorded):
     t, tape = recorded
     for e in range(starts.shape[0]):
         prepare_team(e, given, (elapsed, h), flat, plans, work)
-        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, around.others)
+        here = Surroundings(e, around.obstacles, around.ahead, around.points, around.others)
         own = weigh(e, weights, objective)
         problem = Problem(work.targets, work.asked, h, flat.model, loads[e : e + 1], own, here)
         if tape.gain.shape[0] == 0:
@@ -150,5 +151,6 @@ class FlightGradient:
         tape, planner = self.tape, self._planner
         used = tape._replace(inputs=tape.inputs[:, :-1].copy())
         around = planner.objective, planner.around
-        pull_flight_back(costs, self._times, self.weights, planner.model, around, used, self._work, self.gradient)
+        adjoint = Adjoint(used, self._work, self.gradient)
+        pull_flight_back(costs, self._times, self.weights, planner.model, around, adjoint)
         return self.gradient

@@ -39,7 +39,7 @@ def obstacle_corners(boxes: Iterable[Box], hulls: np.ndarray) -> tuple[np.ndarra
 
     Args:
         boxes: what stands around, see `Task.scenery`.
-        hulls: see `sim.obstacles.make_hulls`.
+        hulls: `Obstacles.vertices`.
     """
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros(_SIDES), np.ones(_SIDES)

@@ -42,20 +42,14 @@ def cluster(address: str, workers: int) -> Iterator[None]:
             _ray.disconnect()
 
 
-class _Job(NamedTuple):
-    """What all parts of an evaluation have in common."""
+class Evaluation(NamedTuple):
+    """Which episodes a policy flies, and by how many processes; see `run_episodes`."""
 
-    values: dict[str, Any]
-    """Configuration."""
+    episodes: int
     seed: int
-    factors: Mapping[str, Any] | None
-    """See `run_episodes`."""
-    folder: str
-    """Working directory of the process that asks."""
-    path: list[str]
-    """Its `sys.path`."""
-    records: bool
-    """Whether trajectories are returned."""
+    workers: int = 0
+    """Processes of Ray; 0: none but this one."""
+    factors: Mapping[str, Any] | None = None
 
 
 def divide_episodes(episodes: int, workers: int, most: int) -> list[tuple[int, int]]:
@@ -65,9 +59,8 @@ def divide_episodes(episodes: int, workers: int, most: int) -> list[tuple[int, i
 
 
 def evaluate_parallel(
-    config: Config, make_policy: Callable[[MultiliftVec], Policy], episodes: int, seed: int, workers: int,
-    progress: Callable[[int], Any] | None = None, factors: Mapping[str, Any] | None = None,
-    writer: TrajectoryWriter | None = None,
+    config: Config, make_policy: Callable[[MultiliftVec], Policy], evaluation: Evaluation,
+    progress: Callable[[int], Any] | None = None, writer: TrajectoryWriter | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Do as `run_episodes`, by actors of Ray, to which this process is connected; the metrics are the same.
 
@@ -79,10 +72,11 @@ def evaluate_parallel(
     import ray
     from ray import cloudpickle
 
-    parts = divide_episodes(episodes, workers, _PART if writer is None else _RECORDED)
+    workers = evaluation.workers
+    parts = divide_episodes(evaluation.episodes, workers, _PART if writer is None else _RECORDED)
     values = build_config(config.model_dump(), {"env.num_threads": 1}).model_dump(mode="json")
     # Once for all parts, and by value: what makes the policy may be a function of a script or a closure.
-    task = ray.put(cloudpickle.dumps((values, make_policy, seed, factors, writer is not None)))
+    task = ray.put(cloudpickle.dumps((values, make_policy, evaluation, writer is not None)))
     crew = [_idle.pop() if _idle else _Worker() for _ in parts[:workers]]
     waiting, flown, head = list(parts), dict[int, dict[str, np.ndarray]](), _ray.Head()
     try:
@@ -198,16 +192,19 @@ def _fly_part(task: bytes, first: int, count: int) -> tuple[dict[str, np.ndarray
     """Fly some episodes; return their metrics, and trajectories where these are asked for.
 
     Args:
-        task: pickled configuration values, maker of the policy, seed, factors and whether trajectories are asked for.
+        task: pickled configuration values, maker of the policy, Evaluation and whether trajectories are asked for.
         first, count: number of the first episode, and how many.
     """
     from ray import cloudpickle
 
-    values, make_policy, seed, factors, records = cloudpickle.loads(task)
+    values, make_policy, evaluation, records = cloudpickle.loads(task)
     config = build_config(values, {})
     # Where the policy has brought torch along; others need not wait for its import.
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
     arrays = make_arrays(MultiliftVec(build_config(values, {"env.num_envs": 1})), count) if records else {}
     record = partial(Recording, arrays) if records else None
-    return run_episodes(config, make_policy, count, seed, first=first, factors=factors, record=record), arrays
+    flown = run_episodes(
+        config, make_policy, count, evaluation.seed, first=first, factors=evaluation.factors, record=record
+    )
+    return flown, arrays

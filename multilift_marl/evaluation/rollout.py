@@ -279,7 +279,7 @@ class Tracer:
         if self._surface is None:
             self._surface = payload_surface(vec.world.system)
         surface = self._surface @ state.payload_rotation[0].T + state.payload_position[0]
-        obstacles = obstacle_corners(task.scenery(0), task.view.hulls)
+        obstacles = obstacle_corners(task.scenery(0), vec.world.obstacles.vertices)
         self._end = tuple(vec.world.cable_points(0, n) for n in range(vec.num_drones)), surface, obstacles
         self._rows.append(
             (

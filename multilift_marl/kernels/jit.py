@@ -20,6 +20,7 @@ from multilift_marl.kernels.compiler import Kernel, make_cache
 
 _UNCOMPILED: bool = config.DISABLE_JIT  # type: ignore[attr-defined]
 FORMER_FIELDS = {
+    "hulls": "obstacles.vertices",
     "load": "payload_estimate",
     "loads": "disturbances",
     "nominal": "rig",
@@ -27,7 +28,7 @@ FORMER_FIELDS = {
     "seen_errors": "estimated_errors",
     "true_load": "payload",
 }
-"""Fields of `mdp.env_data.View` by their names before 0.2."""
+"""Fields of `mdp.env_data.View` by their former names."""
 F = TypeVar("F", bound=Callable[..., Any])
 Arguments = TypeVarTuple("Arguments")
 

@@ -124,8 +124,6 @@ class View(NamedTuple):
     min_separation: np.ndarray
     """(E,) smallest distance between drones in the episode [m]."""
     obstacles: Obstacles
-    hulls: np.ndarray
-    """(H, V, 3) vertices of obstacles from their middles, see `obstacles.make_hulls` [m]."""
     obstacle_readings: np.ndarray | None
     """(E, N, P) what drones observe of obstacles, see `sensing/obstacle_sensing.py` [m]; None if nothing."""
     nodes: Nodes | None

@@ -26,7 +26,7 @@ from multilift_marl.math3d import (
 from multilift_marl.rig.resolve import MIN_SEPARATION
 from multilift_marl.rig.system import System
 from multilift_marl.sim.contact import drone_half_size
-from multilift_marl.sim.obstacle_distance import least_clearance
+from multilift_marl.sim.obstacle_distance import TeamBodies, least_clearance
 from multilift_marl.sim.obstacles import count_hulls
 
 CAUSES = (
@@ -84,7 +84,7 @@ class Limits(NamedTuple):
     payload_round: bool
     """Whether it is a cylinder."""
     payload_hull: int
-    """Row of `sim.obstacles.make_hulls` with the vertices of a mesh's hull from its geometric centre, else -1."""
+    """Row of `Obstacles.vertices` with the vertices of a mesh's hull from its geometric centre, else -1."""
     drone_half: np.ndarray
     """(N, 3) half edges of a drone [m]."""
     distance: float
@@ -185,7 +185,8 @@ def find_cause(e, v):
 @inlined
 def find_obstacle(e, v):
     """Return OBSTACLE if anything of environment e touches an obstacle, else 0; update the clearance [m]."""
-    clearance = least_clearance(e, v.state, v.rig, v.limits, v.mask.lost, v.nodes, v.obstacles, v.hulls, SIGHT)
+    team = TeamBodies(v.state, v.rig, v.limits, v.mask.lost)
+    clearance = least_clearance(e, team, v.nodes, v.obstacles, SIGHT)
     v.clearance[e] = clearance
     v.min_clearance[e] = min(v.min_clearance[e], clearance)
     return OBSTACLE if clearance < TOUCH and _counts(OBSTACLE, v.mask.ignored[e]) else 0

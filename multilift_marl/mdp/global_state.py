@@ -123,14 +123,14 @@ def cable_tension(e, n, v):
 def payload_obstacle(e, n, v):
     """From the payload to the nearest point of an obstacle."""
     place = row(v.state.payload_position, e)
-    return sub(nearest_point(e, place, NO_OBSTACLE, v.obstacles, v.hulls), place)
+    return sub(nearest_point(e, place, NO_OBSTACLE, v.obstacles), place)
 
 
 @inlined
 def drone_obstacle(e, n, v):
     """From a drone to the nearest point of an obstacle."""
     place = vec(v.state.drone_position, e, n)
-    return sub(nearest_point(e, place, NO_OBSTACLE, v.obstacles, v.hulls), place)
+    return sub(nearest_point(e, place, NO_OBSTACLE, v.obstacles), place)
 
 
 STATE = (  # global state of a critic: what belongs to no drone, hidden quantities among it

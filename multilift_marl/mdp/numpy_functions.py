@@ -8,7 +8,8 @@ environment first. Kernels stay what they are without them, so that nothing new 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -22,12 +23,17 @@ from multilift_marl.mdp.failures import FIRST_OWN
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import Term
 from multilift_marl.mdp.stage_kernels import Ahead, approach
+from multilift_marl.sim.obstacles import Obstacles
 from multilift_marl.sim.world import World
 
 Call = Callable[[int, int], None]  # of environments lo to hi
 GOAL_FIELDS = {"position": (3,), "rotation": (3, 3), "velocity": (3,), "acceleration": (3,)}
 """Fields of a goal that a function may return, the environment first; velocity and acceleration are 0 without it."""
-_SHARED = ("rig", "rig_numbers", "nominal", "resting_tension", "limits", "integral_limit", "settings")
+_SHARED = {
+    View: ("rig", "rig_numbers", "resting_tension", "limits", "integral_limit", "settings"),
+    Obstacles: ("vertices",),
+}
+"""Fields of named tuples that belong to no environment."""
 _ROUNDING = 1e-9  # relative, of what is computed with more or fewer environments
 _turn = getattr(turn, "py_func", turn)  # of arrays
 
@@ -35,25 +41,25 @@ _turn = getattr(turn, "py_func", turn)  # of arrays
 class ArrayView:
     """What a NumPy function gets: the fields of `View`, read-only arrays of environments lo to hi, made when asked for.
 
-    What belongs to no environment (`rig`, `nominal`, `resting_tension`, `limits`, `settings`, ...) is whole.
+    What belongs to no environment (`rig`, `resting_tension`, `limits`, `settings`, ...) is whole.
 
     Args:
         record: View, or a named tuple in it.
         rows: lo to hi.
-        shared: fields that are whole.
     """
 
-    def __init__(self, record: Any, rows: Any, shared: Container[str] = ()):
+    def __init__(self, record: Any, rows: Any):
         # Past `__setattr__`, which refuses everything.
-        vars(self).update(_record=record, _rows=rows, _shared=shared)
+        vars(self).update(_record=record, _rows=rows)
 
     def __getattr__(self, name: str) -> Any:
         # Copies ask for names before there is a `_record`: to search for that would lead here again, for ever.
         if name.startswith("_"):
             raise AttributeError(name)
-        if isinstance(self._record, View):
-            name = FORMER_FIELDS.get(name, name)
-        value = _freeze(getattr(self._record, name), ... if name in self._shared else self._rows)
+        if isinstance(self._record, View) and name in FORMER_FIELDS:
+            return attrgetter(FORMER_FIELDS[name])(self)
+        shared = name in _SHARED.get(type(self._record), ())
+        value = _freeze(getattr(self._record, name), ... if shared else self._rows)
         # Kept as an attribute: the next look-up does not come here.
         vars(self)[name] = value
         return value
@@ -144,7 +150,7 @@ class NumpyFunctions:
         self._factors, self._weights = factors, task.weights
         self._compared = set[str]()
         every = slice(0, task.world.num_envs)
-        known, all_true = (task.view, ArrayView(task.view, every, _SHARED)), (true, ArrayView(true, every, _SHARED))
+        known, all_true = (task.view, ArrayView(task.view, every)), (true, ArrayView(true, every))
         plan = task.KERNELS.plan
         self._goal = _Function("KERNELS.plan", plan, *known, GOAL_FIELDS) if plan and is_plain(plan) else None
         self._ahead = Ahead(*(np.zeros((task.world.num_envs, *shape)) for shape in (*GOAL_FIELDS.values(), ())))
@@ -226,7 +232,7 @@ class NumpyFunctions:
         """Return what a function returns for environments lo to hi, by field; at its first call for all, compared."""
         count = len(self._diverged)
         if hi - lo < count:
-            return self._call(function, ArrayView(function.record, slice(lo, hi), _SHARED), lo, hi)
+            return self._call(function, ArrayView(function.record, slice(lo, hi)), lo, hi)
         values = self._call(function, function.whole, lo, hi)
         if count > 1 and function.what not in self._compared:
             self._compared.add(function.what)

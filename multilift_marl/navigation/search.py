@@ -82,6 +82,15 @@ class SearchWork(NamedTuple):
     """(H,) int32 of the heap."""
 
 
+class Search(NamedTuple):
+    """A search: its states, the team and the obstacles, and its arrays."""
+
+    lattice: Lattice
+    body: TeamBody
+    scene: Scene
+    work: SearchWork
+
+
 def make_lattice(
     start: np.ndarray, goal: np.ndarray, space: np.ndarray, step: np.ndarray, body: TeamBody, shapes: FormationShapes,
     clearance: tuple[float, float],
@@ -140,10 +149,11 @@ def search_route(
         key=np.empty(max(8 * cells, 24 * most) + 64),
         state=np.empty(max(8 * cells, 24 * most) + 64, np.int32),
     )
-    measure_way(lattice, body, scene, work)
+    search = Search(lattice, body, scene, work)
+    measure_way(search)
     cell = np.rint((start[:3] - lattice.low) / lattice.step).astype(np.int64)
     first = (cell[0] * lattice.counts[1] + cell[1]) * lattice.counts[2] + cell[2]
-    last, expanded = expand_states(int(first) * YAWS * len(lattice.arms) + shape, lattice, body, scene, work, most)
+    last, expanded = expand_states(int(first) * YAWS * len(lattice.arms) + shape, search, most)
     if last < 0:
         return np.zeros(0, np.int64), expanded
     way = [last]
@@ -200,8 +210,9 @@ def pop(work, size):
 
 
 @kernel
-def measure_way(lattice, body, scene, work):
+def measure_way(search):
     """Write the payload's way from each cell to the goal (Dijkstra), `UNKNOWN` where there is none."""
+    lattice, body, scene, work = search
     # How close each cell is to obstacles.
     count, step = lattice.counts, lattice.step
     thinnest = min(body.half[0], body.half[1], body.half[2]) + lattice.clearance[0]
@@ -259,8 +270,9 @@ def _payload_fits(cell, far, lattice, body, scene):
 
 
 @kernel
-def check_state(state, lattice, body, scene, work):
+def check_state(state, search):
     """Return the clearance of a state [m], measured once."""
+    lattice, body, scene, work = search
     if not work.status[state] & MEASURED:
         work.status[state] |= MEASURED
         shapes = lattice.arms.shape[0]
@@ -289,8 +301,9 @@ def still_ahead(cell, yaw, shape, lattice, work):
 
 
 @kernel
-def reach_state(state, other, length, lattice, body, scene, work, size):
+def reach_state(state, other, length, search, size):
     """Let a way lead from a state to another if that is free, and the best to it so far; return the heap's new size."""
+    lattice, body, scene, work = search
     status = work.status[other]
     if status & CLOSED or (status & REACHED and work.cost[state] + length >= work.cost[other]):
         return size
@@ -298,7 +311,7 @@ def reach_state(state, other, length, lattice, body, scene, work, size):
     cell, yaw, shape = other // (YAWS * shapes), other // shapes % YAWS, other % shapes
     if work.ahead[cell] >= UNKNOWN:
         return size
-    clear = check_state(other, lattice, body, scene, work)
+    clear = check_state(other, search)
     if clear < lattice.clearance[0]:
         return size
     # A thin obstacle may be between two states whose clearances do not overlap.
@@ -319,14 +332,15 @@ def reach_state(state, other, length, lattice, body, scene, work, size):
 
 
 @kernel
-def expand_states(first, lattice, body, scene, work, most):
+def expand_states(first, search, most):
     """Expand states from the first in order of cost and heuristic; return the goal's, or -1, and how many."""
+    lattice, work = search.lattice, search.work
     count, step = lattice.counts, lattice.step
     shapes = lattice.arms.shape[0]
     across, layer = count[2], count[1] * count[2]
     work.cost[first], work.parent[first] = 0.0, -1
     work.status[first] |= REACHED
-    check_state(first, lattice, body, scene, work)
+    check_state(first, search)
     size, expanded = push(work, 0, 0.0, first), 0
     while size > 0 and expanded < most:
         state, size = pop(work, size)
@@ -349,14 +363,14 @@ def expand_states(first, lattice, body, scene, work, most):
                     other = ((u * layer + v * across + w) * YAWS + yaw) * shapes + shape
                     length = sqrt((i * step[0]) ** 2 + (j * step[1]) ** 2 + (CLIMB * k * step[2]) ** 2)
                     if length > 0.0:
-                        size = reach_state(state, other, length, lattice, body, scene, work, size)
+                        size = reach_state(state, other, length, search, size)
 
         # to the next yaws and shapes
         for turned in range(-1, 2, 2):
             other = (cell * YAWS + (yaw + turned) % YAWS) * shapes + shape
-            size = reach_state(state, other, TURN * 2.0 * pi / YAWS, lattice, body, scene, work, size)
+            size = reach_state(state, other, TURN * 2.0 * pi / YAWS, search, size)
         for form in range(shapes):
             if lattice.linked[shape, form]:
                 other = (cell * YAWS + yaw) * shapes + form
-                size = reach_state(state, other, 0.5 * RESHAPE, lattice, body, scene, work, size)
+                size = reach_state(state, other, 0.5 * RESHAPE, search, size)
     return -1, expanded

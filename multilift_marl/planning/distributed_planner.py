@@ -266,7 +266,7 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
     q, later = 6 + 2 * count, links.delay * elapsed / h
     for e in range(post.steps.shape[0]):
         first, kept = e * count, post.sent.shape[1]
-        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, apart.others)
+        here = Surroundings(e, around.obstacles, around.ahead, around.points, apart.others)
         begins = plans.fresh[first]
         if begins:
             post.steps[e] = 0

@@ -21,6 +21,7 @@ from multilift_marl.planning.augmented_lagrangian import CONVERGED, STATUS
 from multilift_marl.planning.flatness import (
     SAMPLES,
     STEP,
+    FlatMotion,
     FlatWork,
     make_flat_team,
     set_flat_state,
@@ -246,7 +247,7 @@ class TeamExpert:
 def _set_rest(motion, load, flat, w, states):
     positions, rotations, shape = motion
     for e in range(states.shape[0]):
-        set_flat_state(positions[e], rotations[e], shape, 0.0, load, flat, w, states[e])
+        set_flat_state(FlatMotion(positions[e], rotations[e], shape), 0.0, load, flat, w, states[e])
 
 
 def _of_each(name: str, values: np.ndarray, count: int, shape: tuple[int, ...]) -> np.ndarray:

@@ -16,6 +16,7 @@ from multilift_marl.planning.flatness import (
     MIN_LIFT,
     SAMPLES,
     STEP,
+    FlatMotion,
     FlatTeam,
     FlatWork,
     make_flat_team,
@@ -168,7 +169,7 @@ def write_motion(poses, load, team, work, x, motion):
     positions, rotations, shape = poses
     count = team.force.shape[0]
     for t in range(positions.shape[0]):
-        set_flat_state(positions[t], rotations[t], shape, 0.0, load, team, work, x)
+        set_flat_state(FlatMotion(positions[t], rotations[t], shape), 0.0, load, team, work, x)
         thrust = x[12 + 4 * count :]
         for n in range(count):
             put(motion.thrust[t, n], (thrust[3 * n], thrust[3 * n + 1], thrust[3 * n + 2]))

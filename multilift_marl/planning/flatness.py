@@ -79,26 +79,36 @@ class FlatWork(NamedTuple):
         return cls(np.zeros((3, num_drones, 3)), np.zeros((3, num_drones, 3)))
 
 
+class FlatMotion(NamedTuple):
+    """How a team moves about a state: five poses of its payload, `FlatTeam.step` apart, and its formation's shape."""
+
+    position: np.ndarray
+    """(5, 3) of the payload [m]."""
+    rotation: np.ndarray
+    """(5, 3, 3) its attitude there."""
+    shape: np.ndarray
+    """(3, N, 3) nominal forces of the cables on the resting payload at the three poses in the middle, its heading
+    frame [N]."""
+
+
 @kernel
-def set_flat_state(position, rotation, shape, yaw, load, team, w, x):
-    """Write the state (12 + 7 N,) of a team whose payload moves so.
+def set_flat_state(motion, yaw, load, team, w, x):
+    """Write the state (12 + 7 N,) of a team that moves so.
 
     Args:
-        position: (5, 3) of the payload, `team.step` apart [m].
-        rotation: (5, 3, 3) its attitude there.
-        shape: (3, N, 3) nominal forces of the cables on the resting payload at the three poses in the middle, its
-            heading frame [N].
+        motion: FlatMotion.
         yaw: which the state's yaw is near to [rad]: it may exceed π.
         load: (7,) other force, moment and mass of the payload, see `team_model.accelerations`.
         team: FlatTeam.
         w: FlatWork.
         x: written.
     """
+    position, rotation, shape = motion
     count, step = shape.shape[1], team.step
     q = 6 + 2 * count
     # At the three poses in the middle: forces and places there are differentiated in turn.
     for i in range(3):
-        _place_team(i, position, rotation, shape, load, team, w)
+        _place_team(i, motion, load, team, w)
     middle = _matrix(rotation, 2)
     put(x[0:3], row(position, 2))
     roll, pitch, turned = euler_angles(middle)
@@ -141,8 +151,9 @@ def _turned(rotation, i, j):
 
 
 @kernel
-def _place_team(i, position, rotation, shape, load, team, w):
+def _place_team(i, motion, load, team, w):
     """Write cable forces and places of the drones at pose i + 1 of five."""
+    position, rotation, shape = motion
     model, step = team.model, team.step
     here, attitude = row(position, i + 1), _matrix(rotation, i + 1)
     velocity = scale(0.5 / step, sub(row(position, i + 2), row(position, i)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import ceil, isfinite, pi
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,17 +27,26 @@ _MIN_WEIGHT = 0.1  # [-] of gravity that the payload must still hang by when it 
 _SAMPLES = 8  # of each piece of the spline, where it is checked
 
 
+class PathFile(NamedTuple):
+    """A file and how its path is read."""
+
+    reference: str
+    """Of the file, see `pin_file`."""
+    spacing: float
+    """Least time between the rows that the path passes through [s]."""
+    ramp: float
+    """In which the target gathers its speed, and loses it [s]; 0: as written."""
+    offset: tuple[float, float, float]
+    """Added to each position [m]."""
+
+
 def load_path(
-    reference: str, spacing: float, ramp: float, offset: tuple[float, float, float], seconds: float, system: System,
-    ranges: RandomizationConfig, key: str = KEY,
-) -> np.ndarray:  # fmt: skip
+    file: PathFile, seconds: float, system: System, ranges: RandomizationConfig, key: str = KEY
+) -> np.ndarray:
     """Return the spline (K, 13) of a file; see `thin_rows`, `ramp_rows` and `fit_spline`.
 
     Args:
-        reference: of the file, see `pin_file`.
-        spacing: least time between the rows that it passes through [s].
-        ramp: in which the target gathers its speed, and loses it [s]; 0: as written.
-        offset: added to each position (3,) [m].
+        file: and how it is read.
         seconds: that an episode takes.
         system, ranges: the team that is to fly it and what its episodes draw.
         key: that the file was given by, for messages.
@@ -44,8 +54,9 @@ def load_path(
     Raises:
         ConfigError: no such file, not the table that is expected, or a path that the team cannot fly.
     """
-    rows, source = read_rows(reference, key), f"{key}={reference.partition('#')[0]}"
-    rows[:, 1:4] += offset
+    spacing, ramp = file.spacing, file.ramp
+    rows, source = read_rows(file.reference, key), f"{key}={file.reference.partition('#')[0]}"
+    rows[:, 1:4] += file.offset
     _check_times(source, rows, seconds)
     if (count := len(_keep_rows(rows[:, 0], spacing))) > MAX_ROWS:
         raise ConfigError(

@@ -42,8 +42,6 @@ class Surroundings(NamedTuple):
 
     env: int
     obstacles: Obstacles
-    hulls: np.ndarray
-    """See `obstacle_distance.py`."""
     ahead: float
     """[s] of the plan's start, from the time at which they are so."""
     points: TeamPoints
@@ -217,7 +215,7 @@ def _add_clearance(m, pose, arm, sphere, problem, w):
     around, lever = problem.around, w.lever
     cable = sub(row(w.place, n), mul(attitude, row(problem.model.anchors, n)))
     point = add(middle, add(mul(attitude, arm), scale(share, cable)))
-    distance, nearest = point_distance(around.env, m, point, around.obstacles, around.hulls)
+    distance, nearest = point_distance(around.env, m, point, around.obstacles)
     short = around.points.clearance + radius - distance
     if short <= 0.0 or abs(distance) < 1e-9:
         return

@@ -12,13 +12,21 @@ import numpy as np
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.physical import GRAVITY
-from multilift_marl.planning.flatness import SAMPLES, STEP, FlatWork, make_flat_team, set_flat_state, steady_shape
+from multilift_marl.planning.flatness import (
+    SAMPLES,
+    STEP,
+    FlatMotion,
+    FlatWork,
+    make_flat_team,
+    set_flat_state,
+    steady_shape,
+)
 from multilift_marl.planning.riccati import IterationWork, Objective, Problem, find_gains, take_step
 from multilift_marl.planning.soft_limits import Surroundings, make_points
 from multilift_marl.planning.team_model import TeamModel, make_model, state_size, step_state
 from multilift_marl.rig.system import System
 from multilift_marl.schema.planner import PlannerConfig
-from multilift_marl.sim.obstacles import Obstacles, make_hulls
+from multilift_marl.sim.obstacles import Obstacles
 
 LIMIT_TOLERANCES = 0.03, 0.1  # of thrust over the thrust at rest [-], of separation [m]
 
@@ -71,8 +79,8 @@ def make_surroundings(
     """Return what the first team is to stay clear of; None: nothing."""
     if obstacles is None:
         obstacles = Obstacles.zeros(1, 0)
-    hulls, points = make_hulls(system), make_points(settings, system, model)
-    return Surroundings(0, obstacles, hulls, settings.delay, points, np.zeros((settings.steps + 1, 0, 4)))
+    points = make_points(settings, system, model)
+    return Surroundings(0, obstacles, settings.delay, points, np.zeros((settings.steps + 1, 0, 4)))
 
 
 class TeamPlanner:
@@ -168,7 +176,7 @@ def plan_teams(given, settings, team, plans, work):
     starts, loads, _ = given
     for e in range(starts.shape[0]):
         prepare_team(e, given, (elapsed, h), flat, plans, work)
-        here = Surroundings(e, around.obstacles, around.hulls, around.ahead, around.points, around.others)
+        here = Surroundings(e, around.obstacles, around.ahead, around.points, around.others)
         problem = Problem(work.targets, work.asked, h, flat.model, loads[e : e + 1], objective, here)
         improve(e, starts[e], problem, iterations, plans, work)
 
@@ -198,7 +206,8 @@ def prepare_team(e, given, times, flat, plans, work):
     shape = shapes[min(e, shapes.shape[0] - 1)]
     for k in range(steps + 1):
         at = min(k, shape.shape[0] - 1)
-        set_flat_state(positions[e, k], rotations[e, k], shape[at], starts[e, 5], loads[e], flat, work.flat, targets[k])
+        motion = FlatMotion(positions[e, k], rotations[e, k], shape[at])
+        set_flat_state(motion, starts[e, 5], loads[e], flat, work.flat, targets[k])
     # Numbers of a state: 6 of the payload's pose, 2 N of the cables' directions, their rates, then 3 N of thrust.
     q = 6 + 2 * (nu // 3)
     for k in range(steps + 1):

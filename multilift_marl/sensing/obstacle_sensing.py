@@ -25,7 +25,7 @@ from multilift_marl.mdp.observations import NO_OBSTACLE, count_readings
 from multilift_marl.rig.resolve import whole_ratio
 from multilift_marl.rng import normal_pair, normal_vector
 from multilift_marl.sim.obstacle_distance import point_distance, ray_distance
-from multilift_marl.sim.obstacles import NONE, Obstacles, make_hulls
+from multilift_marl.sim.obstacles import NONE, Obstacles
 from multilift_marl.sim.state import SystemState
 from multilift_marl.sim.world import World
 
@@ -71,6 +71,19 @@ class ObstacleReadings(NamedTuple):
     """(E, K, N, k, 3) as `placed`, held as `held`."""
 
 
+class DronePoses(NamedTuple):
+    """Where the drones of E teams are, and where they take themselves to be."""
+
+    position: np.ndarray
+    """(E, N, 3) true [m]."""
+    rotation: np.ndarray
+    """(E, N, 3, 3) true."""
+    own_position: np.ndarray
+    """(E, N, 3) as they know it [m]."""
+    own_rotation: np.ndarray
+    """(E, N, 3, 3) as they know it."""
+
+
 class ObstacleSensing:
     """The sensors of obstacles of E teams.
 
@@ -107,11 +120,10 @@ class ObstacleSensing:
             np.zeros(placed), np.zeros(placed), np.zeros((e, sensor.delay + 1, *placed[1:])),
         )  # fmt: skip
         distances = np.zeros((e, n, max(sensor.points, 1)))
-        drones = world.state.drone_position, world.state.drone_rotation
-        known = own.drone_position, own.drone_rotation
-        obstacles = _needed(world.obstacles), make_hulls(world.system)
+        true = world.state
+        drones = DronePoses(true.drone_position, true.drone_rotation, own.drone_position, own.drone_rotation)
         self.sense: Callable[[int, int], None] = prebind(
-            sense_obstacles, *drones, *known, *obstacles, sensor, self.readings, distances
+            sense_obstacles, drones, _needed(world.obstacles), sensor, self.readings, distances
         )
 
     def start(self, env: int, seed: np.random.SeedSequence) -> None:
@@ -126,22 +138,19 @@ class ObstacleSensing:
 
 def _needed(obstacles: Obstacles) -> Obstacles:
     """Return the obstacles with None in place of what distances do not need: kernels compile faster."""
-    needed = ("kind", "size", "rotation", "position", "hull")
+    needed = ("kind", "size", "rotation", "position", "hull", "vertices")
     unknown = {name: None for name in Obstacles._fields if name not in needed}
     return obstacles._replace(**unknown)  # type: ignore[arg-type]
 
 
 @kernel
-def sense_obstacles(
-    lo, hi, position, rotation, own_position, own_rotation, obstacles, hulls, sensor, readings, distances
-):
+def sense_obstacles(lo, hi, drones, obstacles, sensor, readings, distances):
     """Measure in environments lo to hi where it is time, and observe what was measured `delay` steps ago.
 
     Args:
         lo, hi: the environments.
-        position, rotation: of the drones, true (E, N, 3) [m], (E, N, 3, 3).
-        own_position, own_rotation: as they know them.
-        obstacles, hulls: see `sim.obstacle_distance`.
+        drones: DronePoses.
+        obstacles: Obstacles.
         sensor: ObstacleSensor.
         readings: ObstacleReadings, written.
         distances: (E, N, k) [m], written.
@@ -150,16 +159,16 @@ def sense_obstacles(
         now = readings.steps[e]
         count = readings.held.shape[1]
         then = now - min(sensor.delay, now)  # at first the first
-        for n in range(position.shape[1]):
+        for n in range(drones.position.shape[1]):
             latest = readings.latest[e, n]
             if now % sensor.period == 0:
-                drone, yaw = vec(position, e, n), heading(mat(rotation, e, n))
+                drone, yaw = vec(drones.position, e, n), heading(mat(drones.rotation, e, n))
                 if sensor.points > 0:
-                    _find_points(e, drone, yaw, obstacles, hulls, sensor, latest, distances[e, n])
+                    _find_points(e, drone, yaw, obstacles, sensor, latest, distances[e, n])
                     _blur_points(e, sensor, readings, latest, distances[e, n])
-                    _place_points(e, n, own_position, own_rotation, readings)
+                    _place_points(e, n, drones, readings)
                 else:
-                    _measure_ranges(e, drone, yaw, obstacles, hulls, sensor, latest)
+                    _measure_ranges(e, drone, yaw, obstacles, sensor, latest)
                     _blur_ranges(e, sensor, readings, latest)
             # Held before it is read: without delay it is the present itself.
             for k in range(latest.shape[0]):
@@ -169,34 +178,34 @@ def sense_obstacles(
                 put(readings.held_placed[e, now % count, n, j], vec(readings.latest_placed[e], n, j))
                 put(readings.placed[e, n, j], vec(readings.held_placed[e, then % count], n, j))
             if sensor.delay > 0 or sensor.period > 1:
-                _move_points(e, n, own_position, own_rotation, sensor, readings)
+                _move_points(e, n, drones, sensor, readings)
         readings.steps[e] = now + 1
 
 
 @kernel
-def _place_points(e, n, own_position, own_rotation, readings):
+def _place_points(e, n, drones, readings):
     """Write where the points of the last measurement are in the world, as the drone knows itself."""
-    yaw = heading(mat(own_rotation, e, n))
+    yaw = heading(mat(drones.own_rotation, e, n))
     c, s = cos(yaw), sin(yaw)
     for j in range(readings.latest_placed.shape[2]):
         measured = readings.latest[e, n, 3 * j : 3 * j + 3]
         point = turn(c, s, (measured[0], measured[1], measured[2]))
-        put(readings.latest_placed[e, n, j], add(vec(own_position, e, n), point))
+        put(readings.latest_placed[e, n, j], add(vec(drones.own_position, e, n), point))
 
 
 @kernel
-def _move_points(e, n, own_position, own_rotation, sensor, readings):
+def _move_points(e, n, drones, sensor, readings):
     """Observe points where they are now, seen from where the drone knows itself to be, if they do not move."""
-    yaw = heading(mat(own_rotation, e, n))
+    yaw = heading(mat(drones.own_rotation, e, n))
     c, s = cos(yaw), sin(yaw)
     for j in range(readings.placed.shape[2]):
         observed = readings.observed[e, n, 3 * j : 3 * j + 3]
         if observed[0] != 0.0 or observed[1] != 0.0 or observed[2] != sensor.range:  # something is seen
-            put(observed, turn(c, -s, sub(vec(readings.placed[e], n, j), vec(own_position, e, n))))
+            put(observed, turn(c, -s, sub(vec(readings.placed[e], n, j), vec(drones.own_position, e, n))))
 
 
 @kernel
-def _find_points(e, drone, yaw, obstacles, hulls, sensor, points, distances):
+def _find_points(e, drone, yaw, obstacles, sensor, points, distances):
     """Write the nearest points (3 k) in the heading frame, nearest first, and their distances (k), inf where none is.
 
     What is not seen is straight above at the sensor's range.
@@ -209,7 +218,7 @@ def _find_points(e, drone, yaw, obstacles, hulls, sensor, points, distances):
     for m in range(obstacles.kind.shape[1]):
         if obstacles.kind[e, m] == NONE:
             continue
-        distance, nearest = point_distance(e, m, drone, obstacles, hulls)
+        distance, nearest = point_distance(e, m, drone, obstacles)
         if distance > sensor.range or distance >= distances[last]:
             continue
         point = turn(c, -s, sub(nearest, drone))
@@ -237,7 +246,7 @@ def _blur_points(e, sensor, readings, points, distances):
 
 
 @kernel
-def _measure_ranges(e, drone, yaw, obstacles, hulls, sensor, ranges):
+def _measure_ranges(e, drone, yaw, obstacles, sensor, ranges):
     """Write the lengths of the beams until they meet an obstacle, at most the range."""
     for b in range(ranges.shape[0]):
         ranges[b] = sensor.range
@@ -255,7 +264,7 @@ def _measure_ranges(e, drone, yaw, obstacles, hulls, sensor, ranges):
             along = offset[0] * direction[0] + offset[1] * direction[1]
             across = offset[1] * direction[0] - offset[0] * direction[1]
             if abs(across) <= radius and along >= -radius:
-                ranges[b] = min(ranges[b], ray_distance(e, m, drone, direction, obstacles, hulls))
+                ranges[b] = min(ranges[b], ray_distance(e, m, drone, direction, obstacles))
 
 
 @kernel

@@ -1,12 +1,14 @@
 """How far obstacles are: from points, along rays, from drones, cables and the payload.
 
-Obstacle m of environment e is given by its row of `Obstacles`; `hulls` (H, V, 3) are the vertices of hulls from the
-middles of their boxes, in their own frames [m]. Rows of kind NONE are infinitely far.
+Obstacle m of environment e is given by its row of `Obstacles`. Rows of kind NONE are infinitely far.
 """
 
 from __future__ import annotations
 
 from math import hypot, inf, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import (
@@ -25,16 +27,29 @@ from multilift_marl.math3d import (
     unit,
     vec,
 )
+from multilift_marl.rig.constants import RigArrays
 from multilift_marl.sim.gjk import nearest_within, separation
 from multilift_marl.sim.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE
+from multilift_marl.sim.state import SystemState
 
 _GRAZE = 1e-6  # [m] from a hull, where a ray has met it
 _ADVANCES = 64  # of a ray towards a hull
 _NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # half edges of a point
 
 
+class TeamBodies(NamedTuple):
+    """The bodies of E teams: where they are, how large, and which of them count."""
+
+    state: SystemState
+    rig: RigArrays
+    limits: Any
+    """`mdp.failures.Limits`, the bodies' half edges."""
+    lost: np.ndarray
+    """(E, N) bool, drones that count no more, nor do their cables."""
+
+
 @kernel
-def point_distance(e, m, point, obstacles, hulls):
+def point_distance(e, m, point, obstacles):
     """Return the signed distance of a point from an obstacle and the nearest point of its surface, world frame [m].
 
     Inside it is negative, to the nearest face; inside a HULL it is zero, and the nearest point is the point itself.
@@ -44,7 +59,8 @@ def point_distance(e, m, point, obstacles, hulls):
         return inf, point
     middle, attitude, half = vec(obstacles.position, e, m), mat(obstacles.rotation, e, m), vec(obstacles.size, e, m)
     if kind == HULL:
-        offset = separation((BOX, point, _NOTHING, 0), (HULL, middle, attitude, obstacles.hull[e, m]), hulls, inf)
+        hull = HULL, middle, attitude, obstacles.hull[e, m]
+        offset = separation((BOX, point, _NOTHING, 0), hull, obstacles.vertices, inf)
         return norm(offset), sub(point, offset)
     local = tmul(attitude, sub(point, middle))
     distance, normal = local_distance(kind, half, local)
@@ -52,11 +68,11 @@ def point_distance(e, m, point, obstacles, hulls):
 
 
 @kernel
-def nearest_point(e, point, most, obstacles, hulls):
+def nearest_point(e, point, most, obstacles):
     """Return the point of an obstacle's surface that is nearest to a point; `most` [m] above it if none is nearer."""
     found, least = add(point, (0.0, 0.0, most)), most
     for m in range(obstacles.kind.shape[1]):
-        distance, nearest = point_distance(e, m, point, obstacles, hulls)
+        distance, nearest = point_distance(e, m, point, obstacles)
         if distance < least:
             found, least = nearest, distance
     return found
@@ -96,7 +112,7 @@ def local_distance(kind, size, p):
 
 
 @kernel
-def ray_distance(e, m, origin, direction, obstacles, hulls):
+def ray_distance(e, m, origin, direction, obstacles):
     """Return how far a ray along a unit vector is from an obstacle [m]: inf where it misses, 0 from inside."""
     kind = obstacles.kind[e, m]
     if kind == NONE:
@@ -104,7 +120,7 @@ def ray_distance(e, m, origin, direction, obstacles, hulls):
     attitude, half = mat(obstacles.rotation, e, m), vec(obstacles.size, e, m)
     local, along = tmul(attitude, sub(origin, vec(obstacles.position, e, m))), tmul(attitude, direction)
     if kind == HULL:
-        return _ray_to_hull(e, m, origin, direction, obstacles, hulls)
+        return _ray_to_hull(e, m, origin, direction, obstacles)
     if kind == SPHERE:
         begin, end = _between(1.0, dot(local, along), dot(local, local) - half[0] * half[0])
     else:
@@ -143,12 +159,12 @@ def _between(a, b, c):
 
 
 @kernel
-def _ray_to_hull(e, m, origin, direction, obstacles, hulls):
+def _ray_to_hull(e, m, origin, direction, obstacles):
     """Return how far a ray is from a HULL: from plane to plane that separates it from what is left of the ray."""
     length = 0.0
     for _ in range(_ADVANCES):
         point = add(origin, scale(length, direction))
-        distance, nearest = point_distance(e, m, point, obstacles, hulls)
+        distance, nearest = point_distance(e, m, point, obstacles)
         if distance <= _GRAZE:
             return length
         offset = sub(nearest, point)
@@ -161,10 +177,10 @@ def _ray_to_hull(e, m, origin, direction, obstacles, hulls):
 
 
 @kernel
-def segment_distance_to(e, m, a, b, obstacles, hulls):
+def segment_distance_to(e, m, a, b, obstacles):
     """Return the distance of the segment a b, a cable, from an obstacle [m]; 0 if they touch."""
     middle, axes = _segment(a, b)
-    return body_distance_to(e, m, (BOX, middle, axes, 0), obstacles, hulls, inf)
+    return body_distance_to(e, m, (BOX, middle, axes, 0), obstacles, inf)
 
 
 @kernel
@@ -175,7 +191,7 @@ def _segment(a, b):
 
 
 @kernel
-def box_distance_to(e, m, center, frame, half, obstacles, hulls):
+def box_distance_to(e, m, center, frame, half, obstacles):
     """Return the distance of a box, a drone, from an obstacle [m]; 0 if they touch.
 
     Args:
@@ -183,15 +199,15 @@ def box_distance_to(e, m, center, frame, half, obstacles, hulls):
         center: of the box, world frame [m].
         frame: its attitude, 9 numbers.
         half: its half edges [m].
-        obstacles, hulls: see the module.
+        obstacles: Obstacles.
     """
-    return body_distance_to(e, m, (BOX, center, _stretch(frame, half), 0), obstacles, hulls, inf)
+    return body_distance_to(e, m, (BOX, center, _stretch(frame, half), 0), obstacles, inf)
 
 
 @kernel
-def cylinder_distance_to(e, m, center, frame, half, obstacles, hulls):
+def cylinder_distance_to(e, m, center, frame, half, obstacles):
     """Do as `box_distance_to` for an upright cylinder of radius `half[0]` and half height `half[2]` [m]."""
-    return body_distance_to(e, m, (CYLINDER, center, _stretch(frame, half), 0), obstacles, hulls, inf)
+    return body_distance_to(e, m, (CYLINDER, center, _stretch(frame, half), 0), obstacles, inf)
 
 
 @kernel
@@ -205,7 +221,7 @@ def _stretch(frame, half):
 
 
 @kernel
-def body_distance_to(e, m, body, obstacles, hulls, beyond):
+def body_distance_to(e, m, body, obstacles, beyond):
     """Return the distance of a BOX, CYLINDER or HULL from an obstacle [m], 0 if they touch; see `gjk.separation`."""
     other = obstacles.kind[e, m]
     if other == NONE:
@@ -213,31 +229,30 @@ def body_distance_to(e, m, body, obstacles, hulls, beyond):
     place, attitude, half = vec(obstacles.position, e, m), mat(obstacles.rotation, e, m), vec(obstacles.size, e, m)
     kind, middle, axes, _ = body
     if other == SPHERE and kind == HULL:
-        return max(norm(separation(body, (BOX, place, _NOTHING, 0), hulls, beyond + half[0])) - half[0], 0.0)
+        offset = separation(body, (BOX, place, _NOTHING, 0), obstacles.vertices, beyond + half[0])
+        return max(norm(offset) - half[0], 0.0)
     if other == SPHERE:
         offset = sub(place, middle)
         return max(norm(sub(offset, nearest_within(kind, axes, offset))) - half[0], 0.0)
     if other != HULL:
         attitude = _stretch(attitude, half)
-    return norm(separation(body, (other, place, attitude, obstacles.hull[e, m]), hulls, beyond))
+    return norm(separation(body, (other, place, attitude, obstacles.hull[e, m]), obstacles.vertices, beyond))
 
 
 @kernel
-def least_clearance(e, state, rig, limits, lost, nodes, obstacles, hulls, within):
+def least_clearance(e, team, nodes, obstacles, within):
     """Return the least distance of drones, cables and payload from obstacles [m]: 0 if any touch, at most `within`.
 
     Broken cables are left out, of chains their link at the drone.
 
     Args:
         e: the environment.
-        state: SystemState.
-        rig: RigArrays.
-        limits: `mdp.failures.Limits`, the bodies' half edges.
-        lost: (E, N) bool, drones that count no more, nor do their cables.
-        nodes: of chains (`World.nodes`), or None.
-        obstacles, hulls: see the module.
+        team: TeamBodies.
+        nodes: of chains (`World.nodes`), or None: an argument, so that Numba leaves their branch out then.
+        obstacles: Obstacles.
         within: beyond it distances are not sought, which is quick [m]; inf: any.
     """
+    state, rig, limits, lost = team
     least = within
     payload, attitude = row(state.payload_position, e), matrow(state.payload_rotation, e)
     # The payload, whose middle is off its centre of mass.
@@ -246,40 +261,34 @@ def least_clearance(e, state, rig, limits, lost, nodes, obstacles, hulls, within
     kind, hull = (CYLINDER if limits.payload_round else BOX), 0
     if limits.payload_hull >= 0:
         kind, axes, hull = HULL, attitude, limits.payload_hull
-    least = _clearance(e, (kind, middle, axes, hull), norm(half), obstacles, hulls, least)
+    least = _clearance(e, (kind, middle, axes, hull), norm(half), obstacles, least)
     for n in range(state.drone_position.shape[1]):
         if lost[e, n]:
             continue
         drone, frame = vec(state.drone_position, e, n), mat(state.drone_rotation, e, n)
         box = row(limits.drone_half, n)
-        least = _clearance(e, (BOX, drone, _stretch(frame, box), 0), norm(box), obstacles, hulls, least)
+        least = _clearance(e, (BOX, drone, _stretch(frame, box), 0), norm(box), obstacles, least)
         # Its cable, from anchor to hook; of a chain link by link.
         begin, end = add(payload, mul(attitude, row(rig.anchors, n))), add(drone, mul(frame, row(rig.hooks, n)))
         if nodes is not None:
             for k in range(rig.cable_segments[n] - 1):
                 node = vec(nodes.position[e], n, k)
-                least = _cable_clearance(e, begin, node, obstacles, hulls, least)
+                least = _cable_clearance(e, begin, node, obstacles, least)
                 begin = node
         if not state.cable_broken[e, n]:
-            least = _cable_clearance(e, begin, end, obstacles, hulls, least)
+            least = _cable_clearance(e, begin, end, obstacles, least)
     return least
 
 
 @kernel
-def find_touch(e, state, rig, limits, lost, nodes, obstacles, hulls):
-    """Return whether a drone, a cable or the payload touches an obstacle; arguments as of `least_clearance`."""
-    return least_clearance(e, state, rig, limits, lost, nodes, obstacles, hulls, _GRAZE) == 0.0
-
-
-@kernel
-def _cable_clearance(e, a, b, obstacles, hulls, least):
+def _cable_clearance(e, a, b, obstacles, least):
     """Return the distance of the segment a b from the nearest obstacle, if it is less than `least` [m]."""
     middle, axes = _segment(a, b)
-    return _clearance(e, (BOX, middle, axes, 0), norm(column(axes, 0)), obstacles, hulls, least)
+    return _clearance(e, (BOX, middle, axes, 0), norm(column(axes, 0)), obstacles, least)
 
 
 @kernel
-def _clearance(e, body, radius, obstacles, hulls, least):
+def _clearance(e, body, radius, obstacles, least):
     """Return the distance of a body within `radius` [m] from the nearest obstacle, if it is less than `least` [m]."""
     _, middle, _, _ = body
     for m in range(obstacles.kind.shape[1]):
@@ -301,5 +310,5 @@ def _clearance(e, body, radius, obstacles, hulls, least):
         )
         if x * x + y * y + z * z >= reach * reach:
             continue
-        least = min(least, body_distance_to(e, m, body, obstacles, hulls, least))
+        least = min(least, body_distance_to(e, m, body, obstacles, least))
     return least

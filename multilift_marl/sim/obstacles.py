@@ -50,7 +50,9 @@ class Obstacles(NamedTuple):
     clock: np.ndarray
     """(E,) t, since `World.load` [s]."""
     hull: np.ndarray
-    """(E, M) int64, row of `make_hulls` with a HULL's vertices."""
+    """(E, M) int64, row of `vertices` of a HULL."""
+    vertices: np.ndarray
+    """(H, V, 3) of hulls from the middles of their boxes, in their own frames, see `make_hulls`; fixed [m]."""
 
     @classmethod
     def zeros(cls, num_envs: int, count: int) -> Obstacles:
@@ -69,12 +71,14 @@ class Obstacles(NamedTuple):
             phase=np.zeros(shape),
             clock=np.zeros(num_envs),
             hull=np.zeros(shape, np.int64),
+            vertices=np.zeros((0, 1, 3)),
         )
 
 
-def make_obstacles(scenery: Scenery, num_envs: int) -> Obstacles:
+def make_obstacles(system: System, num_envs: int) -> Obstacles:
     """Return the rows of E environments: those of the configuration, then free ones for the task."""
-    made = Obstacles.zeros(num_envs, scenery.count)
+    scenery = system.scenery
+    made = Obstacles.zeros(num_envs, scenery.count)._replace(vertices=make_hulls(system))
     hulls = 0
     for m, each in enumerate(scenery.obstacles):
         made.kind[:, m], made.size[:, m], made.rotation[:, m] = each.kind, each.size, each.rotation

@@ -124,7 +124,7 @@ class World:
         self.air = Air.zeros(num_envs, self.num_drones)
         self._pushing = make_pushes(system, num_envs)
         self.pushes: Pushes | None = None if self._pushing is None else self._pushing[0]
-        self.obstacles = make_obstacles(system.scenery, num_envs)
+        self.obstacles = make_obstacles(system, num_envs)
         self.stats = EpisodeStats.zeros(num_envs)
         self.diverged = np.zeros(num_envs, bool)
         self.breakable = bool(np.isfinite(system.breaking_load).any())
@@ -314,7 +314,7 @@ class World:
         saved = {
             f"{prefix}.{name}": array.copy()
             for prefix, group in self._groups().items()
-            for name, array in group._asdict().items()
+            for name, array in group.items()
         }
         saved["rows"] = np.concatenate([shard.batch.state for shard in self.shards])
         saved["warning"] = np.concatenate([shard.batch.warning for shard in self.shards])
@@ -334,7 +334,7 @@ class World:
         parameters = {name: saved[f"parameters.{name}"] for name in Parameters._fields}
         self.set_parameters(np.ones(self.num_envs, bool), **parameters)
         for prefix, group in self._groups().items():
-            for name, array in group._asdict().items():
+            for name, array in group.items():
                 array[:] = saved[f"{prefix}.{name}"]
         for shard in self.shards:
             shard.batch.state[:] = saved["rows"][shard.lo : shard.hi]
@@ -344,10 +344,13 @@ class World:
                 shard.obstacles.load(np.ones(shard.hi - shard.lo, bool))
         self.diverged[:] = saved["diverged"]
 
-    def _groups(self) -> dict[str, Any]:
+    def _groups(self) -> dict[str, dict[str, np.ndarray]]:
         names = ("state", "hidden_loads", "parameters", "air", "stats", "nodes", "pushes")
-        groups = {name: group for name in names if (group := getattr(self, name)) is not None}
-        return groups | ({"obstacles": self.obstacles} if self.system.scenery.count else {})
+        groups = {name: group._asdict() for name in names if (group := getattr(self, name)) is not None}
+        if self.system.scenery.count:
+            groups["obstacles"] = self.obstacles._asdict()
+            del groups["obstacles"]["vertices"]  # of the configuration, and of no environment
+        return groups
 
     def _sync_broken(self, shard: Shard) -> None:
         """Bring the shard's models into line with `state.cable_broken`."""

@@ -26,7 +26,7 @@ from multilift_marl.mdp.stage_kernels import bind_check, compose_plan
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Section
 from multilift_marl.sensing.measurement import Sensing
-from multilift_marl.sim.obstacles import make_hulls, restart_obstacles
+from multilift_marl.sim.obstacles import restart_obstacles
 from multilift_marl.sim.parameters import Parameters
 from multilift_marl.sim.saved import flatten
 from multilift_marl.sim.world import World
@@ -192,7 +192,6 @@ class Task:
             good_time=self.good_time,
             min_separation=self.min_separation,
             obstacles=world.obstacles,
-            hulls=make_hulls(system),
             obstacle_readings=sensing.obstacles.readings.observed if sensing.obstacles else None,
             nodes=world.nodes,
             clearance=self.clearance,

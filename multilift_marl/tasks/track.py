@@ -18,7 +18,7 @@ from multilift_marl.mdp.failures import least_height
 from multilift_marl.mdp.initial_states import in_ball, set_equilibrium
 from multilift_marl.mdp.observations import Component, target_velocity
 from multilift_marl.mdp.rewards import Term, action_rate, attitude, distance, failure, tolerance, velocity
-from multilift_marl.planning.path_file import load_path
+from multilift_marl.planning.path_file import PathFile, load_path
 from multilift_marl.planning.paths import (
     CIRCLE,
     FIGURE8,
@@ -313,8 +313,8 @@ class Track(Task):
         check_paths(option, seconds, world.system)
         table, team = NO_FILE, (world.system, self.config.randomization)
         if option.file:
-            smoothing = option.file_spacing, option.file_ramp, option.file_offset
-            table = load_path(option.file, *smoothing, seconds, *team)
+            file = PathFile(option.file, option.file_spacing, option.file_ramp, option.file_offset)
+            table = load_path(file, seconds, *team)
         elif option.waypoints:
             limits = option.speed, option.acceleration
             table = load_waypoints(option.waypoints, option.waypoint_times, *limits, seconds, *team)

@@ -189,8 +189,9 @@ def test_an_evaluation_does_a_part_again_where_a_process_is_stopped_or_dies(loca
             crew[0].send_signal(number)
 
     with parallel.cluster("local", 2):
-        flown = parallel.evaluate_parallel(config, make, 12, 5, 2, hurt_one)
-        again = parallel.evaluate_parallel(config, make, 12, 5, 2)  # by the same processes
+        evaluation = parallel.Evaluation(12, 5, workers=2)
+        flown = parallel.evaluate_parallel(config, make, evaluation, hurt_one)
+        again = parallel.evaluate_parallel(config, make, evaluation)  # by the same processes
     whole = run_episodes(config, make, 12, 5)
     for name, values in whole.items():
         np.testing.assert_array_equal(flown[name], values, err_msg=name)
@@ -205,7 +206,7 @@ def test_a_part_that_ends_every_process_is_refused_in_a_sentence(local_ray):
         os.kill(os.getpid(), signal.SIGKILL)
 
     with pytest.raises(ConfigError, match=r"the worker of episodes 0 to 1 died 3 times in a row; .*workers=0"):
-        parallel.evaluate_parallel(load_config("hover"), make, 2, 5, 1)
+        parallel.evaluate_parallel(load_config("hover"), make, parallel.Evaluation(2, 5, workers=1))
 
 
 @pytest.mark.slow

@@ -328,7 +328,7 @@ def test_markers_of_obstacles_are_where_rays_meet_them(tmp_path):
     static = [m for m in heard["/scene"][0][1].markers if m.ns == "scenery"]
     moving = [m for m in heard["/markers"][-1][1].markers if m.ns == "scenery"]
     assert len(static) == len(moving) == 4
-    obstacles, hulls, world = vec.world.obstacles, vec.task.view.hulls, {"world": (np.zeros(3), np.eye(3))}
+    obstacles, world = vec.world.obstacles, {"world": (np.zeros(3), np.eye(3))}
     assert place(static[2].pose.position)[0] == 0.0 and abs(place(moving[2].pose.position)[0]) > 0.3
     rng, met = np.random.default_rng(0), 0
     for k in range(120):
@@ -336,7 +336,7 @@ def test_markers_of_obstacles_are_where_rays_meet_them(tmp_path):
         way = rng.standard_normal(3)
         way /= np.linalg.norm(way)
         origin = obstacles.position[0, m] - 3.0 * way + 0.2 * rng.standard_normal(3)
-        expected = ray_distance(0, m, tuple(origin), tuple(way), obstacles, hulls)
+        expected = ray_distance(0, m, tuple(origin), tuple(way), obstacles)
         found = hit(moving[m], world, origin, way)
         met += np.isfinite(found)
         assert found == pytest.approx(expected, abs=2e-5)

@@ -35,7 +35,7 @@ from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.live import LiveFlight
 from multilift_marl.deploy.ros.messages import ODOMETRY, POSE, FlightMessages
 from multilift_marl.deploy.ros.policy_node import FLYING, PolicyNode
-from multilift_marl.deploy.ros.types import FULL_STATE, NAMED_POSES, read_measurement, typestore
+from multilift_marl.deploy.ros.types import FULL_STATE, NAMED_POSES, PX4Setpoint, read_measurement, typestore
 
 DOMAIN = 180 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 PUBLISHED = {  # IMRCLab/crazyswarm2 at f6154e2, IMRCLab/motion_capture_tracking at 35adc3e
@@ -67,7 +67,7 @@ def hover(vec, wire, live, places, carried: float, yaw: float = 0.0, steps: int 
     for _ in range(steps):
         for n in range(2):
             rise = carried * load.acceleration(n, np.zeros(3), np.zeros(3), vec.task.goal.cable_force[0, n], yaw)
-            message = full_state(wire.store, 0, places[n], np.zeros(3), rise, yaw)
+            message = full_state(wire.store, 0, PX4Setpoint(places[n], np.zeros(3), rise, yaw, 0.0))
             wire.queues[f"/cf{n + 1}/cmd_full_state"].append(message)
         live.step()
 
@@ -90,7 +90,7 @@ def test_types_are_those_that_are_published(distribution, kind):
 def test_bytes_are_those_of_a_full_state():
     """CDR by hand: header of 4 bytes, stamp, text with its length and final zero, then numbers of 8 bytes."""
     rise, yaw = np.array([0.7, 0.8, 0.9]), np.pi / 2
-    message = full_state(Wire.store, 5_000_000_007, MOTION[0], MOTION[2], rise, yaw, 0.25)
+    message = full_state(Wire.store, 5_000_000_007, PX4Setpoint(MOTION[0], MOTION[2], rise, yaw, 0.25))
     data = bytes(Wire.store.serialize_cdr(message, FULL_STATE))
     assert data[:4] == b"\0\1\0\0"
     assert struct.unpack_from("<iII6s", data, 4) == (5, 7, 6, b"world\0")
@@ -228,7 +228,7 @@ def test_a_full_state_moves_on_and_turns_between_set_points():
     vec, wire, live = make_team()
     start, speed = vec.task.goal.slots[0].copy(), np.array([0.0, 0.1, 0.4])
     for n in range(2):
-        message = full_state(wire.store, 0, start[n], speed, np.array([0.0, 0.0, 4.0]), 0.3, 0.25)
+        message = full_state(wire.store, 0, PX4Setpoint(start[n], speed, np.array([0.0, 0.0, 4.0]), 0.3, 0.25))
         wire.queues[f"/cf{n + 1}/cmd_full_state"].append(message)
     for _ in range(6):
         live.step()
@@ -244,8 +244,9 @@ def test_a_full_state_moves_on_and_turns_between_set_points():
 @pytest.mark.parametrize("part", ["position", "orientation", "linear", "angular", "acc"])
 def test_malformed_full_states_are_left_out(part, value):
     vec, wire, live = make_team()
-    good = full_state(wire.store, 0, vec.task.goal.slots[0, 0], np.zeros(3), np.zeros(3), 0.0)
-    bad = full_state(wire.store, 0, np.full(3, 9.0), np.zeros(3), np.zeros(3), 0.0)
+    still = np.zeros(3), np.zeros(3), 0.0, 0.0
+    good = full_state(wire.store, 0, PX4Setpoint(vec.task.goal.slots[0, 0], *still))
+    bad = full_state(wire.store, 0, PX4Setpoint(np.full(3, 9.0), *still))
     inside = {"position": bad.pose, "orientation": bad.pose, "acc": bad}.get(part, bad.twist)
     getattr(inside, part).y = value
     wire.queues["/cf1/cmd_full_state"] += [good, bad, wire.encode("/cf1/cmd_full_state", good)[:-9], b""]
@@ -257,7 +258,7 @@ def test_malformed_full_states_are_left_out(part, value):
 
 def test_no_message_ends_the_simulation_of_crazyflies():
     def ask(position):
-        return full_state(Wire.store, 0, position, np.zeros(3), np.array([0.0, 0.0, 3.0]), 0.3)
+        return full_state(Wire.store, 0, PX4Setpoint(position, np.zeros(3), np.array([0.0, 0.0, 3.0]), 0.3, 0.0))
 
     fuzz_simulation("crazyswarm2", {f"/cf{n}/cmd_full_state": ask for n in (1, 2)})
 

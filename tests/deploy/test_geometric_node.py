@@ -58,7 +58,7 @@ class Bench:
         self.wire.queues[f"{px4_namespace(i)}/out/vehicle_odometry"].append(message)
 
     def ask(self, i: int, time_ns: int, *motion, **more) -> None:
-        message = trajectory_setpoint(self.wire.store, time_ns, *motion, **more)
+        message = trajectory_setpoint(self.wire.store, time_ns, PX4Setpoint(*motion, **more))
         self.wire.queues[f"/drone_{i + 1}/trajectory_setpoint"].append(message)
 
     def sent(self, i: int, kind: str = "vehicle_attitude_setpoint_v1") -> list:

@@ -28,6 +28,7 @@ from multilift_marl.deploy.ros.policy_node import FLYING, HOLDING, LANDING
 from multilift_marl.deploy.ros.types import (
     ATTITUDE,
     FULL_STATE,
+    PX4Setpoint,
     px4_namespace,
     read_measurement,
     read_odometry,
@@ -111,9 +112,8 @@ def test_numbers_that_nothing_measures_are_left_out(part, value):
 
 def test_an_axis_that_is_not_controlled_leaves_the_others_alone():
     nan = np.nan
-    message = trajectory_setpoint(
-        Wire.store, 0, np.array([nan, nan, 3.0]), np.array([1.0, 2.0, nan]), np.array([nan, 5.0, 6.0]), nan
-    )
+    asked = PX4Setpoint(np.array([nan, nan, 3.0]), np.array([1.0, 2.0, nan]), np.array([nan, 5.0, 6.0]), nan)
+    message = trajectory_setpoint(Wire.store, 0, asked)
     setpoint = read_trajectory(message)
     np.testing.assert_array_equal(setpoint.position, [nan, nan, 3.0])
     np.testing.assert_array_equal(setpoint.velocity, [1.0, 2.0, nan])
@@ -226,7 +226,7 @@ def place_message(position):
 
 
 def motion_message(position):
-    return trajectory_setpoint(Wire.store, 0, position, np.zeros(3), np.array([0.0, 0.0, 3.0]), 0.3)
+    return trajectory_setpoint(Wire.store, 0, PX4Setpoint(position, np.zeros(3), np.array([0.0, 0.0, 3.0]), 0.3))
 
 
 def attitude_message(position):

@@ -20,6 +20,7 @@ from multilift_marl.deploy.ros.stages import Stage
 from multilift_marl.deploy.ros.types import (
     ATTITUDE,
     TRAJECTORY,
+    PX4Setpoint,
     local_position,
     px4_namespace,
     read_attitude,
@@ -56,7 +57,7 @@ class Team:
         return self.load.acceleration(n, np.zeros(3), np.zeros(3), self.vec.task.goal.cable_force[0, n], 0.0)
 
     def say(self, n: int, position=NAN, velocity=NAN, acceleration=NAN, yaw=np.nan) -> None:
-        message = trajectory_setpoint(self.wire.store, 0, position, velocity, acceleration, yaw)
+        message = trajectory_setpoint(self.wire.store, 0, PX4Setpoint(position, velocity, acceleration, yaw))
         self.wire.queues[f"{px4_namespace(n)}/in/trajectory_setpoint"].append(message)
 
     def step(self, count: int = 1) -> None:
@@ -216,14 +217,15 @@ def test_frames_without_north_are_no_measurement(field, frame):
 
 
 def test_headings_are_from_north_clockwise():
-    message = trajectory_setpoint(Wire.store, 5_000, np.array([1.0, 2.0, 3.0]), NAN, NAN, 0.0)  # looks east
+    east = PX4Setpoint(np.array([1.0, 2.0, 3.0]), NAN, NAN, 0.0)
+    message = trajectory_setpoint(Wire.store, 5_000, east)
     assert message.timestamp == 5 and message.yaw == pytest.approx(np.pi / 2)
     np.testing.assert_array_equal(message.position, np.array([2, 1, -3], np.float32))
 
 
 def test_bytes_are_those_of_px4s_messages():
     """CDR by hand: 4 bytes of header, a time of 8 bytes, then numbers of 4 each."""
-    message = trajectory_setpoint(Wire.store, 7_000, np.array([1.0, 2.0, 3.0]), NAN, NAN, 0.0)
+    message = trajectory_setpoint(Wire.store, 7_000, PX4Setpoint(np.array([1.0, 2.0, 3.0]), NAN, NAN, 0.0))
     data = bytes(Wire.store.serialize_cdr(message, TRAJECTORY))
     assert data[:4] == b"\0\1\0\0" and int.from_bytes(data[4:12], "little") == 7
     numbers = np.frombuffer(data[12:], "<f4")

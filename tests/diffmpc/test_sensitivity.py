@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
-from multilift_marl.diffmpc.sensitivity import Gradient, Tape, pull_plan_back, record, record_thrusts
+from multilift_marl.diffmpc.sensitivity import Adjoint, Gradient, Tape, pull_plan_back, record, record_thrusts
 from multilift_marl.diffmpc.weighted_planner import FlightGradient, WeightedHardPlanner, WeightedPlanner
 from multilift_marl.planning.expert import TeamExpert
 from multilift_marl.planning.riccati import IterationWork, Problem, find_gains, take_step
@@ -64,7 +64,8 @@ def test_derivatives_of_an_iteration_are_differences_of_it(expert):
     assert (tape.pushing > 0).sum() > 10
     assert (abs(tape.beyond).max(axis=-1) > 0).sum() > 10
     v = np.random.default_rng(1).normal(size=9)
-    pull_plan_back(0, 0, v.copy(), STEP, (objective.state, objective.end, objective.rate), tape, w, gradient)
+    weights = objective.state, objective.end, objective.rate
+    pull_plan_back(0, 0, v.copy(), STEP, weights, Adjoint(tape, w, gradient))
 
     def change(name, at):
         values = []

@@ -7,7 +7,7 @@ import pytest
 from conftest import make_system
 
 from multilift_marl.planning.distributed_planner import DistributedPlanner, set_others, take_own
-from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
+from multilift_marl.planning.flatness import FlatMotion, FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.force_estimator import PAYLOAD, make_priors
 from multilift_marl.planning.plan_messages import believe, hear, said_at
 from multilift_marl.planning.team_model import ModelWork, accelerations, make_model, move_to_middle, state_size
@@ -34,7 +34,7 @@ def at_rest(system):
     model = make_model(system)
     x, team = np.zeros(state_size(N)), make_flat_team(model, system)
     pose = np.tile([0.0, 0.0, 2.0], (5, 1)), np.tile(np.eye(3), (5, 1, 1))
-    set_flat_state(*pose, steady_shape(team), 0.0, np.zeros(7), team, FlatWork.of(N), x)
+    set_flat_state(FlatMotion(*pose, steady_shape(team)), 0.0, np.zeros(7), team, FlatWork.of(N), x)
     return model, x
 
 

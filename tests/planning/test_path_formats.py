@@ -15,7 +15,7 @@ from test_path_file import LENGTH, loop, options, save
 
 from multilift_marl.errors import warn_once
 from multilift_marl.planning import path_table
-from multilift_marl.planning.path_file import MAX_ROWS, load_path, ramp_rows, read_rows, thin_rows
+from multilift_marl.planning.path_file import MAX_ROWS, PathFile, load_path, ramp_rows, read_rows, thin_rows
 from multilift_marl.planning.paths import own_time
 from multilift_marl.planning.spline import fit_spline, sample_spline
 from multilift_marl.schema.files import pin_file
@@ -296,8 +296,8 @@ def test_polynomials_that_do_not_meet_are_refused(tmp_path):
 
 def test_a_spline_is_loaded_in_one_call(tmp_path):
     config = make("track", num_envs=1).config
-    path = pin_file(save(tmp_path, loop()))
-    table = load_path(path, 0.1, 0.0, (1.0, 2.0, 0.5), 20.0, config.system, config.randomization)
+    file = PathFile(pin_file(save(tmp_path, loop())), 0.1, 0.0, (1.0, 2.0, 0.5))
+    table = load_path(file, 20.0, config.system, config.randomization)
     np.testing.assert_allclose(table[0, 1:4], [1.0, 2.0, 2.5], atol=1e-12)
     assert table[-1, 0] == LENGTH
 

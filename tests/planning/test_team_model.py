@@ -7,7 +7,7 @@ import pytest
 
 import multilift_marl as ml
 from multilift_marl.errors import warn_once
-from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
+from multilift_marl.planning.flatness import FlatMotion, FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.model_slopes import slopes
 from multilift_marl.planning.team_model import (
     ModelWork,
@@ -161,7 +161,7 @@ def test_flat_states_are_the_motion_of_the_model_under_their_thrusts(n, change):
             for forces, at in zip(shape, (t - team.step, t, t + team.step), strict=True):
                 forces *= 1 + change * np.sin(3 * at) * np.array([0.7, -1.0, 0.0])
                 forces[:2, 2] += change * np.cos(2 * at) * np.array([0.8, -0.8])
-            set_flat_state(positions, rotations, shape, 0.4 * t, loads, team, FlatWork.of(n), x)
+            set_flat_state(FlatMotion(positions, rotations, shape), 0.4 * t, loads, team, FlatWork.of(n), x)
         near = (4 * found[1:] - found[:-1]) / 3
         return (16 * near[1] - near[0]) / 15
 
@@ -192,7 +192,8 @@ def test_a_team_at_rest_is_its_own_flat_state():
     x, w, still = np.zeros(state_size(n)), ModelWork.of(n), np.zeros(7)
     positions, rotations = np.tile([1.0, 2.0, 3.0], (5, 1)), np.tile(np.eye(3), (5, 1, 1))
     team = make_flat_team(model, system)
-    set_flat_state(positions, rotations, steady_shape(team), 0.0, still, team, FlatWork.of(n), x)
+    motion = FlatMotion(positions, rotations, steady_shape(team))
+    set_flat_state(motion, 0.0, still, team, FlatWork.of(n), x)
     accelerations(x, model, still, w)
     assert abs(w.acceleration).max() < 1e-9
     assert w.tension == pytest.approx(np.linalg.norm(system.formation_force, axis=1))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import multilift_marl as ml
-from multilift_marl.planning.flatness import FlatWork, make_flat_team, set_flat_state, steady_shape
+from multilift_marl.planning.flatness import FlatMotion, FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.team_model import ModelWork, make_model, state_size, step_state
 from multilift_marl.planning.team_observer import TeamObserver
 
@@ -21,7 +21,7 @@ def flown():
     model, x, after = make_model(system), np.zeros(state_size(N)), np.zeros(state_size(N))
     pose = np.tile([0.0, 0.0, 1.0], (5, 1)), np.tile(np.eye(3), (5, 1, 1))
     team = make_flat_team(model, system)
-    set_flat_state(*pose, steady_shape(team), 0.0, np.zeros(7), team, FlatWork.of(N), x)
+    set_flat_state(FlatMotion(*pose, steady_shape(team)), 0.0, np.zeros(7), team, FlatWork.of(N), x)
     work, rest, states = ModelWork.of(N), x[2 * Q :].copy(), [x.copy()]
     for k in range(150):
         thrust = rest.copy()

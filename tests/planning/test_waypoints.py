@@ -16,7 +16,7 @@ from multilift_marl.config.load import build_config
 from multilift_marl.errors import warn_once
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.planning.minimum_snap import fit_minimum_snap
-from multilift_marl.planning.path_file import load_path
+from multilift_marl.planning.path_file import PathFile, load_path
 from multilift_marl.planning.spline import sample_spline
 from multilift_marl.planning.waypoints import plan_waypoints, sample_rows
 from multilift_marl.policies.baselines import make_scripted
@@ -184,7 +184,7 @@ def test_a_path_written_to_a_file_is_flown_as_it_was_planned(tmp_path, limits):
     file = tmp_path / "path.csv"
     np.savetxt(file, rows, delimiter=",", header="t,x,y,z,yaw", comments="", fmt="%.9g")
     config = ml.load_config("track")
-    table = load_path(pin_file(str(file)), 0.1, 0.0, (0, 0, 0), 60.0, config.system, config.randomization)
+    table = load_path(PathFile(pin_file(str(file)), 0.1, 0.0, (0, 0, 0)), 60.0, config.system, config.randomization)
     t = np.linspace(0, path.times[-1], 3000)
     read, planned = sample_spline(table, t), sample_spline(path.table, t)
     for derivative, tolerance in enumerate((1e-4, 1e-2, 0.2)):
@@ -200,7 +200,7 @@ def test_a_file_that_leads_the_team_beyond_its_limits_is_warned_of(tmp_path, cap
         np.savetxt(file, rows, delimiter=",", header="t,x,y,z,yaw", comments="")
         warn_once.cache_clear()
         with caplog.at_level(logging.WARNING):
-            load_path(pin_file(str(file)), 0.1, 0.0, (0, 0, 0), 60.0, config.system, config.randomization)
+            load_path(PathFile(pin_file(str(file)), 0.1, 0.0, (0, 0, 0)), 60.0, config.system, config.randomization)
         said = "leads the team beyond its limits: at " in caplog.text and "the turning of drone" in caplog.text
         assert said == limit
 

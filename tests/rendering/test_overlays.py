@@ -252,7 +252,7 @@ def test_obstacles_are_drawn_as_they_are(tmp_path):
     # Corners of the mesh as drawn are those of the hull in its place.
     vertices = stage.model.mesh_vert[: stage.model.mesh_vertnum[0]]
     corners = vertices @ np.array(mesh.mat).reshape(3, 3).T + mesh.pos
-    hull, frame = vec.task.view.hulls[0], vec.world.obstacles.rotation[0, 3]
+    hull, frame = vec.world.obstacles.vertices[0], vec.world.obstacles.rotation[0, 3]
     expected = hull @ frame.T + vec.world.obstacles.position[0, 3]
     order = np.lexsort(np.round(corners, 4).T), np.lexsort(np.round(expected, 4).T)
     np.testing.assert_allclose(corners[order[0]], expected[order[1]], atol=1e-5)

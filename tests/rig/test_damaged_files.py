@@ -15,7 +15,7 @@ from test_urdf import cf2x, plus
 
 import multilift_marl as ml
 from multilift_marl.errors import ConfigError
-from multilift_marl.planning.path_file import load_path
+from multilift_marl.planning.path_file import PathFile, load_path
 from multilift_marl.rig.mesh import read_mesh
 from multilift_marl.rig.urdf import read_urdf
 
@@ -80,7 +80,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_sentence(name, sound, tmp_path
                 read_mesh(str(path), (0.5, 0.4, 0.3) if i % 2 else None)
             else:
                 smoothing = (0.1, 0.0)[i % 2], (0.0, 2.0)[i % 3 == 0], (0.0, 0.0, 2.0)
-                load_path(str(path), *smoothing, 20.0, config.system, config.randomization)
+                load_path(PathFile(str(path), *smoothing), 20.0, config.system, config.randomization)
         except ConfigError as error:
             assert len(str(error)) < 700 and not [word for word in JARGON if word in str(error)], error
             refused += 1

@@ -116,7 +116,7 @@ def test_what_is_said_to_px4_is_in_north_east_down():
     np.testing.assert_allclose([place.vx, place.vy, place.vz], NED @ VELOCITY)
     assert place.heading == pytest.approx(np.pi / 2 - np.arctan2(ATTITUDE[1, 0], ATTITUDE[0, 0]))
     rise = np.array([0.6, -0.2, 1.7])
-    asked = types.trajectory_setpoint(store, 7_000, POSITION, VELOCITY, rise, 0.3)
+    asked = types.trajectory_setpoint(store, 7_000, types.PX4Setpoint(POSITION, VELOCITY, rise, 0.3))
     for found, expected in ((asked.position, POSITION), (asked.velocity, VELOCITY), (asked.acceleration, rise)):
         np.testing.assert_allclose(found, NED @ expected, rtol=1e-6)
     assert asked.timestamp == 7 and asked.yaw == pytest.approx(np.pi / 2 - 0.3)

@@ -11,17 +11,17 @@ from multilift_marl.kernels.jit import kernel
 from multilift_marl.mdp.failures import make_limits
 from multilift_marl.sim import World
 from multilift_marl.sim.obstacle_distance import (
+    TeamBodies,
     _clearance,
     body_distance_to,
     box_distance_to,
     cylinder_distance_to,
-    find_touch,
     least_clearance,
     point_distance,
     ray_distance,
     segment_distance_to,
 )
-from multilift_marl.sim.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE, Obstacles, make_hulls, place_obstacle
+from multilift_marl.sim.obstacles import BOX, CYLINDER, HULL, NONE, SPHERE, Obstacles, place_obstacle
 
 GEOMS = {BOX: "box", CYLINDER: "cylinder", SPHERE: "sphere", HULL: "mesh"}
 CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -41,8 +41,8 @@ def random_hull(rng) -> np.ndarray:
 
 
 def random_obstacle(rng, kind: int) -> tuple[Obstacles, np.ndarray]:
-    obstacles = Obstacles.zeros(1, 1)
     hulls = random_hull(rng)[None]
+    obstacles = Obstacles.zeros(1, 1)._replace(vertices=hulls)
     size = rng.uniform(0.1, 1.5, 3)
     if kind == CYLINDER:
         size[1] = size[0]
@@ -100,20 +100,20 @@ def test_distances_of_bodies_are_mujocos(kind, body):
         center, frame, half = rng.normal(size=3) * 1.5, random_rotation(rng), rng.uniform(0.02, 0.6, 3)
         nine, place = tuple(frame.ravel()), f'pos="{words(center)}" quat="{pose(frame)}"'
         if body == "box":
-            ours = box_distance_to(0, 0, tuple(center), nine, tuple(half), obstacles, hulls)
+            ours = box_distance_to(0, 0, tuple(center), nine, tuple(half), obstacles)
             theirs = geom_distance(obstacles, f'<geom type="box" size="{words(half)}" {place}/>', hulls[0])
         elif body == "cylinder":
-            ours = cylinder_distance_to(0, 0, tuple(center), nine, (half[0], half[0], half[2]), obstacles, hulls)
+            ours = cylinder_distance_to(0, 0, tuple(center), nine, (half[0], half[0], half[2]), obstacles)
             theirs = geom_distance(obstacles, f'<geom type="cylinder" size="{words(half[[0, 2]])}" {place}/>', hulls[0])
         elif body == "hull":
             own = random_hull(rng)
-            both = np.stack([own, np.resize(hulls[0], own.shape)])
+            obstacles = obstacles._replace(vertices=np.stack([own, np.resize(hulls[0], own.shape)]))
             obstacles.hull[:] = 1
-            ours = body_distance_to(0, 0, (HULL, tuple(center), nine, 0), obstacles, both, np.inf)
+            ours = body_distance_to(0, 0, (HULL, tuple(center), nine, 0), obstacles, np.inf)
             theirs = geom_distance(obstacles, f'<geom type="mesh" mesh="own" {place}/>', hulls[0], own)
         else:
             a, b = tuple(center), tuple(center + rng.normal(size=3))
-            ours = segment_distance_to(0, 0, a, b, obstacles, hulls)
+            ours = segment_distance_to(0, 0, a, b, obstacles)
             theirs = geom_distance(obstacles, f'<geom type="capsule" size="{THIN}" fromto="{words(a + b)}"/>', hulls[0])
             theirs += THIN
         assert ours == pytest.approx(max(theirs, 0.0), abs=1e-4 if theirs > THIN else 2 * THIN)
@@ -129,13 +129,13 @@ def test_distances_of_points_are_those_of_small_spheres(kind):
     for _ in range(100):
         obstacles, hulls = random_obstacle(rng, kind)
         point = obstacles.position[0, 0] + obstacles.rotation[0, 0] @ (rng.uniform(-1.6, 1.6, 3) * obstacles.size[0, 0])
-        ours, nearest = point_distance(0, 0, tuple(point), obstacles, hulls)
+        ours, nearest = point_distance(0, 0, tuple(point), obstacles)
         theirs = geom_distance(obstacles, f'<geom type="sphere" size="1e-4" pos="{words(point)}"/>', hulls[0]) + 1e-4
         inside += theirs < 0
         assert ours == pytest.approx(max(theirs, 0.0) if kind == HULL else theirs, abs=1e-4)
         # The nearest point is as far as the distance says, and on the surface.
         assert np.linalg.norm(np.subtract(nearest, point)) == pytest.approx(abs(ours), abs=1e-6)
-        assert abs(point_distance(0, 0, nearest, obstacles, hulls)[0]) < 1e-6
+        assert abs(point_distance(0, 0, nearest, obstacles)[0]) < 1e-6
     assert inside > 2
 
 
@@ -150,21 +150,20 @@ def test_rays_are_mujocos(kind):
         toward = obstacles.position[0, 0] + rng.normal(size=3) * 0.7 - origin
         direction = toward / np.linalg.norm(toward)
         theirs = mujoco.mj_ray(model, data, origin, direction, None, 1, -1, np.zeros(1, np.int32), None)
-        ours = ray_distance(0, 0, tuple(origin), tuple(direction), obstacles, hulls)
+        ours = ray_distance(0, 0, tuple(origin), tuple(direction), obstacles)
         hits += theirs >= 0
         assert ours == (pytest.approx(theirs, abs=1e-5) if theirs >= 0 else np.inf)
-        assert ray_distance(0, 0, tuple(origin), tuple(-direction), obstacles, hulls) == np.inf
+        assert ray_distance(0, 0, tuple(origin), tuple(-direction), obstacles) == np.inf
     assert 30 < hits < 120
 
 
 def unit(kind: int, position=(0.0, 0.0, 0.0), yaw: float = 0.0) -> Obstacles:
     """Return an obstacle whose half edges are 1 m."""
-    obstacles = Obstacles.zeros(1, 1)
+    obstacles = Obstacles.zeros(1, 1)._replace(vertices=CUBE[None])
     place_obstacle(0, 0, obstacles, kind, (1.0, 1.0, 1.0), position, yaw)
     return obstacles
 
 
-HULLS = CUBE[None]
 LEVEL = tuple(np.eye(3).ravel())
 
 
@@ -187,18 +186,18 @@ LEVEL = tuple(np.eye(3).ravel())
 )
 def test_distances_of_points_by_hand(kind, point, distance, nearest):
     point = tuple(map(float, point))
-    measured, found = point_distance(0, 0, point, unit(kind), HULLS)
+    measured, found = point_distance(0, 0, point, unit(kind))
     assert measured == pytest.approx(distance, abs=1e-9) and found == pytest.approx(nearest, abs=1e-9)
     # Moved and turned by a quarter it is the same.
     turned = -point[1] + 2.0, point[0] - 3.0, point[2] + 1.0
     moved = unit(kind, (2.0, -3.0, 1.0), np.pi / 2)
-    assert point_distance(0, 0, turned, moved, HULLS)[0] == pytest.approx(distance, abs=1e-9)
+    assert point_distance(0, 0, turned, moved)[0] == pytest.approx(distance, abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", GEOMS)
 def test_rays_by_hand(kind):
     obstacles = unit(kind)
-    ray = lambda *numbers: ray_distance(0, 0, numbers[:3], numbers[3:], obstacles, HULLS)  # noqa: E731
+    ray = lambda *numbers: ray_distance(0, 0, numbers[:3], numbers[3:], obstacles)  # noqa: E731
     assert ray(3.0, 0.0, 0.0, -1.0, 0.0, 0.0) == pytest.approx(2.0, abs=1e-6)
     assert ray(0.0, 0.0, 5.0, 0.0, 0.0, -1.0) == pytest.approx(4.0, abs=1e-6)
     assert ray(3.0, 0.0, 0.0, 1.0, 0.0, 0.0) == ray(3.0, 1.5, 0.0, -1.0, 0.0, 0.0) == np.inf
@@ -210,13 +209,13 @@ def test_degenerate_bodies_have_distances_too(kind):
     """Parallel faces, a common middle, a shared face, a segment of no length, and one through the middle."""
     obstacles, half = unit(kind), (0.5, 0.5, 0.5)
     for measure in (box_distance_to, cylinder_distance_to):
-        far = lambda *center, measure=measure: measure(0, 0, center, LEVEL, half, obstacles, HULLS)  # noqa: E731
+        far = lambda *center, measure=measure: measure(0, 0, center, LEVEL, half, obstacles)  # noqa: E731
         assert far(0.0, 0.0, 2.0) == pytest.approx(0.5, abs=1e-6)
         assert far(0.0, 0.0, 1.5 + 1e-4) == pytest.approx(1e-4, abs=1e-6)
         assert far(0.0, 0.0, 0.0) == far(0.0, 0.0, 1.5 - 1e-6) == 0.0
         assert far(0.0, 0.0, 1.5) <= 1e-6
         assert far(0.0, 0.0, 100.0) == pytest.approx(98.5, abs=1e-6)
-    segment = lambda *ends: segment_distance_to(0, 0, ends[:3], ends[3:], obstacles, HULLS)  # noqa: E731
+    segment = lambda *ends: segment_distance_to(0, 0, ends[:3], ends[3:], obstacles)  # noqa: E731
     assert segment(0.0, 0.0, 3.0, 0.0, 0.0, 3.0) == pytest.approx(2.0, abs=1e-6)
     assert segment(-2.0, 0.0, 0.0, 2.0, 0.0, 0.0) == segment(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) == 0.0
     assert segment(-2.0, 0.0, 1.25, 2.0, 0.0, 1.25) == pytest.approx(0.25, abs=1e-6)
@@ -226,23 +225,23 @@ def test_free_rows_are_infinitely_far():
     obstacles = unit(BOX)
     obstacles.kind[:] = NONE
     point, axis = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-    assert point_distance(0, 0, point, obstacles, HULLS)[0] == np.inf
-    assert ray_distance(0, 0, point, axis, obstacles, HULLS) == np.inf
-    assert segment_distance_to(0, 0, point, axis, obstacles, HULLS) == np.inf
-    assert box_distance_to(0, 0, point, LEVEL, (1.0, 1.0, 1.0), obstacles, HULLS) == np.inf
+    assert point_distance(0, 0, point, obstacles)[0] == np.inf
+    assert ray_distance(0, 0, point, axis, obstacles) == np.inf
+    assert segment_distance_to(0, 0, point, axis, obstacles) == np.inf
+    assert box_distance_to(0, 0, point, LEVEL, (1.0, 1.0, 1.0), obstacles) == np.inf
 
 
 @kernel
-def clearances(state, rig, limits, lost, nodes, obstacles, hulls, within, out):
+def clearances(team, nodes, obstacles, within, out):
     for e in range(out.shape[0]):
-        out[e] = least_clearance(e, state, rig, limits, lost, nodes, obstacles, hulls, within)
+        out[e] = least_clearance(e, team, nodes, obstacles, within)
 
 
 def clearance(world: World, obstacles: Obstacles, within=np.inf, lost=None) -> np.ndarray:
     out = np.zeros(world.num_envs)
     lost = np.zeros((world.num_envs, world.num_drones), bool) if lost is None else lost
-    limits = make_limits(world.system)
-    clearances(world.state, world.rig, limits, lost, world.nodes, obstacles, HULLS, within, out)
+    team = TeamBodies(world.state, world.rig, make_limits(world.system), lost)
+    clearances(team, world.nodes, obstacles, within, out)
     return out
 
 
@@ -253,7 +252,7 @@ def test_a_long_body_is_near_what_is_before_its_ends(axis):
     half[axis], place[axis] = 3.0, 3.0 + 0.3 + 1.0
     axes = tuple(np.diag(half).ravel())
     body = BOX, (0.0, 0.0, 0.0), axes, 0
-    found = _clearance.py_func(0, body, np.linalg.norm(half), unit(BOX, tuple(place)), HULLS, 0.5)
+    found = _clearance.py_func(0, body, np.linalg.norm(half), unit(BOX, tuple(place)), 0.5)
     assert found == pytest.approx(0.3, abs=1e-6)
 
 
@@ -272,13 +271,11 @@ def test_a_mesh_is_as_near_as_its_own_hull(tmp_path, kind, size):
     mesh = {"payload.shape": "mesh", "payload.mesh": str(tmp_path / "square.obj"), "payload.anchors": ends}
     world = World(make_system(4, **mesh, **{"scene.obstacles": rock}), 1, 1)
     middle = world.state.payload_position[0] + world.state.payload_rotation[0] @ world.system.payload_center
-    obstacles = Obstacles.zeros(1, 1)
+    obstacles = Obstacles.zeros(1, 1)._replace(vertices=world.obstacles.vertices)
     place_obstacle(0, 0, obstacles, kind, size, tuple(middle + [0.33, 0.33, 0.0]))
     # of the edge x + y = 0.4; the corner of an upright box is nearest to it, the edge of the rock is parallel
     near = {SPHERE: 0.1, BOX: 0.1 / np.sqrt(2), HULL: 0.1 / np.sqrt(2)}[kind]
-    limits, lost, out = make_limits(world.system), np.zeros((1, 4), bool), np.zeros(1)
-    clearances(world.state, world.rig, limits, lost, world.nodes, obstacles, make_hulls(world.system), np.inf, out)
-    assert out[0] == pytest.approx((0.66 - 0.4) / np.sqrt(2) - near, abs=1e-6)
+    assert clearance(world, obstacles)[0] == pytest.approx((0.66 - 0.4) / np.sqrt(2) - near, abs=1e-6)
 
 
 def random_team(rng, **overrides) -> World:
@@ -313,15 +310,13 @@ def all_distances(world: World, obstacles: Obstacles, e: int) -> list[float]:
         attitude = state.payload_rotation[e]
         middle = tuple(state.payload_position[e] + attitude @ system.payload_center)
         measure = cylinder_distance_to if limits.payload_round else box_distance_to
-        found.append(measure(e, m, middle, tuple(attitude.ravel()), tuple(limits.payload_half), obstacles, HULLS))
+        found.append(measure(e, m, middle, tuple(attitude.ravel()), tuple(limits.payload_half), obstacles))
         for n in range(3):
             frame = tuple(state.drone_rotation[e, n].ravel())
             center = tuple(state.drone_position[e, n])
-            found.append(box_distance_to(e, m, center, frame, tuple(limits.drone_half[n]), obstacles, HULLS))
+            found.append(box_distance_to(e, m, center, frame, tuple(limits.drone_half[n]), obstacles))
             points = [tuple(point) for point in world.cable_points(e, n)]
-            found += [
-                segment_distance_to(e, m, a, b, obstacles, HULLS) for a, b in zip(points, points[1:], strict=False)
-            ]
+            found += [segment_distance_to(e, m, a, b, obstacles) for a, b in zip(points, points[1:], strict=False)]
     return found
 
 
@@ -348,8 +343,8 @@ def test_the_least_clearance_is_the_least_of_all_distances(overrides):
 
 def test_a_touch_is_found_and_lost_drones_and_broken_cables_touch_nothing():
     world = World(make_system(2), 1, 1)
-    state, lost, limits = world.state, np.zeros((1, 2), bool), make_limits(world.system)
-    touch = lambda: find_touch(0, state, world.rig, limits, lost, None, obstacles, HULLS)  # noqa: E731
+    state, lost = world.state, np.zeros((1, 2), bool)
+    touch = lambda: clearance(world, obstacles, 1e-6, lost)[0] == 0.0  # noqa: E731
     # A small ball on the middle of a cable, then one on a drone.
     anchor, hook = world.cable_points(0, 0)
     obstacles = Obstacles.zeros(1, 2)

@@ -84,20 +84,17 @@ class ServerOdometry:
         )
 
 
-def full_state(
-    store: Typestore, time_ns: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float,
-    yaw_rate: float = 0.0,
-) -> Any:  # fmt: skip
-    """Return a `FullState`: position, velocity and acceleration in the world, a heading from east, its rate.
+def full_state(store: Typestore, time_ns: int, setpoint: PX4Setpoint) -> Any:
+    """Return a `FullState` of a set-point: its motion, heading and how fast it turns, all finite.
 
     The attitude is level and turns about the vertical, as Crazyswarm2's own scripts have it: of the attitude, the
     firmware's controllers use the heading alone. The radio carries each number as 16 bits of 1/1000, up to 32.767.
     """
-    turning = _vector(store, np.array([0.0, 0.0, yaw_rate]))
+    turning = _vector(store, np.array([0.0, 0.0, setpoint.yaw_rate]))
     return store.types[FULL_STATE](
-        header=make_header(store, time_ns), pose=make_pose(store, position, level(yaw)),
-        twist=store.types["geometry_msgs/msg/Twist"](linear=_vector(store, velocity), angular=turning),
-        acc=_vector(store, acceleration),
+        header=make_header(store, time_ns), pose=make_pose(store, setpoint.position, level(setpoint.yaw)),
+        twist=store.types["geometry_msgs/msg/Twist"](linear=_vector(store, setpoint.velocity), angular=turning),
+        acc=_vector(store, setpoint.acceleration),
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from multilift_marl.config.config import Config
 from multilift_marl.control.disturbance import REJECTIONS, Disturbance, make_rejection, reset_estimate
 from multilift_marl.control.formation import Reference
 from multilift_marl.control.gains import make_gains
-from multilift_marl.control.geometric import command_attitude
+from multilift_marl.control.geometric import AttitudeCommand, command_attitude
 from multilift_marl.deploy.ros.autopilots import read_stamped, write_reference
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER
@@ -75,7 +75,7 @@ class DroneControl:
             self._reject = REJECTIONS[control.disturbance]
         self._state, self._reference = SystemState.zeros(1, 1), Reference.zeros(1, 1)
         self._disturbance, self._nominal = Disturbance.zeros(1, 1), np.zeros((1, 1, 3))
-        self._desired, self._rates, self._total = np.zeros((1, 1, 3, 3)), np.zeros((1, 1, 3)), np.zeros((1, 1))
+        self._command = AttitudeCommand(np.zeros((1, 1, 3, 3)), np.zeros((1, 1, 3)), np.zeros((1, 1)))
         # What holds the load up, without the formation's pull to the side.
         self.carried = np.array([0.0, 0.0, system.hook_force[drone, 2] / system.drone_mass[drone]])
         self.restart()
@@ -107,28 +107,29 @@ class DroneControl:
         force = self._nominal
         if self._reject is not None:
             # Whether thrusts are at a limit is known of those that were asked for last.
-            each = np.clip(self._total / 4, 0.0, self._vehicle.rotor_thrust_max)
+            each = np.clip(self._command.thrust / 4, 0.0, self._vehicle.rotor_thrust_max)
             state.rotor_speed[:] = np.sqrt(each / self._vehicle.thrust_coefficient)[..., None]
             paced = self._rejection._replace(dt=elapsed if elapsed <= _STALE else 0.0)
             self._reject(0, 1, state, self._reference, self._nominal, self._disturbance, paced)
             force = self._disturbance.cable_force
-        command_attitude(0, 1, state, self._reference, force, self._desired, self._rates, self._total, self._gains)
-        np.clip(self._rates, -_FASTEST, _FASTEST, out=self._rates)
+        command_attitude(0, 1, state, self._reference, force, self._command, self._gains)
+        rates = self._command.rates
+        np.clip(rates, -_FASTEST, _FASTEST, out=rates)
 
     @property
     def desired(self) -> np.ndarray:
         """See above."""
-        return self._desired[0, 0]
+        return self._command.attitude[0, 0]
 
     @property
     def rates(self) -> np.ndarray:
         """See above."""
-        return self._rates[0, 0]
+        return self._command.rates[0, 0]
 
     @property
     def share(self) -> float:
         """See above."""
-        return float(min(self._total[0, 0] / (4 * self._vehicle.rotor_thrust_max), 1.0))
+        return float(min(self._command.thrust[0, 0] / (4 * self._vehicle.rotor_thrust_max), 1.0))
 
 
 class _Drone:

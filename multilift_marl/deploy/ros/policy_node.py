@@ -37,6 +37,7 @@ from multilift_marl.deploy.ros.types import (
     FULL_STATE,
     VEHICLE_ODOMETRY,
     Motion,
+    PX4Setpoint,
     control_mode,
     level,
     px4_namespace,
@@ -366,13 +367,12 @@ class PolicyNode:
             else:
                 through = velocities[i] if not planned or self.team.config.control.drag_feedforward else still[i]
                 rise = self._feedforward.acceleration(i, through, accelerations[i], force[i], yaws[i])
-                motion = places[i], velocities[i], rise, yaws[i], yaw_rates[i]
-                if self._names.is_report:
-                    jerk = self._feedforward.jerk(i, jerks[i])
-                    setpoint = trajectory_setpoint(store, now, *motion, jerk)
-                    messages = [control_mode(store, now), setpoint] if self._receiver == PX4 else [setpoint]
-                else:
-                    messages = [full_state(store, now, *motion)]
+                jerk = self._feedforward.jerk(i, jerks[i])
+                setpoint = PX4Setpoint(places[i], velocities[i], rise, yaws[i], yaw_rates[i], jerk=jerk)
+                make_message = trajectory_setpoint if self._names.is_report else full_state
+                messages = [make_message(store, now, setpoint)]
+                if self._names.is_report and self._receiver == PX4:
+                    messages.insert(0, control_mode(store, now))
             for publish, message in zip(publishers, messages, strict=True):
                 publish(message)
         self._setpoints, self._sent = (places.copy(), yaws.copy()), self._woken

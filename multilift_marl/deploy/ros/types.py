@@ -218,18 +218,6 @@ def local_position(store: Typestore, time_ns: int, motion: Motion) -> Any:
     return kind(**values | {"timestamp": time_ns // 1000, "timestamp_sample": time_ns // 1000})
 
 
-def trajectory_setpoint(
-    store: Typestore, time_ns: int, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, yaw: float,
-    yaw_rate: float = np.nan, jerk: np.ndarray | None = None,
-) -> Any:  # fmt: skip
-    """Return PX4's `TrajectorySetpoint` of a motion in ENU, a heading from east, how fast it turns, and its jerk."""
-    place, speed, rise = (_single(swap_enu_ned(vector)) for vector in (position, velocity, acceleration))
-    return store.types[TRAJECTORY](
-        timestamp=time_ns // 1000, position=place, velocity=speed, acceleration=rise,
-        jerk=_single(NONE if jerk is None else swap_enu_ned(jerk)), yaw=float(swap_yaw(yaw)), yawspeed=-float(yaw_rate),
-    )  # fmt: skip
-
-
 NONE = np.full(3, np.nan)
 
 
@@ -254,6 +242,18 @@ class PX4Setpoint(NamedTuple):
     """(3,) [m/s³]."""
     rates: np.ndarray | None = None
     """(3,) of one of body rates and thrust, FLU [rad/s]."""
+
+
+def trajectory_setpoint(store: Typestore, time_ns: int, setpoint: PX4Setpoint) -> Any:
+    """Return PX4's `TrajectorySetpoint` of a set-point's motion, heading, how fast it turns, and jerk."""
+    position, velocity, acceleration, jerk = (
+        _single(swap_enu_ned(vector))
+        for vector in (setpoint.position, setpoint.velocity, setpoint.acceleration, setpoint.jerk)
+    )
+    return store.types[TRAJECTORY](
+        timestamp=time_ns // 1000, position=position, velocity=velocity, acceleration=acceleration, jerk=jerk,
+        yaw=float(swap_yaw(setpoint.yaw)), yawspeed=-float(setpoint.yaw_rate),
+    )  # fmt: skip
 
 
 def read_trajectory(message: Any) -> PX4Setpoint:
