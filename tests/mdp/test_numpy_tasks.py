@@ -18,6 +18,7 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.kernels import inlined
 from multilift_marl.math3d import row, sub, vec
 from multilift_marl.mdp.failures import CAUSES, FIRST_OWN
+from multilift_marl.mdp.numpy_functions import ArrayView
 from multilift_marl.mdp.observation_kernels import compose_observation
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import Term, compose_reward, tolerance
@@ -353,3 +354,29 @@ def test_steps_of_tasks_by_kernels_alone_are_not_divided():
     vec = make("hover", num_envs=4, num_threads=2)
     assert [len(pipeline.parts) for pipeline in vec._pipelines.values()] == [1, 1]
     assert not (vec.task.numpy.plans or vec.task.numpy.judges or vec.task.numpy.observes)
+
+
+TETRAHEDRON = "v 0 0 0\nv 0.3 0 0\nv 0 0.3 0\nv 0 0 0.3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def test_what_belongs_to_no_environment_is_whole_and_all_else_is_of_the_rows_asked_for(tmp_path):
+    """Seven teams of three: no other array is of seven rows."""
+    (tmp_path / "rock.obj").write_text(TETRAHEDRON, encoding="utf-8")
+    rocks = [{"shape": "mesh", "mesh": str(tmp_path / "rock.obj"), "position": [x, 3.0, 1.0]} for x in (-2.0, 2.0)]
+    given = {"task_options.level": "given", "task_options.start": [-2, 0, 2], "task_options.goal": [2, 0, 2]}
+    vec = make("navigate", 7, 3, **given, **{"scene.obstacles": rocks, "scene.reserved": 0, "env.episode_seconds": 14})
+    vec.reset(seed=0)
+
+    def compare(record, part):
+        for name, value in record._asdict().items():
+            seen = getattr(part, name)
+            if hasattr(value, "_fields"):
+                compare(value, seen)
+            elif isinstance(value, np.ndarray):
+                expected = value[2:4] if len(value) == 7 else value
+                np.testing.assert_array_equal(seen, expected, err_msg=name)
+                found.add((name, len(value) == 7))
+
+    found = set()
+    compare(vec.task.view, ArrayView(vec.task.view, slice(2, 4)))
+    assert {("vertices", False), ("resting_tension", False), ("kind", True), ("start", True)} <= found
