@@ -73,6 +73,11 @@ def _plan(values: dict[str, Any]) -> int:
     config = load_config(options.config, overrides | {f"task_options.{key}": value for key, value in own.items()})
     if config.task != "track":
         raise ConfigError(f"config={options.config} is of task {config.task}; give one of task track")
+    if config.scene.obstacles:
+        raise ConfigError(
+            "plans know no obstacles, and would lead through scene.obstacles; leave them out, or search a route: "
+            "config=navigate policy=mpc_route"
+        )
     system, ranges = config.system, config.randomization
     if not has_model(system):
         raise ConfigError(

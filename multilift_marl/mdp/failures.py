@@ -83,6 +83,8 @@ class Limits(NamedTuple):
     """Its geometric centre from its centre of mass, in its frame [m]."""
     payload_round: bool
     """Whether it is a cylinder."""
+    payload_ball: float
+    """Radius of what stands for a point, else 0 [m]."""
     payload_hull: int
     """Row of `Obstacles.vertices` with the vertices of a mesh's hull from its geometric centre, else -1."""
     drone_half: np.ndarray
@@ -106,6 +108,7 @@ def make_limits(system: System, distance: float = MAX_DISTANCE) -> Limits:
         payload_half=system.payload_size / 2,
         payload_center=triple(system.payload_center),
         payload_round=system.payload_shape == "cylinder",
+        payload_ball=system.payload_size[0] / 2 if system.payload_shape == "point" else 0.0,
         payload_hull=-1 if system.payload_mesh is None else count_hulls(system.scenery),
         drone_half=np.array([drone_half_size(vehicle) for vehicle in system.vehicles]),
         distance=distance,

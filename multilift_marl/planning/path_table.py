@@ -69,7 +69,7 @@ def read_columns(source: str, content: bytes, needed: Sequence[str]) -> dict[str
     above, data, separator = _split_text(source, content)
     if not above or not data:
         raise ConfigError(f"{source} needs a line of names and a row of numbers for each way-point; give it both")
-    chosen = choose_columns(source, _name_cells(above[-1], separator), needed=needed)
+    chosen = choose_columns(source, _name_cells(above[-1], separator, len(_split(data[0], separator))), needed=needed)
     numbers = _read_numbers(source, data, separator)
     _check_width(source, chosen, numbers)
     return {name: numbers[:, place] * factor for name, (place, factor) in chosen.items()}
@@ -140,15 +140,16 @@ def _check_width(source: str, chosen: dict[str, Chosen], numbers: np.ndarray) ->
         raise ConfigError(f"{source} names {named} columns or more, but has {numbers.shape[1]}; correct it")
 
 
-def _name_cells(line: str, separator: str) -> list[str]:
-    """Return what the cells of a line of names hold, in lower case."""
+def _name_cells(line: str, separator: str, width: int) -> list[str]:
+    """Return what the cells of a line of names hold, in lower case; the mark of a comment is none of them."""
     mark = separator if separator in line else _separator(line)
-    return [cell.strip("#% ").lower() for cell in _split(line, mark)]
+    cells = [cell.strip("#% ").lower() for cell in _split(line, mark)]
+    return cells[1:] if line[0] in "#%" and not cells[0] and len(cells) > width else cells
 
 
 def _read_names(source: str, lines: list[str], separator: str, width: int) -> dict[str, Chosen] | None:
     """Return the columns by the lines above the numbers, None if they name none; {} for polynomials."""
-    cells = [_name_cells(line, separator) for line in lines]
+    cells = [_name_cells(line, separator, width) for line in lines]
     is_comment = [line[0] in "#%" for line in lines]
     for i in reversed(range(len(lines))):
         if width == _POLYNOMIALS and cells[i][0] == "duration":

@@ -161,7 +161,7 @@ def _check_vehicle(vehicle: Vehicle) -> None:
         thrust = 4 * vehicle.rotor_thrust_max
         hint = plausible.unit_hint(vehicle.mass, "kg", thrust / (3 * GRAVITY))
         raise ConfigError(
-            f"a {vehicle.name} of vehicle.mass={vehicle.mass:g} kg cannot lift itself with {thrust:g} N"
+            f"vehicle '{vehicle.name}' of vehicle.mass={vehicle.mass:g} kg cannot lift itself with {thrust:g} N"
             f"{hint or '; raise vehicle.rotor_thrust_max'}"
         )
     plausible.check_vehicle(vehicle)

@@ -33,7 +33,7 @@ from multilift_marl.math3d import (
 )
 from multilift_marl.rng import uniform
 from multilift_marl.schema.sections import EnvConfig
-from multilift_marl.sensing.load_filter import follow_attitude, follow_position, predict_position
+from multilift_marl.sensing.load_filter import assume_planned, follow_attitude, follow_position, predict_position
 
 MAX_AGE = 0.5  # [s] what was heard longer ago is not used
 ATTITUDE_PRIOR = 0.02 / 0.1  # [m] of an anchor's error over [rad] of a payload's attitude about the planned one
@@ -155,7 +155,7 @@ def exchange_messages(lo, hi, broadcast, links, messages, first):
                 arrives = uniform(e, messages) > links.loss  # drawn in any case: the draws of others stay the same
                 # By the true positions, whatever the drones believe: radio does not ask.
                 near = norm(sub(vec(position, e, n), vec(position, e, m))) <= links.range
-                if first and near:
+                if first and near and broadcast.has_message[e, m]:
                     put(messages.heard[e, n, m], vec(content, e, m))
                     messages.age[e, n, m] = 0
                 elif arrives and near and then >= 0 and messages.has_sent[e, then % kept, m]:
@@ -168,16 +168,23 @@ def exchange_messages(lo, hi, broadcast, links, messages, first):
 def update_shared_estimate(lo, hi, scene, messages, load, first):
     """Estimate each payload from all anchors that a drone knows, its own and those it has heard of.
 
-    The planned attitude counts as a measurement, too, so that any number of anchors will do.
+    The planned attitude counts as a measurement, too, so that any number of anchors will do. Before there is one, a
+    drone takes the payload to be where it is planned to be.
     """
+    known = scene.memory.known
     for e in range(lo, hi):
         for n in range(load.tension.shape[1]):
             position, attitude, count = _fit(e, n, scene, messages)
+            begins = first or not known[e, n]
+            known[e, n] = count > 0 or not begins
+            if not known[e, n]:
+                assume_planned(e, n, scene.planned, load)
+                continue
             if count == 0:
                 predict_position(e, n, load, scene.sensor)
                 continue
-            follow_position(e, n, position, vec(scene.own.drone_velocity, e, n), load, scene.sensor, first)
-            follow_attitude(e, n, attitude, (0.0, 0.0, 0.0), load, scene.sensor, first)
+            follow_position(e, n, position, vec(scene.own.drone_velocity, e, n), load, scene.sensor, begins)
+            follow_attitude(e, n, attitude, (0.0, 0.0, 0.0), load, scene.sensor, begins)
 
 
 @kernel

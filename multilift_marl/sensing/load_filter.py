@@ -9,10 +9,12 @@ from multilift_marl.math3d import (
     add,
     mat,
     matmul,
+    matrow,
     mul,
     put,
     putmat,
     rotation_vector,
+    row,
     scale,
     sub,
     tmul,
@@ -73,3 +75,12 @@ def follow_attitude(e, k, measured, body_rates, load, sensor, first):
 def predict_position(e, n, load, sensor):
     """Predict the position of a payload of which nothing is measured, by its velocity."""
     put(load.position[e, n], add(vec(load.position, e, n), scale(sensor.dt, vec(load.velocity, e, n))))
+
+
+@kernel
+def assume_planned(e, n, planned, load):
+    """Write the planned motion, a Goal, as what drone n knows of the payload."""
+    putmat(load.rotation[e, n], matrow(planned.rotation, e))
+    put(load.position[e, n], row(planned.position, e))
+    put(load.velocity[e, n], row(planned.velocity, e))
+    put(load.body_rates[e, n], (0.0, 0.0, 0.0))

@@ -43,7 +43,13 @@ from multilift_marl.sensing.communication import (
     make_messages,
     update_shared_estimate,
 )
-from multilift_marl.sensing.load_filter import alpha_beta, follow_attitude, follow_position, predict_position
+from multilift_marl.sensing.load_filter import (
+    alpha_beta,
+    assume_planned,
+    follow_attitude,
+    follow_position,
+    predict_position,
+)
 from multilift_marl.sim.state import SystemState
 
 Call = Callable[[int, int], None]  # of environments lo to hi
@@ -58,6 +64,8 @@ class LoadMemory(NamedTuple):
     """(E, N, 3) of a cable's direction, body frame of its drone [rad]."""
     tension_offset: np.ndarray
     """(E, N) over the tension at rest [-]."""
+    known: np.ndarray
+    """(E, N) bool, whether the drone has had an anchor to go by in the episode."""
 
 
 CAMERA_DELAY = 0.008  # [s] of a pose by motion capture
@@ -152,7 +160,7 @@ class LoadSensing:
             np.zeros((e, rows, 3)), np.tile(np.eye(3), (e, rows, 1, 1)), np.zeros((e, rows, 3)),
             np.zeros((e, rows, 3)), np.zeros((e, n)),
         )  # fmt: skip
-        self._memory = LoadMemory(np.zeros(e, np.uint64), np.zeros((e, n, 3)), np.zeros((e, n)))
+        self._memory = LoadMemory(np.zeros(e, np.uint64), np.zeros((e, n, 3)), np.zeros((e, n)), np.zeros((e, n), bool))
         self._anchor, self._knows_anchor = np.zeros((e, n, 3)), np.ones((e, n), bool)
         self._sensor, self._links = make_sensor(level, dt, length), links
         self._messages = None if links is None else make_messages(e, n, links.delay)
@@ -252,8 +260,7 @@ def measure_cable(lo, hi, scene, load, first):
             off_tension = memory.tension_offset[e, n] + sensor.tension * normal_pair(e, memory)[0]
             load.tension[e, n] = max(true.cable_tension[e, n] + off_tension * scene.resting_tension[n], 0.0)
             # slack or broken: it points nowhere
-            whole = first and not true.cable_broken[e, n]
-            scene.knows_anchor[e, n] = whole or true.cable_tension[e, n] > 0.0
+            scene.knows_anchor[e, n] = true.cable_tension[e, n] > 0.0 and not true.cable_broken[e, n]
 
             # The anchor is a nominal length along it.
             # Nominal length and stretch at rest: the true length is not known.
@@ -285,15 +292,17 @@ def _planned_cable(e, n, scene):
 
 @kernel
 def update_own_estimate(lo, hi, scene, load, first):
-    """Estimate each payload from a drone's own anchor alone, at rest in the planned attitude."""
+    """Estimate each payload from a drone's own anchor alone, at rest in the planned attitude.
+
+    Without a cable, and before it has ever been taut, a drone takes the payload to be where it is planned to be.
+    """
+    known = scene.memory.known
     for e in range(lo, hi):
         for n in range(load.tension.shape[1]):
-            if scene.true.cable_broken[e, n]:
-                # Without a cable it takes the payload to be where it is planned to be.
-                putmat(load.rotation[e, n], matrow(scene.planned.rotation, e))
-                put(load.position[e, n], row(scene.planned.position, e))
-                put(load.velocity[e, n], row(scene.planned.velocity, e))
-                put(load.body_rates[e, n], (0.0, 0.0, 0.0))
+            begins = first or not known[e, n]
+            known[e, n] = scene.knows_anchor[e, n] or scene.true.cable_broken[e, n] or not begins
+            if scene.true.cable_broken[e, n] or not known[e, n]:
+                assume_planned(e, n, scene.planned, load)
                 continue
             if not scene.knows_anchor[e, n]:
                 predict_position(e, n, load, scene.sensor)
@@ -302,7 +311,7 @@ def update_own_estimate(lo, hi, scene, load, first):
             arm = row(scene.rig.anchors, n)
             put(load.position[e, n], add(vec(load.position, e, n), mul(mat(load.rotation, e, n), arm)))
             follow_position(
-                e, n, vec(scene.anchor, e, n), vec(scene.own.drone_velocity, e, n), load, scene.sensor, first
+                e, n, vec(scene.anchor, e, n), vec(scene.own.drone_velocity, e, n), load, scene.sensor, begins
             )
             attitude = matrow(scene.planned.rotation, e)
             put(load.position[e, n], sub(vec(load.position, e, n), mul(attitude, arm)))

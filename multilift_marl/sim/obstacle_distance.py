@@ -261,7 +261,11 @@ def least_clearance(e, team, nodes, obstacles, within):
     kind, hull = (CYLINDER if limits.payload_round else BOX), 0
     if limits.payload_hull >= 0:
         kind, axes, hull = HULL, attitude, limits.payload_hull
-    least = _clearance(e, (kind, middle, axes, hull), norm(half), obstacles, least)
+    if limits.payload_ball > 0.0:
+        far = _clearance(e, (BOX, middle, _NOTHING, 0), 0.0, obstacles, least + limits.payload_ball)
+        least = max(far - limits.payload_ball, 0.0)
+    else:
+        least = _clearance(e, (kind, middle, axes, hull), norm(half), obstacles, least)
     for n in range(state.drone_position.shape[1]):
         if lost[e, n]:
             continue

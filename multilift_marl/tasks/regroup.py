@@ -97,7 +97,11 @@ def change_team(e, v):
     """Let drones leave and join when their time has come; lower the slots of those that wait."""
     own, goal, state = v.own, v.goal, v.state
     event = own.event[e]
-    if event < own.when.shape[1] and v.time[e] >= own.when[e, event]:
+    # One at a time is away: nobody leaves while another one waits to join.
+    alone = True
+    for n in range(own.waiting.shape[1]):
+        alone = alone and not own.waiting[e, n]
+    if event < own.when.shape[1] and v.time[e] >= own.when[e, event] and (alone or own.joins[e, event]):
         who = own.who[e, event]
         # The time is a sum of steps, whose round-off must not decide.
         own.held[e, event] = v.good_time[e] >= v.settings.seconds - 1e-9
@@ -167,7 +171,7 @@ class Regroup(Task):
         Component("absent_azimuth", 2, "-", "-", "cosine and sine of that of the absent drone, 0 if none is",
                   absent_azimuth),
     )  # fmt: skip
-    MIN_DRONES: ClassVar[int] = 2
+    MIN_DRONES: ClassVar[int] = 3  # one alone cannot hold a payload level
 
     def count_limits(self) -> dict[str, tuple[int, int]]:
         """Bound what kernels index by, see `Task`."""

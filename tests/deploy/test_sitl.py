@@ -111,6 +111,8 @@ def test_the_example_is_that_of_the_help_and_can_be_started(tmp_path, capsys):
         (FLOWN, ["common.config=null", "nodes.pilot.env.dornes=3"], "nodes.pilot: unknown key 'env.dornes'"),
         (FLOWN, ["nodes.pilot.config=hovr"], "nodes.pilot: no configuration named 'hovr'; did you mean 'hover'"),
         (FLOWN, ["nodes.pilot.role=pilot"], "nodes.pilot: role must be .*'policy'"),
+        (FLOWN, ["nodes.pilot.output=rates"], "nodes.pilot: output means nothing to role=policy, but to geometric_con"),
+        (FLOWN, ["nodes.c.role=clock", "nodes.c.policy=mpc"], "nodes.c: policy means nothing to role=clock"),
         (FLOWN, ["nodes.other={}"], "nodes.other needs a role"),
         (FLOWN, ["nodes.flight.role=clock"], "nodes.flight has the name of another process"),
         (FLOWN, ["nodes.view.role=clock"], "nodes.view has the name of another process"),

@@ -103,11 +103,11 @@ def test_gain_is_measured_in_the_same_fresh_episodes_for_script_and_learned_team
 
 def test_processes_of_ray_fly_the_parts_of_the_same_episodes(begun):
     cloudpickle = pytest.importorskip("ray.cloudpickle", exc_type=ImportError)
-    from multilift_marl.evaluation.parallel import _fly_part
+    from multilift_marl.evaluation.parallel import Evaluation, _fly_part
 
     config, make = load_config("hover", SHORT), partial(make_scripted, "formation")
     whole = run_episodes(config, make, 5, seed=3)
-    task = cloudpickle.dumps((config.model_dump(mode="json"), make, 3, None, False))
+    task = cloudpickle.dumps((config.model_dump(mode="json"), make, Evaluation(5, 3), False))
     parts = [_fly_part(task, first, count)[0] for first, count in ((0, 2), (2, 3))]
     digests = [each for _, each in begun]
     assert digests[0] == digests[1] + digests[2]

@@ -31,7 +31,8 @@ def team(anchors=ANCHORS, hooks=HOOKS, **limits):
     state.drone_rotation[0] = turned([1.0, -2.0, 0.5], 0.4), turned([-0.4, 0.7, 2.0], -0.6)
     values = {
         "separation": np.full((2, 2), 0.3), "cables": np.full((2, 2), 0.01), "payload_half": HALF,
-        "payload_center": CENTER, "payload_round": False, "payload_hull": -1, "drone_half": DRONE, "distance": 3.0,
+        "payload_center": CENTER, "payload_round": False, "payload_ball": 0.0, "payload_hull": -1, "drone_half": DRONE,
+        "distance": 3.0,
     }  # fmt: skip
     return record(
         state=state, limits=Limits(**(values | limits)), mask=FailureMask.zeros(1, 2), min_separation=np.full(1, 9.0),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import load_script, make, refusal, same, zeros
 
+from multilift_marl.agents.environments import training_environment
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.kernels import jit
 from multilift_marl.kernels.jit import compose, inlined, kernel
@@ -56,7 +57,8 @@ def test_of_training_alone_too_a_bare_weight_leaves_the_margin():
     given = {"reward.attitude": {"weight": 1.0, "margin": 40.0}}
     config = load_config("hover", {"train.overrides": given})
     changed = build_config(config.model_dump(), {"train.overrides": {"reward.attitude": 2.0}})
-    assert changed.train.overrides["reward.attitude"] == {"weight": 2.0, "margin": 40.0}
+    trained = training_environment(changed)
+    assert trained.reward["attitude"].model_dump() == {"weight": 2.0, "margin": (40.0,)}
 
 
 def test_weight_and_margins_are_configuration():

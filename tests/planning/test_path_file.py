@@ -102,6 +102,14 @@ def test_all_kinds_of_file_hold_the_same_path(tmp_path, name, columns):
     assert (read_rows(pin_file(path)) == expected).all()
 
 
+@pytest.mark.parametrize("mark", ["# ", "#", "% ", "#\t"])
+@pytest.mark.parametrize("delimiter", [" ", ",", "\t"])
+def test_names_may_be_a_comment_as_numpy_writes_it(tmp_path, mark, delimiter):
+    rows, file = loop()[:, :4], tmp_path / "path.csv"
+    np.savetxt(file, rows, delimiter=delimiter, header=delimiter.join("txyz"), comments=mark)
+    np.testing.assert_allclose(read_rows(pin_file(str(file)))[:, :4], rows, atol=1e-12)
+
+
 def test_columns_are_found_by_name_and_others_ignored(tmp_path):
     rows = loop()
     extra = np.column_stack([rows[:, 3], rows[:, 0] + 5.0, np.full(len(rows), 7.0), rows[:, 1:3]])

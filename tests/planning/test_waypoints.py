@@ -140,6 +140,12 @@ def test_damaged_files_are_refused(tmp_path):
     assert "give finite places" in complaint("x,y,z\n0,0,2\n1,nan,2\n")
 
 
+def test_plans_do_not_ignore_obstacles(capsys):
+    box = "scene.obstacles=[{shape: box, size: [1, 1, 4], position: [1.5, 0.5, 1]}]"
+    assert plan(["waypoints=[[0, 0, 1.5], [3, 1, 2]]", box]) == 2
+    assert "plans know no obstacles" in capsys.readouterr().err
+
+
 def test_the_file_is_pinned(tmp_path):
     path = save(tmp_path, "x,y,z\n0,0,1.5\n3,1,2\n")
     config = ml.load_config("track", options(path))

@@ -165,6 +165,21 @@ def test_drones_have_talked_before_an_episode():
     assert (messages.age[0, off] == 0).all() and (messages.age[1, off] == 3).all()
 
 
+def test_who_has_nothing_to_say_at_the_start_is_not_heard_then():
+    """A drone without a cable: what it would say is where no anchor is."""
+    overrides = {"env.sensing": "onboard", "env.communication": "all", "task_options.absent": 1.0}
+    vec = make("regroup", 8, **overrides)
+    vec.reset(seed=1)
+    messages, each = vec._sensing._load_sensing._messages, np.arange(8)
+    away = vec.task.own.attached.argmin(axis=1)
+    hears = np.ones((8, 4), bool)
+    hears[each, away] = False
+    heard = messages.age[each, :, away] == 0
+    assert not heard[hears].any()
+    others = ~np.eye(4, dtype=bool) & vec.task.own.attached[:, None]
+    assert (messages.age[others] == 0).all()
+
+
 @pytest.mark.parametrize(
     "links",
     [{"delay": 25}, {"delay": 10}, {"loss": 0.9}, {"loss": 1.0}, {"delay": 5, "loss": 0.7}, {"range": 0.0}],

@@ -35,6 +35,25 @@ def settled(level, **settings):
     return vec
 
 
+@pytest.mark.parametrize("talk", ["none", "all"])
+def test_until_a_cable_has_been_taut_the_payload_is_where_it_is_planned(talk):
+    """On the ground, before take-off: a slack cable points nowhere, and nothing is to be integrated."""
+    vec = make("takeoff", 4, **{"env.sensing": "onboard", "env.communication": talk})
+    vec.reset(seed=1)
+    known, taut = vec.task.view.payload_estimate, np.zeros((4, 4), bool)
+    for _ in range(400):
+        heard = taut.any(axis=1, keepdims=True) if talk == "all" else taut
+        unknown = np.broadcast_to(~heard, (4, 4))
+        planned = np.broadcast_to(vec.task.planned.position[:, None], (4, 4, 3))
+        np.testing.assert_array_equal(known.position[unknown], planned[unknown])
+        assert (vec.task.view.estimated_errors.position_integral[unknown] == 0).all()
+        vec.step(np.zeros((4, 4, 4)))
+        taut |= vec.world.state.cable_tension > 0
+    assert taut.all()  # and then it is measured
+    away = np.linalg.norm(known.position - vec.world.state.payload_position[:, None], axis=-1)
+    assert away.max() < 0.1
+
+
 def changed(vec, change):
     """Return which drones (N,) observe another thing after `change(state)`, sensors' noise being the same."""
     before = observe(copy.copy(vec))[0]

@@ -278,6 +278,18 @@ def test_a_mesh_is_as_near_as_its_own_hull(tmp_path, kind, size):
     assert clearance(world, obstacles)[0] == pytest.approx((0.66 - 0.4) / np.sqrt(2) - near, abs=1e-6)
 
 
+@pytest.mark.parametrize("gap", [0.02, 0.3])
+def test_a_point_is_as_near_as_the_ball_that_stands_for_it(gap):
+    """On the diagonal of the cube about it: its corner is 3.7 cm farther out than the ball."""
+    world = World(make_system(3, **{"payload.shape": "point", "payload.mass": 0.7}), 1, 1)
+    away = np.array([1.0, 1.0, -1.0]) / np.sqrt(3)
+    obstacles = Obstacles.zeros(1, 1)
+    place_obstacle(
+        0, 0, obstacles, SPHERE, (0.1, 0.1, 0.1), tuple(world.state.payload_position[0] + (0.15 + gap) * away)
+    )
+    assert clearance(world, obstacles)[0] == pytest.approx(gap, abs=1e-9)
+
+
 def random_team(rng, **overrides) -> World:
     """Return eight teams, somewhere and turned as bodies without cables could be."""
     world = World(make_system(3, **overrides), 8, 1)

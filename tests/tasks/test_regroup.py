@@ -65,6 +65,19 @@ def test_a_drone_joins_as_soon_as_its_cable_reaches_it_and_not_before():
     assert joined.all() and (own.peak_tension < 10).all()
 
 
+def test_nobody_leaves_while_another_one_waits_to_join():
+    overrides = {
+        "task_options.absent": 1.0,
+        "task_options.events": [1.5, 2.2, 3.0, 4.0],
+        "task_options.event_spread": 0.0,
+    }
+    vec = regroup(**overrides | {"env.episode_seconds": 9.0})
+    own, left = vec.task.own, []
+    for _ in fly(vec, 8.9):
+        left.append((~own.attached).sum(axis=1).max())
+    assert max(left) == 1 and (own.event == 4).all()
+
+
 def test_the_slot_of_a_drone_that_leaves_sinks_within_two_seconds():
     vec = regroup(**SHORT | {"task_options.absent": 0.0, "task_options.event_spread": 0.0})
     goal, own, rates = vec.task.goal, vec.task.own, []
@@ -203,6 +216,7 @@ def test_what_cannot_be_is_refused(overrides, said):
 
 
 @pytest.mark.parametrize("own", [{}, {"payload.anchor_radius": None}])
-def test_one_drone_is_too_few(own):
-    message = refusal(make, "regroup", num_drones=1, **own)
+@pytest.mark.parametrize("drones", [1, 2])
+def test_one_drone_or_two_are_too_few(own, drones):
+    message = refusal(make, "regroup", num_drones=drones, **own)
     assert "payload.anchors [" not in message and "raise env.num_drones" in message

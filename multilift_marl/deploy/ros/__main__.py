@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -41,6 +41,12 @@ environment: env.num_drones=6."""
 
 FLYING = ("policy", "trajectory_planner", "mpc_planner")
 NODES = (*FLYING, "geometric_control", "clock")
+OF_ROLES: dict[str, tuple[str, ...]] = {
+    "policy": ("simulation", *FLYING), "speed": ("simulation",), "sync": ("simulation",), "start": FLYING,
+    "receiver": FLYING, "output": ("geometric_control",), "drones": ("geometric_control",),
+    "patience": ("geometric_control", "clock"),
+}  # fmt: skip
+"""Roles to which a key of the command means something, where it does not to all."""
 CLOCK_PATIENCE = 5.0  # [s]
 OURS = ("simulation", "policy")  # whose topics are ours unless they are told otherwise
 USUAL: dict[str, dict[str, Any]] = {
@@ -100,6 +106,13 @@ class Options(CommandOptions):
     allow_network: bool = Field(False, description="whether other machines may hear and fly it, by multicast")
 
 
+def check_role(role: str, keys: Iterable[str]) -> None:
+    """Refuse, by a ConfigError, keys that mean nothing to a role."""
+    for key in keys:
+        if role not in (roles := OF_ROLES.get(key, (role,))):
+            raise ConfigError(f"{key} means nothing to role={role}, but to {' and '.join(roles)}; leave it out")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Simulate or fly until interrupted; return the exit status."""
     return run_command(_run, _USAGE, Options, arguments)
@@ -110,6 +123,7 @@ def _run(values: dict[str, Any]) -> int:
     from multilift_marl.deploy.ros.dds import Node, describe_reach
 
     options, overrides = split_options(Options, values)
+    check_role(options.role, sorted(options.model_fields_set))
     if options.names is None:
         options = options.model_copy(update={"names": "multilift" if options.role in OURS else "report"})
     overrides = USUAL.get(options.role, {}) | overrides

@@ -13,7 +13,7 @@ from pydantic import Field
 from multilift_marl.command import CommandOptions, make_folder, spell_arguments, split_options
 from multilift_marl.config.load import check_names, load_config
 from multilift_marl.deploy.px4.__main__ import Options as FlightOptions
-from multilift_marl.deploy.ros.__main__ import USUAL
+from multilift_marl.deploy.ros.__main__ import OF_ROLES, USUAL, check_role
 from multilift_marl.deploy.ros.__main__ import Options as NodeOptions
 from multilift_marl.deploy.sitl.view import ViewOptions, of_flight
 from multilift_marl.errors import ConfigError, reason, shorten
@@ -106,7 +106,7 @@ def list_commands(options: Options, out: Path) -> dict[str, list[str]]:
     usual = _usual(options, out)
     if options.flight is None:
         own: type[CommandOptions] = NodeOptions
-        first = _merge(own, usual, common, options.simulation or {})
+        first = _merge(own, usual, _of_role("simulation", _merge(own, common)), options.simulation or {})
         commands = {"simulation": _command("simulation", "ros", own, first)}
     else:
         own, first = FlightOptions, _merge(FlightOptions, usual, common, options.flight)
@@ -115,9 +115,9 @@ def list_commands(options: Options, out: Path) -> dict[str, list[str]]:
     for name, values in options.nodes.items():
         if name in ("flight", "simulation", "view"):
             raise ConfigError(f"nodes.{name} has the name of another process; give it another one")
-        if values.get("role", "simulation") == "simulation":
+        if (role := values.get("role", "simulation")) == "simulation":
             raise ConfigError(f"nodes.{name} needs a role, such as policy; a simulation is a section of its own")
-        merged = _merge(NodeOptions, common, shared, values)
+        merged = _of_role(role, _merge(NodeOptions, common, shared)) | _merge(NodeOptions, values)
         commands[name] = _command(f"nodes.{name}", "ros", NodeOptions, merged)
     if options.view is not None:
         merged = _merge(ViewOptions, of_flight(first, own.model_fields), options.view, {"live": True})
@@ -136,11 +136,18 @@ def _usual(options: Options, out: Path) -> Keys:
     return {"policy": "none"}
 
 
+def _of_role(role: Any, values: Keys) -> Keys:
+    """Return the values, given to all processes, that mean something to a role."""
+    return {key: value for key, value in values.items() if role in OF_ROLES.get(key, (role,))}
+
+
 def _command(name: str, module: str, options: type[CommandOptions], values: Keys) -> list[str]:
     """Return the command of a process, whose values are checked first."""
     try:
         check_names(values, options.model_fields)
         _, overrides = split_options(options, values)
+        if module == "ros":
+            check_role(str(values.get("role", "simulation")), values)
         trained = values.get("policy") not in (None, "none", *SCRIPTED)
         config = values.get("config") or (None if trained else "hover")
         if config is not None:  # that of a trained policy is found by the process
