@@ -225,7 +225,7 @@ def test_each_vehicle_is_drawn_in_its_own_size():
         ({"vehicle.inertia": [[2e-3] * 3] * 2}, r"vehicle\.inertia lists 2 values for env\.num_drones=4"),
         ({"vehicle.inertia": [1, 2, 3, 4]}, r"vehicle\.inertia must be a list of 3 numbers"),
         ({"vehicle.preset": [*MIX[:3], "irys"]}, r"drone 3: unknown vehicle\.preset 'irys'; did you mean 'iris'\?"),
-        ({"vehicle.mass": [0.6, 3, 0.6, 0.6]}, r"drone 1: a falcon of vehicle\.mass=3 kg cannot lift itself"),
+        ({"vehicle.mass": [0.6, 3, 0.6, 0.6]}, r"drone 1: vehicle 'falcon' of vehicle\.mass=3 kg cannot lift itself"),
         ({"vehicle.preset": MIX, "payload.mass": 6}, r"2 × falcon, 1 × hummingbird, 1 × iris lift 92\.3 N, less than"),
         (
             {"vehicle.preset": MIX, "payload.mass": 4.2},

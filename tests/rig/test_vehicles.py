@@ -138,7 +138,10 @@ def test_every_field_of_a_vehicle_can_be_configured():
         ({"rotor_azimuth": (0, 90, 180, 250)}, r"vehicle\.rotor_azimuth .* does not balance: equal thrusts"),
         ({"rotor_azimuth": (0, 180, 0, 180)}, r"vehicle\.rotor_azimuth .* cannot turn the drone about each axis"),
         ({"rotor_speed_min": 5000}, r"vehicle\.rotor_speed_min=5000 rad/s must be less than the 1788"),
-        ({"mass": 3.0}, r"a falcon of vehicle\.mass=3 kg cannot lift itself with 20 N; raise vehicle\.rotor_thrust"),
+        (
+            {"mass": 3.0},
+            r"vehicle 'falcon' of vehicle\.mass=3 kg cannot lift itself with 20 N; raise vehicle\.rotor_thrust",
+        ),
         ({"mass": -1.0}, r"vehicle\.mass must be greater than 0, but is -1"),
         ({"arm": 0}, r"vehicle\.arm must be greater than 0"),
         ({"rotor_time_constant_up": 0}, r"vehicle\.rotor_time_constant_up must be greater than 0"),
