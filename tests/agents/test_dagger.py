@@ -40,6 +40,7 @@ def policy_of(trainer):
     return LearnedPolicy(trainer._content(), "the trained one")
 
 
+@pytest.mark.slow
 def test_a_team_learns_to_fly_as_its_teacher_does():
     """From where it begins, beside the same training at a learning rate that moves nothing."""
     errors = []

@@ -148,6 +148,7 @@ def test_the_contract_names_what_the_environment_tells(task):
     assert contract["drones"]["trained"] == len(contract["formation"]) == learned.config.env.num_drones
 
 
+@pytest.mark.slow
 def test_the_document_explains_every_field(tmp_path):
     text = (ROOT / "docs" / "export.md").read_text()
     for name, value in export_policy(policy(), tmp_path).items():
@@ -312,6 +313,7 @@ def test_the_operator_set_is_stated_and_can_be_an_older_one(tmp_path, monkeypatc
     assert not (tmp_path / "oldest" / "policy.onnx").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [

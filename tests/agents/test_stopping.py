@@ -10,7 +10,7 @@ import time
 
 import pytest
 import torch
-from conftest import make_trainer
+from conftest import make_trainer, slow
 
 from multilift_marl._interrupt import Watch
 from multilift_marl.agents import stopping
@@ -90,6 +90,7 @@ def test_before_there_is_anything_to_lose_one_signal_ends_it(tmp_path, kind):
     assert status == 130 and errors == "stopped\n"
 
 
+@pytest.mark.slow
 def test_an_iteration_that_takes_too_long_is_given_up_and_done_again(tmp_path, monkeypatch):
     monkeypatch.setattr(stopping, "PATIENCE", 0.2)
     monkeypatch.setattr(stopping, "LAST_PATIENCE", 600.0)
@@ -273,7 +274,7 @@ sys.exit(train.main())
 """
 
 
-@pytest.mark.parametrize(("seconds", "number"), [(600, signal.SIGTERM), (600, signal.SIGHUP), (0, None)])
+@pytest.mark.parametrize(("seconds", "number"), [(600, signal.SIGTERM), slow(600, signal.SIGHUP), (0, None)])
 def test_after_a_training_a_further_signal_still_ends_with_the_documented_status(tmp_path, seconds, number):
     command = [sys.executable, "-c", ALONE, str(seconds)]
     process = subprocess.Popen(command, cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

@@ -345,6 +345,7 @@ def exported(tmp_path_factory):
     return out / "policy.onnx"
 
 
+@pytest.mark.slow
 def test_an_exported_policy_flies_as_the_one_it_comes_from(exported, folder):
     policy, learned = ml.load_policy(exported), ml.load_policy("hover")
     config = load_config("hover", {"env.episode_seconds": 0.4, "env.num_threads": 1})

@@ -129,6 +129,7 @@ def test_trust_ends_with_the_call_and_counts_for_what_was_named_there_alone(stra
     assert "other.py, which was not run" in refusal(ml.load_policy, save_policy(stranger, {"import": [str(other)]}))
 
 
+@pytest.mark.slow
 def test_an_exported_policy_does_not_run_what_its_contract_names(stranger, capsys):
     pytest.importorskip("onnxruntime")
     assert export(["run=hover", f"out={stranger}"]) == 0

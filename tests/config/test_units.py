@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from conftest import bold_actions, make, refusal
+from conftest import bold_actions, make, refusal, slow
 
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.policies.baselines import make_scripted
@@ -50,7 +50,12 @@ def similar_rig(size: float) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    "action", [name for name in ACTIONS if name != "planner_weights"]
+    "action",
+    [
+        name if name in ("reference", "acc_rates", "ctbr") else slow(name)
+        for name in ACTIONS
+        if name != "planner_weights"
+    ],
 )  # tolerances are in SI units
 def test_similar_rigs_observe_and_fly_alike(action):
     """A whole flight, twice as large: every number that drones observe is the same at every step."""

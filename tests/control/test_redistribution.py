@@ -66,6 +66,7 @@ def test_slots_give_way_to_the_falling_drone_then_go_where_they_hold_the_payload
     assert plan_offset(4.0, held, 1.0, True) == plan_offset(99.0, held, -1.0, False) == pytest.approx(held)
 
 
+@pytest.mark.slow
 def test_drones_are_told_their_planned_offset():
     vec = make("loss_6", num_envs=8, num_drones=6, **{"task_options.loss_time": (0.5, 0.5)})
     told = vec.observation_names.index("planned_offset_0")

@@ -107,6 +107,7 @@ def test_one_that_ends_at_once_is_named_at_once_with_its_last_words(tmp_path):
     assert are_free()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("twice", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("number", [signal.SIGTERM, *map(slow, [signal.SIGINT, signal.SIGHUP, signal.SIGKILL])])
 def test_a_command_that_is_ended_leaves_nothing_behind(number, twice, tmp_path):

@@ -158,6 +158,7 @@ def test_on_the_way_to_a_task_no_drone_comes_near_another(task, seed, drones):
     np.testing.assert_allclose(way.world.state.payload_position[0], end.pose[:3], atol=0.05)
 
 
+@pytest.mark.slow
 def test_what_stands_for_an_autopilots_delay_and_integral_is_not_added_to_its_own():
     flight = Flight(ml.load_config("hover_px4"), record(report=lambda state: None), 2000)
     for config in (flight.vec.config, flight._part("track", 1.0, {})):

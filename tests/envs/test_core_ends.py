@@ -32,6 +32,7 @@ def test_a_reset_starts_the_clock_of_its_environments_only(task, cables):
     assert truncated.tolist() == [True, False, True]
 
 
+@pytest.mark.few_tasks
 def test_ends_have_one_cause(task, num_drones, cables):
     harsh = {"task_options.grace": 0.0} if task == "recover" else {}
     vec = make(

@@ -26,6 +26,7 @@ def play(vec: MultiliftVec, steps: int, row: int, first_step: int = 0) -> tuple[
     return shown, ends
 
 
+@pytest.mark.few_tasks
 def test_same_seed_same_episodes(task, num_drones, cables):
     first, second = (make(task, num_drones=num_drones, seed=7, **cables) for _ in range(2))
     assert same(first.reset()[0], second.reset()[0])
@@ -50,6 +51,7 @@ def test_different_seeds_environments_episodes_and_purposes_differ(task, cables)
     assert not any(same(a, b) for a, b in zip(start, evaluation, strict=True))
 
 
+@pytest.mark.few_tasks
 def test_an_environment_of_a_batch_is_replayed_alone(task, num_drones, cables):
     short = {"env.episode_seconds": 4.0}
     batch = make(task, num_envs=6, num_drones=num_drones, num_threads=2, seed=5, **short, **cables)

@@ -49,6 +49,7 @@ def flat(vec, info):
     return told | {f"{key}.{name}": value for key in GROUPS for name, value in info[key].items()}
 
 
+@pytest.mark.few_tasks
 @pytest.mark.parametrize("drawn", [False, True], ids=["", "drawn"])
 def test_official_checker_finds_nothing(task, cables, drawn, monkeypatch):
     monkeypatch.setattr(wrapper_utils, "Window", MagicMock())  # it tries render_mode="human", too: see test_window.py
@@ -122,6 +123,7 @@ def test_spaces_are_the_same_objects_and_hold_what_comes(task, num_drones, cable
     assert envs.observation_space.contains(envs.step(envs.action_space.sample())[0])
 
 
+@pytest.mark.few_tasks
 def test_same_numbers_as_the_core_and_the_pettingzoo_door(task, num_drones, cables):
     team = {"num_drones": num_drones, **cables}
     env, zoo = MultiliftGymnasiumEnv(task, **team), ml.parallel_env(task, **team)

@@ -12,6 +12,7 @@ from conftest import make
 EPISODES = 4 * 60
 
 
+@pytest.mark.slow
 @pytest.mark.few_tasks
 def test_episodes_keep_no_memory(task):
     vec = make(task, num_envs=4, num_threads=1)

@@ -66,6 +66,7 @@ def test_seed_starts_at_its_first_episode_and_none_goes_on():
     assert same(starts[0], starts[2])
 
 
+@pytest.mark.few_tasks
 @pytest.mark.parametrize("act", [gentle, lambda env, step: bold_actions(env.vec, step)])
 def test_same_numbers_as_the_core(task, num_drones, cables, act):
     env = parallel_env(task, num_drones=num_drones, seed=3, **BRIEF, **cables)
@@ -212,6 +213,7 @@ def test_names_and_overrides_reach_the_core():
         parallel_env("hover", **{"payload.mas": 1.0})
 
 
+@pytest.mark.few_tasks
 @pytest.mark.skipif(not hasattr(pettingzoo, "parallel_registry"), reason="PettingZoo before 1.27 has no registry")
 def test_registered_with_pettingzoo(task, cables):
     multilift_v0.register()

@@ -346,6 +346,7 @@ def test_a_policy_of_the_same_size_but_another_meaning_is_refused(run, tmp_path,
     assert policy.action_names == fast.action_names and message in refusal(policy.bind, fast)
 
 
+@pytest.mark.slow
 def test_shipped_policy_beats_the_scripts(tmp_path):
     policy = ml.load_policy("hover")
     flights = {

@@ -61,6 +61,7 @@ def test_an_anchor_that_stays_off_its_place_is_integrated():
     assert np.abs(again[0]).max() < 1e-6 and np.abs(again[1]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_drone_takes_its_share_within_two_seconds_of_joining():
     vec = make("regroup_senses", num_drones=6, **{"task_options.absent": 1.0})
     policy, at = FormationAdaptive(vec), vec.observation_names.index("attached_0")

@@ -9,7 +9,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
-from conftest import make, make_system, same
+from conftest import make, make_system, same, slow
 
 import multilift_marl as ml
 from multilift_marl.errors import RenderingError, pip_install
@@ -56,6 +56,7 @@ def test_a_frame_is_a_picture_of_the_size_asked_for():
     assert picture(vec, width=401, height=301).shape == (301, 401, 3)
 
 
+@pytest.mark.slow
 @needs_gl
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_frames_change_with_the_team_alone(camera):
@@ -71,6 +72,7 @@ def test_frames_change_with_the_team_alone(camera):
         assert (np.abs(different - first).max(axis=-1) > 40).sum() > 200
 
 
+@pytest.mark.slow
 @needs_gl
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("shape", ["box", "point"])
@@ -88,7 +90,7 @@ def test_the_target_is_seen_where_it_is(camera, shape):
 
 @needs_gl
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("num_drones", [1, 4, 16])
+@pytest.mark.parametrize("num_drones", [slow(1), 4, slow(16)])
 def test_the_whole_team_is_in_the_picture(camera, num_drones):
     vec = make(num_envs=1, num_drones=num_drones)
     vec.reset(seed=0)
@@ -215,6 +217,7 @@ def test_what_is_drawn_has_the_same_physics(num_drones):
     assert same(*states)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [pytest.param((90, 160), marks=pytest.mark.slow), (91, 161)])
 def test_a_video_holds_the_frames(tmp_path, size):
     iio, av = pytest.importorskip("imageio.v3"), pytest.importorskip("av")

@@ -52,6 +52,7 @@ def test_filters_stay_as_close_as_their_sensors(level, position, velocity, angle
     assert all(after < 1.5 * before + 1e-3 for after, before in zip(late, early, strict=True)), (early, late)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [pytest.param("mocap", marks=pytest.mark.slow), "onboard"])
 def test_filters_follow_a_fast_path(level):
     _, (position, velocity, angle) = fly(level, "formation_lead", **TRACK)

@@ -117,6 +117,7 @@ def test_a_drone_touches_beside_and_above_the_gap_alone(drone, touches):
     assert (room < 0) == touches
 
 
+@pytest.mark.slow
 def test_a_cable_touches_too():
     from multilift_marl.tasks.gate import _cable_room
 
