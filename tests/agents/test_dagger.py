@@ -138,6 +138,7 @@ def test_a_training_that_is_not_resumed_learns_from_the_first_step_on():
 RATES = {"control.action": "acc_rates", "control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("teacher", "keys"), [("payload_geometric", {}), pytest.param("mpc", RATES, marks=pytest.mark.slow)]
 )

@@ -104,6 +104,7 @@ def test_a_network_whose_actions_are_not_numbers_is_not_taken_for_the_policy(tmp
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_a_network_may_differ_by_what_rounding_makes_of_it_and_by_no_more(tmp_path, monkeypatch):
     """Actions so steep that single precision is off by more than the tolerance of others."""
     content = checkpoint()

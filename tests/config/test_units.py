@@ -49,6 +49,9 @@ def similar_rig(size: float) -> dict[str, object]:
     }  # fmt: skip
 
 
+DEFAULT = "reference", "acc_rates", "ctbr"
+
+
 @pytest.mark.parametrize(
     "action",
     [

@@ -143,6 +143,7 @@ def turned(rotation, points):
     )
 
 
+@pytest.mark.slow
 def test_it_knows_what_drones_observe_from_where_they_took_themselves_to_be_when_they_measured():
     """Two steps and more ago, at a rate."""
     vec = make(**{

@@ -193,6 +193,7 @@ def test_what_a_policy_cannot_fly_is_listed_with_the_reason(short, tmp_path):
     assert len(card["policy"]["sha256"]) == 64
 
 
+@pytest.mark.slow
 def test_a_policy_brings_its_action_interface(short, tmp_path):
     assert benchmark(["policy=hover_ctbr", f"out={tmp_path}"]) == 0
     metrics = read(tmp_path)["tasks"]["hover"]["policies"]["policy"]["metrics"]
