@@ -18,7 +18,7 @@ from multilift_marl.control.formation import Goal, place_formation
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import FORMER_FIELDS, is_plain, prebind
 from multilift_marl.math3d import turn
-from multilift_marl.mdp.env_data import View, reduce_view
+from multilift_marl.mdp.env_data import Call, View, reduce_view
 from multilift_marl.mdp.failures import FIRST_OWN
 from multilift_marl.mdp.observations import Component
 from multilift_marl.mdp.rewards import Term
@@ -26,7 +26,6 @@ from multilift_marl.mdp.stage_kernels import Ahead, approach
 from multilift_marl.sim.obstacles import Obstacles
 from multilift_marl.sim.world import World
 
-Call = Callable[[int, int], None]  # of environments lo to hi
 GOAL_FIELDS = {"position": (3,), "rotation": (3, 3), "velocity": (3,), "acceleration": (3,)}
 """Fields of a goal that a function may return, the environment first; velocity and acceleration are 0 without it."""
 _SHARED = {

@@ -110,7 +110,7 @@ def check_role(role: str, keys: Iterable[str]) -> None:
     """Refuse, by a ConfigError, keys that mean nothing to a role."""
     for key in keys:
         if role not in (roles := OF_ROLES.get(key, (role,))):
-            raise ConfigError(f"{key} means nothing to role={role}, but to {' and '.join(roles)}; leave it out")
+            raise ConfigError(f"{key} means nothing to role={role}, but to {', '.join(roles)}; leave it out")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
