@@ -124,6 +124,8 @@ def describe_error(error: BaseException) -> str:
         theirs = [frame for frame in frames if not frame.filename.startswith((_PACKAGE, "<"))]
         last = (theirs or frames)[-1]
         file, line, text = last.filename, last.lineno, " ".join(str(error).split())
+        if not theirs and len(frames) == 1:  # of the call itself, such as a wrong number of arguments
+            return f"{type(error).__name__} ({text})"
     return f"{type(error).__name__} in {Path(file or '?').name}, line {line}{f' ({text})' if text else ''}"
 
 

@@ -164,8 +164,11 @@ def _evaluation(flight: str) -> dict[str, Any]:
 
 
 def _short(metrics: dict[str, Any]) -> dict[str, list[float]]:
-    """Return [mean, low, high] of each metric."""
-    return {name: [float(f"{value:.6g}") for value in (each["mean"], *each["ci95"])] for name, each in metrics.items()}
+    """Return [mean, low, high] of each metric, [mean] of too few episodes."""
+    return {
+        name: [float(f"{value:.6g}") for value in (each["mean"], *(each["ci95"] or ()))]
+        for name, each in metrics.items()
+    }
 
 
 def _shifts(name: str) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.evaluation.metrics import join_episodes
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.plugins import find_callable
 from multilift_marl.policies.baselines import LINEAR
@@ -127,7 +128,7 @@ def fly(config: Config, script: type[Formation], seed: int, cost: Cost = "errors
     rigs = evaluated_rigs(config)
     each = max(1, config.env.num_envs // len(rigs))
     parts = [run_episodes(rig, script, each, seed, TRAINING_EVALUATION) for rig in rigs]
-    flown = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    flown = join_episodes(parts)
     tracks = config.task == "track"
     error, success = flown[find_task(config.task).ERROR], flown["success_rate"].mean()
     turned = np.zeros_like(error) if tracks else flown["payload_attitude_error_deg"]

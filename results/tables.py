@@ -241,7 +241,7 @@ def policies_csv() -> str:
             line = [task, flight, entry.title, name, seed, report["episodes"], report["seed"]]
             for metric, _, factor in METRICS:
                 values = report["metrics"].get(metric)
-                parts = ("", "", "") if values is None else (values["mean"], *values["ci95"])
+                parts = ("", "", "") if values is None else (values["mean"], *(values["ci95"] or ("", "")))
                 line += [part if part == "" else f"{factor * part:.6g}" for part in parts]
             lines.append(line)
     return _csv(head, lines)

@@ -24,6 +24,7 @@ from multilift_marl.agents.policy import load_policy
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, parse_overrides
 from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.metrics import bootstrap_seeds, wilson
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_scripted
@@ -101,6 +102,8 @@ def main(arguments: list[str]) -> None:
     policies = [load_policy(name) for name in names]
     config = build_config(policies[0].config.model_dump(), values)
     seeds = [f" of seed {policy.config.seed}" if len(policies) > 1 else "" for policy in policies]
+    if len(set(seeds)) < len(seeds):
+        raise ConfigError("policies of one recipe are compared by their training seeds, but two have the same one")
     teams: dict[str, Callable[[MultiliftVec], Policy]] = {}
     for seed, policy in zip(seeds, policies, strict=True):
         teams[f"learned{seed}"] = policy.bind

@@ -31,7 +31,8 @@ from multilift_marl.schema.training import TrainConfig
 SMALL = 0.05
 """[-] differences of actions below which they are squared: above it the network takes sides, and no mean."""
 REFILL = 20
-"""Batches that a resumed training collects first, or as many as there were: few steps alone would be overfitted."""
+"""Batches that a resumed training collects first, at most as many as there were and half of those to come: few steps
+alone would be overfitted."""
 TEACHER = 4  # purpose of seeds, beside those of `envs/core.py` and `rollouts.NOISE`
 
 
@@ -92,8 +93,8 @@ class TaughtFlights(LearningRollouts):
 
     def share(self, iteration: int) -> float:
         """Return the share of episodes that the teacher flies if they begin in an iteration."""
-        steps = iteration * self._total * self._horizon
-        return max(1.0 - steps / max(self._settings.handover, 1), self._settings.teacher_share)
+        steps, handover = iteration * self._total * self._horizon, self._settings.handover
+        return max(1.0 - steps / handover if handover else 0.0, self._settings.teacher_share)
 
     def collect(self, iteration: int) -> Batches:
         """Fly the next steps of all environments, keep them, and return them as one batch of size [E, T]."""
@@ -102,6 +103,7 @@ class TaughtFlights(LearningRollouts):
         seed = np.random.SeedSequence([vec.config.seed, vec.first_env], spawn_key=(TEACHER, iteration))
         rng = np.random.default_rng(seed)
         if self._by_teacher is None:
+            self._teacher.reset()
             self._by_teacher = rng.uniform(size=vec.num_envs) < share
         rows: list[dict[str, np.ndarray]] = []
         observation, _ = vec.current()
@@ -181,6 +183,7 @@ class DaggerRollouts(LearningRollouts):
         self.flights = [TaughtFlights(env, learner, total, max(capacity, 1)) for env in envs]
         self._all = RigRollouts(self.flights)
         self._first: int | None = None  # iteration in which it began to collect
+        self._refill = 0  # batches that it collects before it learns
 
     def collect(self, iteration: int) -> Batches:
         """See `LearningRollouts.collect`; a batch for each rig."""
@@ -189,7 +192,9 @@ class DaggerRollouts(LearningRollouts):
         torch.set_num_threads(self._train.threads)
         if self._first is None:
             self._first = iteration
-        loss = self._learn() if iteration + 1 - self._first >= min(self._first, REFILL) else {}
+            to_come = -(-self._train.frames // (self._total * self._train.horizon)) - iteration
+            self._refill = min(iteration, REFILL, to_come // 2)
+        loss = self._learn() if iteration + 1 - self._first >= self._refill else {}
         torch.set_num_threads(1)
         share = self.flights[0].share(iteration)
         self.values = loss | {"teacher_share": share, "learning_seconds": time.perf_counter() - begin}

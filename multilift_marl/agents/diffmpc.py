@@ -24,12 +24,13 @@ from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
 from multilift_marl.planning.team_weights import TeamWeights
 from multilift_marl.policies.planner_weights import PlannerWeights
+from multilift_marl.schema.planner import PlannerConfig
 from multilift_marl.schema.training import TrainConfig
 
 
-def check_diffmpc(train: TrainConfig, action: str, distributed: bool) -> None:
+def check_diffmpc(train: TrainConfig, action: str, planner: PlannerConfig) -> None:
     """Refuse, by a ConfigError, what cannot be trained through a planner."""
-    if distributed:
+    if planner.distributed:
         raise ConfigError(
             "train.algorithm=diffmpc follows derivatives of the team's plan; set planner.distributed=false, and "
             "true to fly what was learned"
@@ -37,6 +38,11 @@ def check_diffmpc(train: TrainConfig, action: str, distributed: bool) -> None:
     if action != "planner_weights":
         raise ConfigError(
             f"train.algorithm=diffmpc learns the weights of a planner; set control.action=planner_weights, not {action}"
+        )
+    if planner.lead is not None:
+        raise ConfigError(
+            "train.algorithm=diffmpc has the derivatives of plans that lead as much as the rotors lag; leave "
+            "planner.lead out"
         )
     for key in ("gru", "workers", "rigs"):
         if getattr(train, key):
@@ -65,11 +71,12 @@ class DiffMpcRollouts(LearningRollouts):
         commander = env.vec.commander
         assert isinstance(commander, PlannerWeights) and isinstance(commander.planner, WeightedPlanner)
         self._commander = commander
-        vec, train = env.vec, learner.config
+        vec, train, planner = env.vec, learner.config, env.vec.config.planner
         self._settings, self._horizon = train.diffmpc, train.horizon
         slowest = max(vehicle.rotor_time_constant for vehicle in vec.world.system.vehicles)
         response = 1.0 - exp(-vec.task.dt / slowest) if slowest else 1.0
         self._planner = commander.planner
+        self._expected = round(planner.delay / vec.task.dt)
         self._flight = FlightGradient(self._planner, self._settings.window, vec.task.dt, response)
         self._loss = loss_weights(train, vec)
         shape = self._settings.window + 1, vec.num_envs, vec.num_drones
@@ -115,7 +122,8 @@ class DiffMpcRollouts(LearningRollouts):
             kept[slot] = weights
         rows.append(list_step(outcome, vec))
         flight.tape.cut[slot] |= rows[-1]["done"][:, 0] | began
-        flight.tape.late[slot] = vec.task.view.action_delay
+        # A plan begins where the team will be after `planner.delay`, and so does what the tape keeps.
+        flight.tape.late[slot] = np.maximum(vec.task.view.action_delay - self._expected, 0)
 
     def _learn(self) -> tuple[float, float]:
         """Follow the gradient of the flights in the window once; return their loss and the gradient's norm."""

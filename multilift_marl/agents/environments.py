@@ -34,7 +34,7 @@ def training_environment(config: Config) -> Config:
     for env in (config.env, environment.env):
         check_communication(config.train, env)
     if config.train.algorithm == "diffmpc":
-        check_diffmpc(config.train, environment.control.action, environment.planner.distributed)
+        check_diffmpc(config.train, environment.control.action, environment.planner)
     if config.train.algorithm == "dagger":
         check_dagger(config.train)
     return environment

@@ -19,7 +19,7 @@ from multilift_marl.agents.rigs import evaluated_rigs
 from multilift_marl.config.config import Config
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.evaluation.metrics import is_better, summarize
+from multilift_marl.evaluation.metrics import FEWEST, is_better, join_episodes, summarize
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import make_base_policy
 from multilift_marl.policies.policy import Policy
@@ -120,6 +120,11 @@ class Evaluator:
         if self.error not in flown:
             hint = nearest(self.error, [name for name, value in flown.items() if value.dtype == float])
             raise ConfigError(f"task {self.config.task}: ERROR names no metric, '{self.error}'{hint}")
+        if not np.isfinite(flown[self.error]).all():
+            raise ConfigError(
+                f"task {self.config.task}: the metric '{self.error}', by which policies are compared (ERROR), is not "
+                "finite in some episodes; give it a number in each, such as a bound"
+            )
         return [float(flown["success_rate"].mean()), -float(flown[self.error].mean())]
 
     def _score_anew(self) -> None:
@@ -142,9 +147,9 @@ class Evaluator:
         """Return whether a policy beats the best one on fresh episodes, too.
 
         The policy that training began with gives way to a gain beyond the noise; among trained ones, whose
-        gains add up in steps smaller than that, the means decide.
+        gains add up in steps smaller than that, and in too few episodes for any noise, the means decide.
         """
-        untrained = self.best_policy().frames == 0
+        untrained = self.best_policy().frames == 0 and self.config.eval.episodes >= FEWEST
         flown, best = self._fly(candidate.bind, iteration), self._fly(self.best_policy().bind, iteration)
         return is_better(flown, best, self.error, beyond_noise=untrained)
 
@@ -156,4 +161,4 @@ class Evaluator:
         # Rounded up, so that each rig has its share; blocks of episodes never meet.
         each, first = -(-self.config.eval.episodes // len(rigs)), block * _BLOCK
         flown = [run_episodes(rig, make_policy, each, seed, TRAINING_EVALUATION, first=first) for rig in rigs]
-        return {name: np.concatenate([metrics[name] for metrics in flown]) for name in flown[0]}
+        return join_episodes(flown)

@@ -20,6 +20,8 @@ from multilift_marl.tasks import find_task
 
 _Z = 1.959964  # two-sided 95 %
 _RESAMPLES = 2000
+_AT_ONCE = 1_000_000  # values drawn, so that many episodes take no gigabytes
+FEWEST = 10  # episodes that an interval of a mean takes; of fewer a bootstrap's is far too narrow, of one it is a point
 _APART = (  # also over the episodes without failure, and over the successful ones
     "payload_position_error_m", "payload_attitude_error_deg", "payload_tilt_deg", "payload_rmse_m", "settling_time_s",
 )  # fmt: skip
@@ -63,8 +65,10 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 def bootstrap(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
     """Return the 95 % percentile bootstrap interval of the mean of `values` (n,), the same for the same values."""
     rng = np.random.default_rng(seed)
-    means = values[rng.integers(0, len(values), (_RESAMPLES, len(values)))].mean(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
+    count, rows = len(values), max(1, _AT_ONCE // len(values))
+    parts = [min(rows, _RESAMPLES - done) for done in range(0, _RESAMPLES, rows)]
+    means = [values[rng.integers(0, count, (part, count))].mean(axis=1) for part in parts]
+    low, high = np.quantile(np.concatenate(means), [0.025, 0.975])
     return float(low), float(high)
 
 
@@ -88,9 +92,19 @@ def bootstrap_seeds(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def join_episodes(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return what `run_episodes` measured in several parts as one; metrics that one lacks are left out.
+
+    A single drone has no separation, a team without obstacles no clearance.
+    """
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+
 def summarize(episodes: dict[str, np.ndarray], causes: Sequence[str] = CAUSES) -> dict[str, dict[str, Any]]:
     """Return {metric: {"mean", "ci95": [low, high]}} of what `run_episodes` measured.
 
+    Episodes where a metric is not finite have none; means of fewer than `FEWEST` have no interval ("ci95": None).
     Errors include failed episodes at the failure bound; "<metric>_held" takes the episodes without failure alone,
     "<metric>_successful" the successful ones; they are missing where there are none.
 
@@ -102,7 +116,7 @@ def summarize(episodes: dict[str, np.ndarray], causes: Sequence[str] = CAUSES) -
     count = len(success)
     result = {"success_rate": _rate(int(success.sum()), count)}
     for name, values in episodes.items():
-        if name in ("success_rate", "failure_cause") or is_shortfall(name):
+        if name in ("success_rate", "failure_cause") or is_shortfall(name) or not np.isfinite(values).any():
             continue
         result[name] = _rate(int(values.sum()), count) if values.dtype == bool else _mean(values)
         for kind, chosen in (("held", cause == 0), ("successful", success)):
@@ -119,11 +133,10 @@ def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> d
 
     Both on the same episodes, (n,) each; the form is that of `summarize`. Metrics that one of them lacks are left out.
     """
-    return {
-        name: _mean(values.astype(float) - baseline[name].astype(float))
-        for name, values in policy.items()
-        if name in baseline and name != "failure_cause" and not is_shortfall(name)
-    }
+    names = [name for name in policy if name in baseline and name != "failure_cause" and not is_shortfall(name)]
+    with np.errstate(invalid="ignore"):  # inf - inf
+        differences = {name: policy[name].astype(float) - baseline[name].astype(float) for name in names}
+    return {name: _mean(values) for name, values in differences.items() if np.isfinite(values).any()}
 
 
 def is_better(
@@ -147,16 +160,20 @@ def is_better(
 def is_gain(success: np.ndarray, error: np.ndarray) -> bool:
     """Return whether paired differences of success and error (n,) are an improvement beyond the noise.
 
-    That is in success or, succeeding no less often, in error: the 95 % interval of the difference leaves out zero.
-    Errors are compared in episodes that end alike: the others differ by metres, and count as successes already.
+    Of fewer than `FEWEST` nothing is. That is in success or, succeeding no less often, in error: the 95 % interval of
+    the difference leaves out zero. Errors are compared in episodes that end alike: the others differ by metres, and
+    count as successes already.
     """
+    if success.size < FEWEST:
+        return False
     low, _ = bootstrap(success)
     alike = error[success == 0]
-    return bool(low > 0 or (success.mean() >= 0 and alike.size > 0 and bootstrap(alike)[1] < 0))
+    return bool(low > 0 or (success.mean() >= 0 and alike.size >= FEWEST and bootstrap(alike)[1] < 0))
 
 
 def _mean(values: np.ndarray) -> dict[str, Any]:
-    return {"mean": float(values.mean()), "ci95": list(bootstrap(values))}
+    values = values[np.isfinite(values)]
+    return {"mean": float(values.mean()), "ci95": list(bootstrap(values)) if values.size >= FEWEST else None}
 
 
 def _rate(successes: int, trials: int) -> dict[str, Any]:
@@ -255,8 +272,8 @@ def _shown(row: dict[str, Any]) -> tuple[tuple[str, bool], ...]:
 
 
 def _gain(value: dict[str, Any], digits: int) -> str:
-    mean, low, high = (f"{100 * each:+.{digits}f}" for each in (value["mean"], *value["ci95"]))
-    return f"{mean} ({low}, {high})"
+    mean, *bounds = (f"{100 * each:+.{digits}f}" for each in (value["mean"], *(value["ci95"] or ())))
+    return f"{mean} ({', '.join(bounds) or 'too few episodes'})"
 
 
 def _align(cells: list[list[str]]) -> str:
@@ -272,5 +289,5 @@ def _align(cells: list[list[str]]) -> str:
 def _cell(value: dict[str, Any] | None, factor: float, digits: int) -> str:
     if value is None:
         return "-"
-    low, high = value["ci95"]
-    return f"{factor * value['mean']:.{digits}f} ({factor * low:.{digits}f} - {factor * high:.{digits}f})"
+    mean, *bounds = (f"{factor * each:.{digits}f}" for each in (value["mean"], *(value["ci95"] or ())))
+    return f"{mean} ({' - '.join(bounds)})" if bounds else mean

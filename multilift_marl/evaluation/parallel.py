@@ -16,6 +16,7 @@ from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.metrics import join_episodes
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.evaluation.trajectories import Recording, TrajectoryWriter, make_arrays
 from multilift_marl.policies.policy import Policy
@@ -107,7 +108,7 @@ def evaluate_parallel(
         else:
             _idle.append(worker)
     # In the order of the episodes, not in that in which parts came back.
-    return {name: np.concatenate([flown[first][name] for first, _ in parts]) for name in flown[0]}
+    return join_episodes([flown[first] for first, _ in parts])
 
 
 class _Worker:

@@ -189,7 +189,9 @@ def plot_card(path: str | Path, card: Mapping[str, Any]) -> None:
                 row["policies"][label]["metrics"]["success_rate" if axes is success else row["error"]]
                 for _, row in rows
             ]
-            low, mean, high = 100 * np.array([[m["ci95"][0], m["mean"], m["ci95"][1]] for m in found]).reshape(-1, 3).T
+            mean = 100 * np.array([each["mean"] for each in found])
+            bounds = [each["ci95"] or (each["mean"], each["mean"]) for each in found]
+            low, high = 100 * np.array(bounds).reshape(-1, 2).T
             heights = np.array([y for y, _ in rows]) + 0.26 * (place - 1)
             title = {"policy": card["policy"]["name"], "baseline": "best baseline", "shipped": "shipped policy"}[label]
             axes.barh(

@@ -11,6 +11,7 @@ from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
+from multilift_marl.evaluation.metrics import join_episodes
 from multilift_marl.evaluation.outline import obstacle_corners, payload_surface
 from multilift_marl.evaluation.shortfalls import ShortfallMeter
 from multilift_marl.mdp.failures import MAX_DISTANCE
@@ -90,7 +91,7 @@ def run_episodes(
         parts.append(measure_episodes(vec, policy, observation, on_step))
         if progress is not None:
             progress(done + count)
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return join_episodes(parts)
 
 
 def _fix_parameters(vec: MultiliftVec, factors: Mapping[str, Any]) -> dict[str, Any]:

@@ -42,12 +42,21 @@ class Criterion(NamedTuple):
     """Whether it counts throughout `Task.success_windows`; otherwise at the end of the episode."""
 
 
-def rest_criteria(bounds: Any, errors: Errors, state: SystemState) -> tuple[Criterion, ...]:
-    """Return what `rewards.is_at_rest` asks for, its finite bounds; nothing where `bounds` are no RestBounds."""
+def rest_criteria(
+    bounds: Any, errors: Errors, state: SystemState, place: np.ndarray | None = None
+) -> tuple[Criterion, ...]:
+    """Return what `rewards.is_at_rest` asks for, its finite bounds; nothing where `bounds` are no RestBounds.
+
+    With `place`, live (E, 3), the payload is to rest there [m], wherever its target is.
+    """
     if not isinstance(bounds, RestBounds):
         return ()
+
+    def distance() -> np.ndarray:
+        return errors.distance if place is None else length(state.payload_position - place)
+
     found = (
-        Criterion("distance_m", bounds.distance, lambda: errors.distance - bounds.distance),
+        Criterion("distance_m", bounds.distance, lambda: distance() - bounds.distance),
         Criterion("angle_deg", float(np.rad2deg(bounds.angle)), lambda: np.rad2deg(errors.angle - bounds.angle)),
         Criterion("speed_m_s", bounds.speed, lambda: length(state.payload_velocity) - bounds.speed),
         Criterion("body_rate_rad_s", bounds.body_rate, lambda: length(state.payload_body_rates) - bounds.body_rate),

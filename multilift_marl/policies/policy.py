@@ -67,8 +67,23 @@ class OwnPolicy:
         """Begin new episodes in the environments of the mask (E,) bool (None: all)."""
         self._call(".reset", self.policy.reset, np.ones(self._shape[0], bool) if mask is None else mask)
 
-    def _call(self, method: str, function: Any, argument: Any) -> Any:
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Return what the policy says of the episodes so far, numbers (E,) by name."""
+        if not callable(function := getattr(self.policy, "metrics", None)):
+            return {}
+        found = self._call(".metrics", function)
         try:
-            return function(argument)
+            numbers = {str(name): np.asarray(values, float) for name, values in found.items()}
+        except (AttributeError, TypeError, ValueError):
+            numbers = {"": np.zeros(0)}
+        if any(each.shape != self._shape[:1] for each in numbers.values()):
+            raise ConfigError(
+                f"{self._name}.metrics must return {{name: numbers ({self._shape[0]},)}}, not {found!r:.200}"
+            )
+        return numbers
+
+    def _call(self, method: str, function: Any, *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
         except Exception as error:  # a user's code may raise anything
             raise ConfigError(f"{self._name}{method} failed: {describe_error(error)}") from error

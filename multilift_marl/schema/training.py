@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 
 from multilift_marl.errors import nearest
 from multilift_marl.schema.files import pin_overrides, pin_policy
-from multilift_marl.schema.values import Float, Int, NotNegative, Section
+from multilift_marl.schema.values import Float, Int, Section
 
 BASE_POLICIES = (
     "formation", "formation_integral", "formation_feedback", "formation_gusts", "formation_lead", "formation_narrow",
@@ -21,6 +21,7 @@ BASE_POLICIES = (
 GAINS = Path(__file__).resolve().parents[1] / "policies" / "gains"
 TUNED = tuple(sorted(path.stem for path in GAINS.glob("*.yaml")))
 """Linear policies by tuned gains, a file each."""
+_Weight = Annotated[Float, Field(ge=0, le=1e6)]  # of a loss in single precision
 _RESULTS = Path(__file__).resolve().parents[2] / "results"
 _FORMER = re.compile(r"(?:.*/)?searched\w*\.py:(\w+)")  # where those were, beside the package
 
@@ -85,7 +86,7 @@ class DiffMpcConfig(Section):
     fresh_adam: bool = Field(
         False, description="whether Adam begins anew at each update, so that it follows signs alone (Auto-Multilift)"
     )
-    loss: tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative, NotNegative] = Field(
+    loss: tuple[_Weight, _Weight, _Weight, _Weight, _Weight, _Weight] = Field(
         (1.0, 0.1, 0.0, 0.05, 0.01, 0.0),
         description="weights of squared deviations: the payload's position [1/m²] and attitude [1/rad²], cables' "
         "direction, velocity [s²/m²], body rates [s²/rad²], cables' rates [s²]",
@@ -152,8 +153,8 @@ class TrainConfig(Section):
     gamma: Float = Field(0.99, ge=0, le=1, description="[-] discount of one policy step")
     gae_lambda: Float = Field(0.985, ge=0, le=1, description="[-] of generalised advantage estimation")
     clip: Float = Field(0.2, gt=0, description="[-] PPO's clipping range")
-    entropy: Float = Field(0.0, ge=0, description="[-] weight of the entropy bonus")
-    value_weight: Float = Field(1.0, ge=0, description="[-] weight of the critic's loss")
+    entropy: _Weight = Field(0.0, description="[-] weight of the entropy bonus")
+    value_weight: _Weight = Field(1.0, description="[-] weight of the critic's loss")
     max_grad_norm: Float = Field(1.0, gt=0, description="[-] gradient clipping")
     target_kl: Float = Field(0.03, gt=0, description="[-] approximate KL that ends an update early")
     hidden: tuple[Annotated[Int, Field(ge=1, le=8192)], ...] = Field(

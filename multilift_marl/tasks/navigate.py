@@ -307,7 +307,7 @@ class Navigate(Task):
 
     def criteria(self) -> tuple[Criterion, ...]:
         """See `Task.criteria`."""
-        found = rest_criteria(self.settings.bounds, self.errors, self.world.state)
+        found = rest_criteria(self.settings.bounds, self.errors, self.world.state, self.own.goal)
         return (*found, tension_criterion(self.own.peak_tension, self.options.success_tension))
 
     def preview_targets(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

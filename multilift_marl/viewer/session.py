@@ -53,7 +53,7 @@ class Session:
         self._makers = _fitting(vec, learned)
         self.policies = tuple(self._makers)
         self.policy = self._checked(policy if policy is not None else next(iter(self._makers), "none"), learned)
-        self._policy = self._makers[self.policy](vec)
+        self._policy, self._chosen = self._makers[self.policy](vec), self.policy
         self.paused = False
         self.speed = 1.0
         self.outcome = ""
@@ -61,6 +61,7 @@ class Session:
         self._calm = np.zeros(3)  # [N] on the payload without a push
         self._push_left = 0  # policy steps
         self._observation, _ = vec.reset(seed=seed)
+        self._policy.reset()
 
     def advance(self, seconds: float) -> int:
         """Let the clock run on by `seconds` of the spectator's time; return how many policy steps were taken."""
@@ -108,15 +109,20 @@ class Session:
             self._start()
 
     def choose(self, policy: str) -> None:
-        """Let another policy control the team from now on.
+        """Let another policy control the team, as soon as its kernels are compiled.
 
         Raises:
             ConfigError: there is no such policy here.
         """
+        self._chosen = self._checked(policy, {})
+        # The first step of a policy may compile for seconds, in which the team flies on.
+        fresh = self._makers[policy](self.vec)
+        fresh.reset()
+        fresh.act(self._observation.copy())
         with self._lock:
-            self.policy = self._checked(policy, {})
-            self._policy = self._makers[policy](self.vec)
-            self._policy.reset()
+            if self._chosen == policy:  # not another one meanwhile
+                self.policy, self._policy = policy, fresh
+                self._policy.reset()
 
     def push(self, heading: float, elevation: float, force: float) -> None:
         """Push the payload for PUSH_SECONDS.

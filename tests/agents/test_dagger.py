@@ -60,6 +60,35 @@ def test_the_teacher_flies_first_and_the_learner_later():
     assert shares[0] == 1.0 and shares[5] == pytest.approx(0.5) and shares[-1] == 0.0
 
 
+def test_without_a_handover_the_learner_flies_at_once():
+    trainer = Trainer(config(**{"train.dagger.handover": 0, "train.dagger.teacher_share": 0.0}), Path("unused"))
+    assert trainer.step()["teacher_share"] == 0.0
+    assert not trainer.rollouts.flights[0]._by_teacher.any()
+
+
+def test_a_teacher_begins_with_its_episodes(tmp_path, monkeypatch):
+    """As every policy that flies, also one that has nothing before."""
+    (tmp_path / "teach.py").write_text(
+        "import numpy as np\nclass T:\n    def __init__(self, vec): self.shape = vec.num_envs, vec.num_drones\n"
+        "    def reset(self, mask): self.count = np.zeros(self.shape[0])\n"
+        "    def act(self, observation):\n        self.count += 1\n        return np.zeros((*self.shape, 4))\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    trainer = Trainer(config(**{"train.dagger.teacher": "teach.py:T"}), Path("unused"))
+    assert "loss" in trainer.step()
+    assert (trainer.rollouts.flights[0]._teacher.policy.count == 25).any()
+
+
+def test_a_training_that_is_resumed_near_its_end_learns_in_what_is_left(tmp_path):
+    trainer = new_run(config(), "first", tmp_path)
+    for _ in range(36):
+        trainer.step()
+    trainer.evaluate()
+    trainer.save("last")
+    again = resume_run(trainer.folder, {})
+    assert ["loss" in again.step() for _ in range(4)] == [False, True, True, True]
+
+
 def test_steps_are_kept_as_they_were_flown_and_the_oldest_make_room():
     """Of a step that only resets nothing is kept."""
     small = {"train.dagger.capacity": 150, "train.dagger.teacher_share": 1.0, "env.episode_seconds": 0.5}

@@ -77,6 +77,14 @@ def test_a_run_is_evaluated_and_exported_as_any_other(tmp_path):
     assert load_policy(next((tmp_path / "exported").glob("*.onnx"))).act(observation) == pytest.approx(action, abs=1e-5)
 
 
+@pytest.mark.parametrize("steps, expected, late", [(2, 0.04, 0), (3, 0.04, 1), (1, 0.04, 0), (2, 0.0, 2)])
+def test_delay_that_plans_expect_does_not_count_as_lateness(steps, expected, late):
+    own = {"randomization.action_delay": [steps, steps], "planner.delay": expected, "planner.steps": 10}
+    trainer = Trainer(config(**own), Path("unused"))
+    trainer.step()
+    assert (trainer.rollouts._flight.tape.late == late).all()
+
+
 @pytest.mark.parametrize(
     ("own", "message"),
     [
@@ -84,6 +92,8 @@ def test_a_run_is_evaluated_and_exported_as_any_other(tmp_path):
         ({"train.gru": 8}, r"has no train\.gru"),
         ({"train.rigs": [{"payload.mass": 1.0}, {"payload.mass": 2.0}]}, r"has no train\.rigs"),
         ({"train.horizon": 20}, r"train\.horizon=20 holds no window"),
+        ({"planner.lead": 0.1}, r"leave planner\.lead out"),
+        ({"train.diffmpc.loss": [1e45, 0, 0, 0, 0, 0]}, r"train\.diffmpc\.loss"),
     ],
 )
 def test_what_cannot_be_trained_so_is_refused(own, message):

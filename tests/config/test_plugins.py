@@ -302,6 +302,19 @@ def test_a_class_of_ones_own_flies_with_any_action_interface(folder, action):
     assert policy.policy.count.tolist() == [0, 0, 0]
 
 
+def test_metrics_of_ones_own_policy_are_reported(folder):
+    (folder / "told.py").write_text(
+        "import mine\nimport numpy as np\nclass Told(mine.Lean):\n"
+        "    def metrics(self): return {'steps_flown': self.count, 'never': [np.nan] * len(self.count)}\n"
+        "class Wrong(mine.Lean):\n    def metrics(self): return {'steps': 3.0}\n"
+    )
+    assert evaluate(["policy=told.py:Told", "control.action=acceleration", "baseline=none", *SHORT]) == 0
+    report = json.loads(next(folder.glob("runs/told.Told-hover/eval/*/metrics.json")).read_text())
+    assert report["policy"]["steps_flown"]["mean"] > 0 and "never" not in report["policy"]
+    wrong = make_scripted("told.py:Wrong", make(num_envs=2))
+    assert "told.py:Wrong.metrics must return {name: numbers (2,)}, not {'steps': 3.0}" in refusal(wrong.metrics)
+
+
 def test_evaluation_and_viewer_fly_a_class_of_ones_own(folder):
     assert evaluate(["policy=mine:Lean", "control.action=acceleration", "baseline=none", *SHORT]) == 0
     report = json.loads(next(folder.glob("runs/mine.Lean-hover/eval/*/metrics.json")).read_text())
@@ -311,13 +324,26 @@ def test_evaluation_and_viewer_fly_a_class_of_ones_own(folder):
     session.step()
 
 
+def test_the_viewer_begins_a_policys_episodes(folder):
+    (folder / "late.py").write_text(
+        "import mine\nclass Late(mine.Lean):\n"
+        "    def reset(self, mask): self.begun = True\n"
+        "    def act(self, observation): return super().act(observation) if self.begun else None\n"
+    )
+    make_session({"policy": "late.py:Late"})[0].step()
+
+
 @pytest.mark.parametrize(
     ("name", "source", "message"),
     [
         ("mine:Leen", "", "policy=mine:Leen: mine holds no class 'Leen'; did you mean 'Lean'?"),
         ("nosuch:Lean", "", "policy=nosuch: there is no such module"),
         ("other:", "", "policy=other: is not of the form module:Class"),
-        ("other:P", "class P:\n    def __init__(self): pass", "policy other:P failed: TypeError in "),
+        (
+            "other:P",
+            "class P:\n    def __init__(self): pass",
+            "policy other:P failed: TypeError (P.__init__() takes 1 ",
+        ),
         ("other:P", "class P:\n    def __init__(self, vec): pass", "policy other:P has no method 'act'"),
         ("other:act", "return 0 * obs", "policy other:act.act must return finite floating point numbers (1, 4, 4)"),
         ("other:act", "return np.zeros((1, 4, 4), int)", "but returned int64 (1, 4, 4)"),

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from multilift_marl.evaluation.metrics import (
     _ROWS,
+    FEWEST,
     bootstrap,
     bootstrap_seeds,
     compare,
     format_table,
     is_better,
     is_gain,
+    join_episodes,
     summarize,
     wilson,
 )
@@ -45,6 +49,53 @@ def test_a_means_interval_is_that_of_resampled_means():
     assert low == pytest.approx(values.mean() - half, abs=0.15 * half)
     assert high == pytest.approx(values.mean() + half, abs=0.15 * half)
     assert bootstrap(values) == (low, high) != bootstrap(values, seed=1)
+
+
+def test_many_episodes_are_drawn_in_parts_and_as_those_of_few(monkeypatch):
+    values = np.random.default_rng(3).exponential(2.0, 37)
+    whole = bootstrap(values)
+    monkeypatch.setattr("multilift_marl.evaluation.metrics._AT_ONCE", 100)
+    assert bootstrap(values) == whole
+
+
+def test_of_few_episodes_no_mean_has_an_interval_and_no_policy_is_better():
+    """Of equal policies the bootstrap alone calls one better in a half of single episodes."""
+    rng = np.random.default_rng(0)
+    for count in range(1, FEWEST):
+        few = episodes(count)
+        assert summarize(few)["energy_j"] == {"mean": pytest.approx(few["energy_j"].mean()), "ci95": None}
+        assert summarize(few)["success_rate"]["ci95"] == list(wilson(int(few["success_rate"].sum()), count))
+        assert not is_gain(np.zeros(count), np.full(count, -1.0))
+    assert is_gain(np.zeros(FEWEST), np.full(FEWEST, -1.0))
+    assert not is_gain(np.r_[np.zeros(FEWEST - 1), [1, -1]], np.full(FEWEST + 1, -1.0))
+    wrong = sum(is_gain(np.zeros(FEWEST), rng.normal(size=FEWEST)) for _ in range(1000))
+    assert wrong < 70
+
+
+def test_episodes_where_a_metric_has_no_number_do_not_count_in_it():
+    first, second = episodes(), episodes(seed=1)
+    for each, gaps in ((first, slice(0, 8)), (second, slice(5, 11))):
+        each["own"] = np.arange(40.0) ** 2
+        each["own"][gaps] = np.nan
+        each["never"] = np.full(40, np.inf)
+    assert summarize(first)["own"] == {
+        "mean": pytest.approx(first["own"][8:].mean()), "ci95": list(bootstrap(first["own"][8:]))
+    }  # fmt: skip
+    assert compare(first, second | {"own": 2 * second["own"]})["own"]["mean"] == pytest.approx(
+        -(np.arange(11.0, 40.0) ** 2).mean()
+    )
+    for found in (summarize(first), compare(first, second)):
+        assert "never" not in found
+        json.dumps(found, allow_nan=False)
+
+
+def test_what_only_some_teams_have_is_left_out_of_their_common_episodes():
+    first, second = episodes(3), episodes(5)
+    del second["energy_j"]
+    for parts in ((first, second), (second, first)):
+        found = join_episodes(parts)
+        assert set(found) == set(second)
+        assert found["return"].tolist() == [*parts[0]["return"], *parts[1]["return"]]
 
 
 def test_an_interval_over_training_seeds_has_the_variances_of_seeds_and_of_episodes():

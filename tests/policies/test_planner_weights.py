@@ -109,10 +109,18 @@ def test_weights_are_the_drones_own_and_means_of_what_they_say():
     assert (np.hstack(weight_map(3)) != 0).any(axis=1).all()
 
 
-@pytest.mark.parametrize("limits", ["soft", "hard"])
-def test_derivatives_by_actions_are_differences_of_simulated_flights(limits):
+@pytest.mark.parametrize(
+    "own",
+    [
+        {"planner.limits": "soft"},
+        {"planner.limits": "hard"},
+        {"randomization.action_delay": [2, 2], "planner.delay": 0.04},  # expected: not late
+    ],
+    ids=["soft", "hard", "late"],
+)
+def test_derivatives_by_actions_are_differences_of_simulated_flights(own):
     """The flights are MuJoCo's, with motor lag and controllers; the derivatives those of the planner's model."""
-    keys = {"planner.limits": limits, "planner.steps": 10, "planner.position": 0.3, "task_options.speed": 2.0}
+    keys = own | {"planner.steps": 10, "planner.position": 0.3, "task_options.speed": 2.0}
     vec = ml.make_vec("track", num_envs=1, **WEIGHTS, **keys, **{"task_options.acceleration": 4.0})
     commander, steps = vec.commander, 20
     vec.reset(seed=1)

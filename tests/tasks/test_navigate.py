@@ -212,6 +212,17 @@ def test_given_maps_that_cannot_be_are_refused(change, said):
     assert said in refusal(make, "navigate", **(GIVEN | change))
 
 
+def test_what_an_episode_misses_is_the_distance_from_the_goal():
+    """Not from the target, which is under way."""
+    vec = reset(2, speed=0.5)
+    clear_all(vec)
+    (criterion,) = (each for each in vec.task.criteria() if each.name == "distance_m")
+    vec.step(zeros(vec))
+    away = np.linalg.norm(vec.world.state.payload_position - vec.task.own.goal, axis=1)
+    assert vec.task.errors.distance.max() < 0.5 < away.min()
+    np.testing.assert_allclose(criterion.excess(), away - criterion.bound, atol=1e-12)
+
+
 def test_a_straight_flight_without_obstacles_succeeds():
     vec = reset(2)
     clear_all(vec)

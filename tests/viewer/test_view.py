@@ -5,12 +5,14 @@ import http.client
 import socket
 import subprocess
 import sys
+import threading
 import urllib.request
 
 import numpy as np
 import pytest
 
 from multilift_marl.errors import CheckpointError, ConfigError, RenderingError, pip_install
+from multilift_marl.policies.baselines import make_scripted
 from multilift_marl.viewer import inputs
 from multilift_marl.viewer.__main__ import main, make_session
 from multilift_marl.viewer.page import HOST, Page, _group
@@ -130,6 +132,33 @@ def test_policies_change_in_flight():
     with pytest.raises(ConfigError, match="unknown policy 'formatio'; did you mean 'formation'"):
         flight.choose("formatio")
     flight.advance(0.2)
+
+
+def test_the_team_flies_on_while_a_policy_that_is_chosen_compiles():
+    flight, asked, go_on = session(policy="formation"), threading.Event(), threading.Event()
+
+    class Slow:
+        def __init__(self, vec):
+            self.policy = make_scripted("formation_integral", vec)
+
+        def act(self, observation):
+            asked.set()
+            assert go_on.wait(30)
+            return self.policy.act(observation)
+
+        def reset(self, mask=None):
+            self.policy.reset(mask)
+
+    flight._makers["slow"] = Slow
+    choosing = threading.Thread(target=flight.choose, args=("slow",))
+    choosing.start()
+    assert asked.wait(30)
+    begun = flight.vec.steps[0]
+    flight.step()
+    assert flight.policy == "formation" and flight.vec.steps[0] == begun + 1 and flight.status()
+    go_on.set()
+    choosing.join(30)
+    assert flight.policy == "slow"
 
 
 def test_a_trained_policy_is_the_first_and_one_that_does_not_fit_is_refused():
