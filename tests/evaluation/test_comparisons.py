@@ -114,6 +114,18 @@ def test_an_interval_over_training_seeds_has_the_variances_of_seeds_and_of_episo
     assert half["both"] == pytest.approx(np.hypot(half["seeds"], half["episodes"]), rel=0.1)
 
 
+@pytest.mark.parametrize("spread, least, most", [(10.0, 0.65, 0.85), (1.0, 0.9, 1.0)])
+def test_of_three_training_seeds_the_interval_covers_as_stated(spread, least, most):
+    """`spread`: of seeds, over the uncertainty of the mean of episodes."""
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(120):
+        seeds, common, own = rng.normal(size=(3, 1)), rng.normal(size=(1, 60)), rng.normal(size=(3, 60))
+        low, high = bootstrap_seeds(spread / np.sqrt(60) * seeds + common + 0.5 * own)
+        hits += low <= 0 <= high
+    assert least <= hits / 120 <= most
+
+
 def test_of_one_training_seed_the_interval_is_that_of_episodes_and_gaps_do_not_count():
     values = np.random.default_rng(3).exponential(2.0, 400)
     assert bootstrap_seeds(values[None]) == pytest.approx(bootstrap(values), rel=0.02)

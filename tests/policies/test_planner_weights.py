@@ -110,15 +110,15 @@ def test_weights_are_the_drones_own_and_means_of_what_they_say():
 
 
 @pytest.mark.parametrize(
-    "own",
+    "own, most",
     [
-        {"planner.limits": "soft"},
-        {"planner.limits": "hard"},
-        {"randomization.action_delay": [2, 2], "planner.delay": 0.04},  # expected: not late
+        ({"planner.limits": "soft"}, 0.08),
+        ({"planner.limits": "hard"}, 0.08),
+        ({"randomization.action_delay": [2, 2], "planner.delay": 0.04}, 0.2),  # expected: not late
     ],
     ids=["soft", "hard", "late"],
 )
-def test_derivatives_by_actions_are_differences_of_simulated_flights(own):
+def test_derivatives_by_actions_are_differences_of_simulated_flights(own, most):
     """The flights are MuJoCo's, with motor lag and controllers; the derivatives those of the planner's model."""
     keys = own | {"planner.steps": 10, "planner.position": 0.3, "task_options.speed": 2.0}
     vec = ml.make_vec("track", num_envs=1, **WEIGHTS, **keys, **{"task_options.acceleration": 4.0})
@@ -127,7 +127,8 @@ def test_derivatives_by_actions_are_differences_of_simulated_flights(own):
     still = np.zeros((1, 3, vec.action_size))
     for _ in range(100):
         vec.step(still)
-    saved, flight = vec.state_dict(), FlightGradient(commander.planner, steps, vec.task.dt)
+    response = 1.0 - np.exp(-vec.task.dt / vec.world.system.vehicles[0].rotor_time_constant)  # as in training
+    saved, flight = vec.state_dict(), FlightGradient(commander.planner, steps, vec.task.dt, response)
     loss = np.concatenate([np.ones(3), np.full(3, 0.1), np.zeros(27)])
 
     def fly(action):
@@ -153,8 +154,8 @@ def test_derivatives_by_actions_are_differences_of_simulated_flights(own):
     counted = expected != 0
     assert counted.sum() == vec.action_size + 3
     found, expected = found[counted], expected[counted]
-    assert found == pytest.approx(expected, abs=0.08 * abs(expected).max())
-    assert found @ expected > 0.998 * np.linalg.norm(found) * np.linalg.norm(expected)
+    assert found == pytest.approx(expected, abs=most * abs(expected).max())
+    assert found @ expected > (0.998 if most < 0.1 else 0.99) * np.linalg.norm(found) * np.linalg.norm(expected)
 
 
 def test_what_cannot_be_planned_is_refused():
