@@ -182,19 +182,17 @@ class DaggerRollouts(LearningRollouts):
             )
         self.flights = [TaughtFlights(env, learner, total, max(capacity, 1)) for env in envs]
         self._all = RigRollouts(self.flights)
-        self._first: int | None = None  # iteration in which it began to collect
-        self._refill = 0  # batches that it collects before it learns
+        self._learns_from: int | None = None  # iteration
 
     def collect(self, iteration: int) -> Batches:
         """See `LearningRollouts.collect`; a batch for each rig."""
         batches = self._all.collect(iteration)
         begin = time.perf_counter()
         torch.set_num_threads(self._train.threads)
-        if self._first is None:
-            self._first = iteration
+        if self._learns_from is None:
             to_come = -(-self._train.frames // (self._total * self._train.horizon)) - iteration
-            self._refill = min(iteration, REFILL, to_come // 2)
-        loss = self._learn() if iteration + 1 - self._first >= self._refill else {}
+            self._learns_from = iteration + min(iteration, REFILL, to_come // 2) - 1
+        loss = self._learn() if iteration >= self._learns_from else {}
         torch.set_num_threads(1)
         share = self.flights[0].share(iteration)
         self.values = loss | {"teacher_share": share, "learning_seconds": time.perf_counter() - begin}

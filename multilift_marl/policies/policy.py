@@ -74,9 +74,10 @@ class OwnPolicy:
         found = self._call(".metrics", function)
         try:
             numbers = {str(name): np.asarray(values, float) for name, values in found.items()}
+            fits = all(each.shape == self._shape[:1] for each in numbers.values())
         except (AttributeError, TypeError, ValueError):
-            numbers = {"": np.zeros(0)}
-        if any(each.shape != self._shape[:1] for each in numbers.values()):
+            fits = False
+        if not fits:
             raise ConfigError(
                 f"{self._name}.metrics must return {{name: numbers ({self._shape[0]},)}}, not {found!r:.200}"
             )

@@ -302,19 +302,6 @@ def test_a_class_of_ones_own_flies_with_any_action_interface(folder, action):
     assert policy.policy.count.tolist() == [0, 0, 0]
 
 
-def test_metrics_of_ones_own_policy_are_reported(folder):
-    (folder / "told.py").write_text(
-        "import mine\nimport numpy as np\nclass Told(mine.Lean):\n"
-        "    def metrics(self): return {'steps_flown': self.count, 'never': [np.nan] * len(self.count)}\n"
-        "class Wrong(mine.Lean):\n    def metrics(self): return {'steps': 3.0}\n"
-    )
-    assert evaluate(["policy=told.py:Told", "control.action=acceleration", "baseline=none", *SHORT]) == 0
-    report = json.loads(next(folder.glob("runs/told.Told-hover/eval/*/metrics.json")).read_text())
-    assert report["policy"]["steps_flown"]["mean"] > 0 and "never" not in report["policy"]
-    wrong = make_scripted("told.py:Wrong", make(num_envs=2))
-    assert "told.py:Wrong.metrics must return {name: numbers (2,)}, not {'steps': 3.0}" in refusal(wrong.metrics)
-
-
 def test_evaluation_and_viewer_fly_a_class_of_ones_own(folder):
     assert evaluate(["policy=mine:Lean", "control.action=acceleration", "baseline=none", *SHORT]) == 0
     report = json.loads(next(folder.glob("runs/mine.Lean-hover/eval/*/metrics.json")).read_text())
@@ -322,15 +309,6 @@ def test_evaluation_and_viewer_fly_a_class_of_ones_own(folder):
     session, _ = make_session({"policy": "mine.py:Lean", "vehicle.preset": "heavy", "import": "mine"})
     assert session.policy == "mine.py:Lean" and {"formation", "mine.py:Lean"} <= set(session.policies)
     session.step()
-
-
-def test_the_viewer_begins_a_policys_episodes(folder):
-    (folder / "late.py").write_text(
-        "import mine\nclass Late(mine.Lean):\n"
-        "    def reset(self, mask): self.begun = True\n"
-        "    def act(self, observation): return super().act(observation) if self.begun else None\n"
-    )
-    make_session({"policy": "late.py:Late"})[0].step()
 
 
 @pytest.mark.parametrize(
