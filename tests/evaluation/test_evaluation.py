@@ -179,19 +179,22 @@ def run(tmp_path_factory):
 
 @pytest.mark.slow
 def test_command_writes_metrics_plots_and_table(run, tmp_path, capsys):
-    arguments = [f"run={run}", "episodes=4", "seed=1000", f"out={tmp_path}", "env.num_drones=3", "payload.mass=1.2"]
+    arguments = [f"run={run}", "episodes=10", "seed=1000", f"out={tmp_path}", "env.num_drones=3", "payload.mass=1.2"]
     assert evaluate(arguments) == 0
     shown = capsys.readouterr().out
     for word in ("success", "position error", "attitude error", "settling time", "formation_integral"):
         assert word in shown
     report = json.loads((tmp_path / "metrics.json").read_text())
-    assert report["episodes"] == 4 and report["seed"] == 1000
+    assert report["episodes"] == 10 and report["seed"] == 1000
     assert report["config"]["env"]["num_drones"] == 3 and report["config"]["payload"]["mass"] == 1.2
     assert set(report["baselines"]) == SCRIPTS == set(report["paired"])
     for summary in (report["policy"], *report["baselines"].values()):
         assert set(summary) >= CONTRACT
-        for value in summary.values():
-            assert value["ci95"][0] <= value["mean"] <= value["ci95"][1]
+        for name, value in summary.items():
+            if value["ci95"] is None:  # of fewer than ten episodes
+                assert name.endswith(("_held", "_successful")) or name == "settling_time_s"
+            else:
+                assert value["ci95"][0] <= value["mean"] <= value["ci95"][1]
     assert {"errors.png", "tensions.png", "paths.png", "training.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
