@@ -31,13 +31,15 @@ STRIPS: dict[str, tuple[str, dict, str, int, tuple[float, ...]]] = {
     "loss": ("loss", {}, "loss", 0, (1.5, 4.4, 11.0)),
     "navigate": ("navigate_narrow", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
     "navigate_dense": ("navigate_dense", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
+    "navigate_low": ("navigate_low", ROUTE, "mpc_route", 0, (0.02, 3.2, 6.0)),
     "navigate_sparse": ("navigate", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
     "navigate_unknown": ("navigate_unknown", ROUTE, "mpc_route", 0, (2.5, 4.5, 6.5)),
     "coltrans": ("maps/coltrans_forest", {**ACC_RATES, "env.num_drones": 6}, "mpc_route", 0, (1.0, 2.3, 3.4)),
     "mixed_team": ("hover", MIXED, "formation_integral", 0, (0.02, 6.0)),
 }
 
-CAMERAS = {name: "chase" for name, strip in STRIPS.items() if strip[2] == "mpc_route"} | {"gate": "chase"}
+CAMERAS = {name: "chase" for name, strip in STRIPS.items() if strip[2] == "mpc_route" and name != "navigate_low"}
+CAMERAS["gate"] = "chase"
 
 
 def draw(name: str) -> np.ndarray:

@@ -23,7 +23,7 @@ HERE = Path(__file__).parent / "navigate"
 DOCS = Path(__file__).parents[1] / "docs"
 BEGIN, END = "<!-- table of navigate -->\n", "<!-- end of table -->"
 SEED, CHUNK = 1000, 50
-LEVELS = "sparse", "dense", "narrow", "unknown"
+LEVELS = "sparse", "dense", "narrow", "low", "unknown"
 PUBLIC = "window", "forest", "wall"  # of coltrans-planning, in configs/maps; episodes differ by their starts
 ROWS: dict[str, dict[str, object]] = {
     **{f"{level}_{n}": {"env.num_drones": n} for n in (4, 2, 3, 6, 8) for level in LEVELS},
@@ -49,9 +49,9 @@ def configuration(row: str) -> str:
     level = row.rsplit("_", 1)[0]
     if level in PUBLIC:
         return f"maps/coltrans_{'window3' if row == 'window_3' else level}"
-    return {"sparse": "navigate", "unknown": "navigate_unknown", "dense": "navigate_dense"}.get(
-        level, "navigate_narrow"
-    )
+    if level == "sparse":
+        return "navigate"
+    return f"navigate_{level}" if level in LEVELS else "navigate_narrow"
 
 
 def fly(row: str, policy: str, maps: int) -> None:

@@ -23,7 +23,9 @@ UNINTERPRETED = (  # they start processes, compile, or look at documents and rec
     "train_command", "types", "view", "view_browser", "window", "workers",
 )  # fmt: skip
 MOST = 400  # tests tried as Python
-TUNED = "tests/policies/test_tuned_numbers.py"
+STATED = (  # tests of numbers that are assigned at import, by what documents and recipes say of them
+    "tests/policies/test_tuned_numbers.py", "tests/mdp/test_task_tables.py::test_the_reference_of_the_tasks",
+)  # fmt: skip
 
 
 @dataclass
@@ -206,18 +208,19 @@ class Chooser:
         covering.sort(key=distance)
         files = {entry.test.split("::")[0] for entry in covering[:10]}
         if fault.names:  # what is assigned at import is read by tests that call nothing
-            files |= {TUNED, *(file for file, factor in factors.items() if factor < 0.3)}
+            files |= {*(name.split("::")[0] for name in STATED), *(f for f, factor in factors.items() if factor < 0.3)}
         seen = {entry.test for entry in covering}
         others = [e for e in self.entries if e.test not in seen and (not affected or e.test.split("::")[0] in files)]
         others.sort(key=distance)
         fast, spent = list[str](), 0.0
-        tuned = [entry for entry in others if fault.names and entry.test.startswith(TUNED)]
-        first = {entry.test for entry in tuned}
-        for entry in (*tuned, *(each for each in (*covering, *others) if each.test not in first)):
+        stated = [entry for entry in others if fault.names and entry.test.startswith(STATED)]
+        first = {entry.test for entry in stated}
+        for entry in (*stated, *(each for each in (*covering, *others) if each.test not in first)):
             if entry.passed and spent + entry.seconds <= seconds and len(fast) < MOST:
                 fast.append(entry.test)
                 spent += entry.seconds
-        stopped = [entry.test for entry in covering if not entry.passed and not entry.guessed][:12]
+        longer = (*stated, *(entry for entry in covering if entry.test not in first))
+        stopped = [entry.test for entry in longer if not entry.passed and not entry.guessed][:12]
         taken = set(fast)
         rest = [entry.test for entry in covering if entry.test not in taken]
         related = sorted((test for test in self.unknown if near[test] < 1), key=near.__getitem__)

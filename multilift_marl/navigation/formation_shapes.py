@@ -1,9 +1,9 @@
-"""Shapes of a formation that hold the payload at rest: the resting one and narrow ones, and all between them.
+"""Shapes of a formation that hold the payload at rest: the resting one, narrow and low ones, and all between them.
 
 Cable forces f = f₀ + Σ c_j m_j balance the payload's weight for any coordinates c, since the modes m_j are internal
 forces: neither sum nor moment. They point along the cables, so that they are the formation's shape. Each mode leads
-straight to the narrowest formation across one axis of the payload that keeps drones and cables apart, cables taut and
-steep; there c_j = 1.
+straight to the narrowest formation across one axis of the payload, or to the lowest one, that keeps drones and cables
+apart, cables taut and steep; there c_j = 1.
 """
 
 from __future__ import annotations
@@ -25,11 +25,16 @@ MIN_TENSION = 0.25  # of each cable over its resting one
 MAX_TENSION = 2.0
 MAX_LEAN = np.deg2rad(50.0)  # of cables from the vertical, or 5° more than at rest
 CABLE_SPARE = 1.2  # distance of cables over the limit
-MIN_GAIN = 0.02  # [m] by which a mode narrows the formation, at least
+MIN_GAIN = 0.02  # [m] by which a mode narrows or lowers the formation, at least
 _SHARES = np.arange(1, 9) / 8  # of a mode at which it is to be flown
 _CAUTION = 0.005  # beyond all limits, and ...
-_PENALTY = 10.0  # of what breaks them, over widths, while the narrowest shape is searched for
-_SCALES = [(along, across) for along in (1.0, 1.5, 2.0) for across in (0.5, 0.25, 0.0)]  # of level forces, to begin
+_PENALTY = 10.0  # of what breaks them, over extents, while the least shape is searched for
+_LONGER, _DRAWN_IN = (1.0, 1.5, 2.0), (0.5, 0.25, 0.0)
+_SCALES = (  # of level forces along x and y, to begin, by the axis whose extent is to be least
+    [(narrow, along) for along in _LONGER for narrow in _DRAWN_IN],
+    [(along, narrow) for along in _LONGER for narrow in _DRAWN_IN],
+    [(wide, wide) for wide in (1.3, 1.6, 2.0)],
+)
 _ITERATIONS = 60
 _STEP = 1e-6  # of finite differences, over the largest force
 
@@ -40,7 +45,7 @@ class FormationShapes(NamedTuple):
     rest: np.ndarray
     """(N, 3) of the resting formation, in the payload's heading frame [N]."""
     modes: np.ndarray
-    """(J, N, 3) internal forces [N]; none of one drone, or where no shape is narrower."""
+    """(J, N, 3) internal forces [N], the lowest last; none of one drone, or where no shape is narrower or lower."""
     choices: np.ndarray
     """(S, J) coordinates c of the shapes to choose from, the resting one first."""
     linked: np.ndarray
@@ -99,15 +104,15 @@ def find_breach(forces: np.ndarray, system: System) -> str | None:
     return names[worst] if spare[worst] < -1e-9 else None
 
 
-@lru_cache(maxsize=16)
-def make_shapes(system: System) -> FormationShapes:
-    """Return the shapes of a team; the same system gives the same ones, from memory."""
+@lru_cache(maxsize=32)
+def make_shapes(system: System, low: bool = False) -> FormationShapes:
+    """Return the shapes of a team, with `low` also low ones; the same system gives the same ones, from memory."""
     rest = system.formation_force.copy()
     limits = make_shape_limits(system)
     modes = []
     if system.num_drones > 1:
         free = _internal_forces(system)
-        found = (_narrowest(across, system, limits, free) for across in (1, 0))
+        found = (_least(axis, system, limits, free) for axis in ((1, 0, 2) if low else (1, 0)))
         modes = [mode for mode in found if mode is not None]
     shapes = FormationShapes(rest, np.array(modes).reshape(-1, *rest.shape), np.zeros((0, 0)), np.zeros((0, 0)))
     return _with_choices(shapes, limits)
@@ -140,44 +145,43 @@ def _internal_forces(system: System) -> np.ndarray:
     return rows[rank:].reshape(-1, *system.anchors.shape)
 
 
-def _narrowest(across: int, system: System, limits: ShapeLimits, free: np.ndarray) -> np.ndarray | None:
-    """Return the mode (N, 3) to the narrowest formation across axis 0 or 1, None if none is narrower.
+def _least(axis: int, system: System, limits: ShapeLimits, free: np.ndarray) -> np.ndarray | None:
+    """Return the mode (N, 3) to the formation of the least extent along an axis, None if none is less.
 
-    Minimises the drones' offsets along the axis beyond the payload's own half width, under the limits as penalties,
+    Minimises the drones' offsets along the axis beyond the payload's own half size, under the limits as penalties,
     by Levenberg and Marquardt's method from several scaled formations.
     """
     rest = system.formation_force
     radius = max(float(np.linalg.norm(vehicle.half_size)) for vehicle in system.vehicles)
-    enough = max(0.0, float(system.payload_size[across]) / 2 - radius)
-    widest = _half_width(rest, system, across)
-    if widest < enough + MIN_GAIN:
+    enough = max(0.0, float(system.payload_size[axis]) / 2 - radius)
+    most = _extent(rest, system, axis)
+    if most < enough + MIN_GAIN:
         return None
-    best, least = None, widest - MIN_GAIN
-    for along, narrow in _SCALES:
+    best, least = None, most - MIN_GAIN
+    for scales in _SCALES[axis]:
         scaled = rest.copy()
-        scaled[:, across] *= narrow
-        scaled[:, 1 - across] *= along
+        scaled[:, :2] *= scales
         first = np.tensordot(free, scaled - rest, axes=2)
-        mode = np.tensordot(_minimize(first, rest, free, (across, enough), limits), free, axes=1)
+        mode = np.tensordot(_minimize(first, rest, free, (axis, enough), limits), free, axes=1)
         # Of a mode that ends outside the limits, the part that is within.
         for share in (1.0, 0.98, 0.95, 0.9, 0.8, 0.7):
             within = all(_holds(rest + part * share * mode, limits) for part in np.linspace(0, 1, 33))
-            width = max(enough, _half_width(rest + share * mode, system, across))
-            if within and width < least - 1e-3:
-                best, least = share * mode, width
+            extent = max(enough, _extent(rest + share * mode, system, axis))
+            if within and extent < least - 1e-3:
+                best, least = share * mode, extent
             if within:
                 break
     return best
 
 
-def _half_width(forces: np.ndarray, system: System, across: int) -> float:
-    return float(np.abs(drone_places(system, forces)[:, across]).max())
+def _extent(forces: np.ndarray, system: System, axis: int) -> float:
+    return float(np.abs(drone_places(system, forces)[:, axis]).max())
 
 
 def _minimize(
     x: np.ndarray, rest: np.ndarray, free: np.ndarray, goal: tuple[int, float], limits: ShapeLimits
 ) -> np.ndarray:
-    """Return the coordinates of internal forces of least cost; `goal`: the axis, and half width that is enough [m]."""
+    """Return the coordinates of internal forces of least cost; `goal`: the axis, and offset that is enough [m]."""
     size = _num_residuals(len(rest))
     unit_force = float(limits.tension.max())
     forces = np.zeros_like(rest)
@@ -239,13 +243,13 @@ def write_spares(forces, limits, spare):
 
 
 @kernel
-def write_residuals(rest, mode, across, enough, limits, forces, residuals):
-    """Write by how much a mode breaks limits on its way, and how far drones are beyond the width that is enough.
+def write_residuals(rest, mode, axis, enough, limits, forces, residuals):
+    """Write by how much a mode breaks limits on its way, and how far drones are beyond the offset that is enough.
 
     Args:
         rest, mode: (N, 3) [N].
-        across: axis of the width.
-        enough: half width [m].
+        axis: of the offset.
+        enough: offset [m].
         limits: ShapeLimits.
         forces: (N, 3), to work in.
         residuals: written.
@@ -261,4 +265,4 @@ def write_residuals(rest, mode, across, enough, limits, forces, residuals):
             spare[i] = _PENALTY * min(spare[i] - _CAUTION, 0.0)
     for i in range(count):
         end = add(row(limits.anchors, i), scale(limits.length[i], unit(row(forces, i))))
-        residuals[_SHARES.shape[0] * spares + i] = max(abs(end[across]) - enough, 0.0)
+        residuals[_SHARES.shape[0] * spares + i] = max(abs(end[axis]) - enough, 0.0)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from time import thread_time
+from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl.navigation.formation_shapes import make_shape_limits, make_shapes
+from multilift_marl.navigation.formation_shapes import FormationShapes, make_shape_limits, make_shapes
 from multilift_marl.navigation.motion import RouteMotion, move_team
 from multilift_marl.navigation.search import make_lattice, search_route, states_at
 from multilift_marl.navigation.smoothing import Band, coordinate_scale, smooth_knots, space_knots
 from multilift_marl.navigation.team_clearance import (
     Scene,
     TeamBody,
+    hangs_over,
     make_body,
     make_scene,
     measure_clearance,
@@ -29,7 +31,8 @@ from multilift_marl.sim.obstacles import Obstacles
 FINENESS = 1.0, 0.6, 0.45  # of the lattice, tried in turn, and ...
 MOVING = 2  # ... of a moving team, which cannot wait, as many and a tenth of the states
 STEP = 0.5  # [-] of the lattice, over the narrowest half width of payload and drone
-TALL = 1.5  # [-] steps of height, over those
+TALL = 1.5  # [-] steps of height, over those, and ...
+LOW = 0.5  # ... with low shapes
 REPAIRS = 9  # of the curve, and as many of its speeds
 CLOSER = 0.015  # [m] that a knot is to keep more, each time that it is too close
 FADES = 1.0, 1.6, 2.2  # [s] in which a route comes to its curve from a moving start, tried in turn
@@ -81,6 +84,8 @@ def find_route(
 ) -> Route:
     """Return a route of a team to rest in the resting formation at a goal.
 
+    Low shapes are tried where things hang over the way and no route is found without them.
+
     Args:
         system: the team.
         obstacles, env: those of one environment, where they are now.
@@ -96,7 +101,13 @@ def find_route(
     begun = thread_time()
     start = np.array(start if departure is None else departure[0, :4], dtype=float)
     goal = np.array(goal, dtype=float)
-    shapes, scene = make_shapes(system), make_scene(obstacles, env)
+    scene = make_scene(obstacles, env)
+    tries = [make_shapes(system), make_shapes(system, low=True)]
+    if not hangs_over(scene, settings.ground) or len(tries[0].modes) == len(tries[1].modes):
+        tries.pop()
+    if departure is not None and departure.shape[1] > 4 + len(tries[0].modes):  # that of a route in low shapes
+        tries = [make_shapes(system, low=True)]
+    shapes = tries[0]
     body = make_body(system, shapes.rest, shapes.modes)
     space = _space(start, goal, scene, body, settings)
     if departure is not None:  # a curve may leave it a little
@@ -105,29 +116,60 @@ def find_route(
     shape = still if departure is None else departure[0, 4:]
     for name, pose, own in (("start", start, shape), ("goal", goal, still)):
         _check_pose(name, pose, own, space, body, scene, settings)
-    nearest = int(np.abs(shapes.choices - shape).sum(axis=1).argmin())
 
+    request = _Request(system, scene, start, goal, space, settings, departure)
     expanded = 0
-    most = settings.most if departure is None else settings.most // 10
     for fineness in FINENESS[: None if departure is None else MOVING]:
-        step = fineness * STEP * (system.payload_size[:2].min() / 2 + body.radius.max()) * np.array([1.0, 1.0, TALL])
-        clearance = settings.least_clearance * fineness**2, settings.comfort
-        lattice = make_lattice(start, goal, space, step, body, shapes, clearance)
-        way, count = search_route(lattice, start, nearest, body, scene, most)
-        expanded += count
-        if not len(way):
-            continue
-        states = states_at(way, lattice, shapes)
-        states[0, 4:] = shape
-        turns = round((states[-1, 3] - goal[3]) / (2 * np.pi))
-        states[-1, :4] = *goal[:3], goal[3] + 2 * np.pi * turns
-        route = _make_route(states, departure, system, body, scene, space, settings)
-        if route is not None:
-            return route._replace(report=route.report._replace(expanded=expanded, planning_time=thread_time() - begun))
+        for shapes in tries:
+            route, count = _find_with(shapes, fineness, request)
+            expanded += count
+            if route is not None:
+                report = route.report._replace(expanded=expanded, planning_time=thread_time() - begun)
+                return route._replace(report=report)
     raise NoRoute(
         f"no route that keeps {settings.least_clearance:g} m from all obstacles was found, with any of "
         f"{len(shapes.choices)} shapes of the formation: widen a gap, lower least_clearance, or raise most"
     )
+
+
+class _Request(NamedTuple):
+    """What `find_route` is asked for."""
+
+    system: System
+    scene: Scene
+    start: np.ndarray
+    goal: np.ndarray
+    space: np.ndarray
+    """(2, 3) lowest and highest position of the payload [m]."""
+    settings: RouteSettings
+    departure: np.ndarray | None
+
+
+def _find_with(shapes: FormationShapes, fineness: float, request: _Request) -> tuple[Route | None, int]:
+    """Return a route by some shapes and one lattice, None if none is found, and how many states were expanded."""
+    system, settings, departure, goal = request.system, request.settings, request.departure, request.goal
+    body = make_body(system, shapes.rest, shapes.modes)
+    shape, most = np.zeros(len(shapes.modes)), settings.most
+    if departure is not None:
+        departure = np.pad(departure, ((0, 0), (0, 4 + len(shapes.modes) - departure.shape[1])))
+        shape, most = departure[0, 4:], settings.most // 10
+    nearest = int(np.abs(shapes.choices - shape).sum(axis=1).argmin())
+    least = settings.least_clearance * fineness**2
+    step = fineness * STEP * (system.payload_size[:2].min() / 2 + body.radius.max()) * np.ones(3)
+    if shapes is make_shapes(system):
+        step[2] *= TALL
+    else:  # a slot may be between two heights of the lattice: the curve rises or sinks into it
+        step[2] *= LOW
+        least -= step[2] / 2
+    lattice = make_lattice(request.start, goal, request.space, step, body, shapes, (least, settings.comfort))
+    way, expanded = search_route(lattice, request.start, nearest, body, request.scene, most)
+    if not len(way):
+        return None, expanded
+    states = states_at(way, lattice, shapes)
+    states[0, 4:] = shape
+    turns = round((states[-1, 3] - goal[3]) / (2 * np.pi))
+    states[-1, :4] = *goal[:3], goal[3] + 2 * np.pi * turns
+    return _make_route(states, body, request._replace(departure=departure)), expanded
 
 
 def measure_route(
@@ -181,11 +223,10 @@ def _text(place: np.ndarray) -> str:
     return f"({place[0]:.2f}, {place[1]:.2f}, {place[2]:.2f}) m"
 
 
-def _make_route(
-    states: np.ndarray, departure: np.ndarray | None, system: System, body: TeamBody, scene: Scene, space: np.ndarray,
-    settings: RouteSettings,
-) -> Route | None:  # fmt: skip
+def _make_route(states: np.ndarray, body: TeamBody, request: _Request) -> Route | None:
     """Return the smooth route along states (S, 4 + J) of a lattice, None if it comes too close to obstacles."""
+    system, scene, space, settings = request.system, request.scene, request.space, request.settings
+    departure = request.departure
     weights = coordinate_scale(len(body.modes))
     knots, spacing = space_knots(states, weights)
     lead, pace = moving_start(departure, weights, spacing)
@@ -201,6 +242,7 @@ def _make_route(
         spacing=spacing,
         lead=lead,
     )
+    best = knots, knots, np.array([-np.inf])
     for _ in range(REPAIRS):
         knots = smooth_knots(knots, band)
         u = np.arange(SAMPLES * (len(knots) - 1) + 1) / SAMPLES
@@ -209,8 +251,12 @@ def _make_route(
         close = u[clearance < settings.least_clearance + 0.01]
         if not len(close):
             break
+        if clearance.min() > best[2].min():
+            best = knots, values, clearance
         knot = np.arange(len(knots))
         band.safe[np.abs(knot[:, None] - close).min(axis=1) <= 2.0] += CLOSER
+    if clearance.min() < settings.least_clearance:  # the repairs have made it worse, or there is no room
+        knots, values, clearance = best
     if clearance.min() < settings.least_clearance:
         return None
 

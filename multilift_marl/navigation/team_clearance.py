@@ -75,6 +75,12 @@ def make_scene(obstacles: Obstacles, env: int) -> Scene:
     return Scene(*(np.ascontiguousarray(part[env][used]) for part in parts))
 
 
+def hangs_over(scene: Scene, height: float) -> bool:
+    """Return whether an obstacle is wholly above a height [m]."""
+    half = (np.abs(scene.rotation[:, 2]) * scene.size).sum(axis=1)  # of the box about it
+    return bool((scene.position[:, 2] - half > height).any())
+
+
 def rest_clearance(system: System, obstacles: Obstacles, env: int, place: tuple[float, float, float, float]) -> float:
     """Return how far the resting formation is from obstacles [m], `FAR` at most.
 

@@ -14,7 +14,7 @@ import numpy as np
 from multilift_marl.rig.system import System
 from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, clear_obstacles, place_obstacle
 
-LEVELS = ("sparse", "dense", "narrow", "unknown")
+LEVELS = ("sparse", "dense", "narrow", "unknown", "low")
 CAPACITY = 16  # rows that a map of the usual length needs at most
 FALCONS = 1.4637  # [m] width of the resting formation of four falcons
 LENGTH = 8.0  # from start to goal, like the next ones in units of length
@@ -29,7 +29,13 @@ RADIUS = 0.12, 0.32  # of pillars
 GAPS = 0.5, 0.8  # range of the widths of a narrow map's gaps over the resting formation's
 ALONE = 4.0
 SPARE = 0.15  # that a gap is wider than the payload, at least
-WALLS = 3  # of a narrow map
+SLOTS = 1.0, 1.15  # range of the heights of a low map's slots over the resting formation's
+DEPTH = 0.4, 0.8  # of those slots along the way
+APART = 3.8  # from one to the next, at most
+SILL = 0.45, 0.1  # from so far below the height of start and goal to so far above, their lower edges
+SPAN = 2.4  # length of a low formation, and ...
+CLIMB = 0.25  # ... by how much of the way beyond that the next sill may be higher or lower
+WALLS = 3  # of a narrow or low map
 MAX_WALLS = CAPACITY // 2
 _DRAWS = 4000
 
@@ -43,6 +49,7 @@ class Course(NamedTuple):
     """Least and greatest number of pillars, where there is room; None: `PILLARS`, more on a longer course."""
     gaps: tuple[float, float] = GAPS
     walls: int = WALLS
+    slots: tuple[float, float] = SLOTS
 
     @property
     def field(self) -> float:
@@ -56,7 +63,7 @@ class Course(NamedTuple):
 
     def capacity(self, level: str) -> int:
         """Return how many rows of obstacles the maps of a level need."""
-        return CAPACITY if level == "narrow" else max(CAPACITY, self.most_pillars(level))
+        return max(CAPACITY, self.most_pillars(level)) if level in PILLARS else CAPACITY
 
 
 COURSE = Course()
@@ -95,6 +102,14 @@ def formation_width(system: System) -> float:
     return float((ends.max(axis=0) - ends.min(axis=0)).max()) * (ALONE if system.num_drones == 1 else 1.0)
 
 
+def formation_height(system: System) -> float:
+    """Return the height of the resting formation from the payload's lowest point, drones included [m]."""
+    above = system.slots[:, 2] + [vehicle.half_size[2] for vehicle in system.vehicles]
+    half = float(system.payload_size[2]) / 2
+    middle = float(system.payload_center[2])
+    return max(float(above.max()), middle + half) - (middle - half)
+
+
 def unit_length(system: System) -> float:
     """Return the unit of a map's lengths [m]."""
     return formation_width(system) / FALCONS
@@ -114,7 +129,9 @@ def draw_map(level: str, seed: int, system: System, course: Course = COURSE) -> 
     # No team flies over what stands on the ground, its cables upright and the payload at the ceiling.
     reach = float(system.cable_length.max() + np.linalg.norm(system.anchors, axis=1).max())
     tall = high[2] + reach + 0.1
-    if level == "narrow":
+    if level == "low":
+        placed = _slots(rng, unit, tall, (height, formation_height(system)), course)
+    elif level == "narrow":
         least = float(system.payload_size[:2].min()) + SPARE * unit
         placed = _walls(rng, unit, tall, (formation_width(system), least), course)
     else:
@@ -156,6 +173,29 @@ def _pillars(
         else:
             half = radius / 2**0.5  # its corners on the circle
             placed.append(Obstacle(BOX, (half, half, tall / 2), (x, y, tall / 2), turned))
+    return placed
+
+
+def _slots(
+    rng: np.random.Generator, unit: float, tall: float, heights: tuple[float, float], course: Course
+) -> list[Obstacle]:
+    """Draw walls `tall` [m] across the way, each open between a sill and a beam from one side to the other.
+
+    `heights`: of start and goal, at least, and of the resting formation [m].
+    """
+    placed, walls = [], course.walls
+    apart = min(APART, 2 * course.field / max(walls - 1, 1))
+    step = CLIMB * max(apart - SPAN, 0.0)
+    level = rng.uniform(-SILL[0], SILL[1])
+    for wall in range(walls):
+        x = ((wall - (walls - 1) / 2) * apart + rng.uniform(-0.1, 0.1)) * unit
+        half = 0.5 * rng.uniform(*DEPTH) * unit
+        sill = heights[0] + level * unit
+        beam = sill + rng.uniform(*course.slots) * heights[1]
+        for foot, top in ((0.0, sill), (beam, max(tall, beam + 0.1))):
+            size = half, (WIDTH + 1.5) * unit, (top - foot) / 2
+            placed.append(Obstacle(BOX, size, (x, 0.0, (foot + top) / 2), 0.0))
+        level = float(np.clip(level + rng.uniform(-step, step), -SILL[0], SILL[1]))
     return placed
 
 

@@ -28,7 +28,19 @@ from multilift_marl.mdp.rewards import (
     velocity,
 )
 from multilift_marl.navigation.team_clearance import rest_clearance
-from multilift_marl.planning.maps import GAPS, LENGTH, MAX_WALLS, WALLS, Course, Map, draw_map, place_map, unit_length
+from multilift_marl.planning.maps import (
+    GAPS,
+    LENGTH,
+    LEVELS,
+    MAX_WALLS,
+    SLOTS,
+    WALLS,
+    Course,
+    Map,
+    draw_map,
+    place_map,
+    unit_length,
+)
 from multilift_marl.rig.obstacles import NONE
 from multilift_marl.rig.system import System
 from multilift_marl.schema.values import Between, Counts, Float, Int, Section, Span, Vector
@@ -47,7 +59,7 @@ PEAK = 35.0 / 16.0  # of an eased motion's speed over its mean, see `math3d.ease
 class NavigateOptions(ArrivalOptions):
     """The map, the target's motion along the straight line, and what counts as success."""
 
-    level: Literal["sparse", "dense", "narrow", "unknown", "given"] = Field(
+    level: Literal["sparse", "dense", "narrow", "low", "unknown", "given"] = Field(
         "sparse", description="of the maps; given: scene.obstacles, start and goal"
     )
     start: Place | None = Field(None, description="[m] of the payload, level given")
@@ -59,7 +71,10 @@ class NavigateOptions(ArrivalOptions):
     gaps: Annotated[Span, Between(0.1, 1.5)] = Field(
         GAPS, description="[-] widths of the gaps of level narrow over the resting formation's, or their range"
     )
-    walls: Int = Field(WALLS, ge=1, le=MAX_WALLS, description="of level narrow")
+    slots: Annotated[Span, Between(0.1, 3)] = Field(
+        SLOTS, description="[-] heights of the slots of level low over the resting formation's, or their range"
+    )
+    walls: Int = Field(WALLS, ge=1, le=MAX_WALLS, description="of levels narrow and low")
     length: Annotated[Float, Between(4, 100, "m")] = Field(
         LENGTH, description="[m] from start to goal, for a formation as wide as that of four falcons"
     )
@@ -71,18 +86,18 @@ class NavigateOptions(ArrivalOptions):
     @property
     def course(self) -> Course:
         """What the level leaves open."""
-        return Course(self.length, self.pillars, self.gaps, self.walls)
+        return Course(self.length, self.pillars, self.gaps, self.walls, self.slots)
 
 
 OF_LEVELS = {
     ("start", "goal", "low", "high"): ("given",),
     ("pillars",): ("sparse", "dense", "unknown"),
-    ("map",): ("sparse", "dense", "narrow", "unknown"),
+    ("map",): LEVELS,
 }
 
 
 def check_level(option: NavigateOptions) -> None:
-    """Refuse, by a ConfigError, options of other levels; gaps, walls and length may come from a configuration."""
+    """Refuse, by a ConfigError, options of other levels; gaps, slots, walls, length may come from a configuration."""
     for names, levels in OF_LEVELS.items():
         if option.level in levels:
             continue

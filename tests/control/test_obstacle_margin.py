@@ -28,14 +28,15 @@ def make(**keys) -> MultiliftVec:
 
 
 def keep(place, command, points=(), margin=0.0, velocity=(0.0, 0.0, 0.0), payload=((0.0, 0.0, -1.0), 0.0), **margins):
-    """Return where the command (3,) of the first of four drones is put; `payload`: position and heading."""
+    """Return where the command (3,) of the first drone is put; `payload`: position and heading."""
     goal, reference, (position, yaw) = Goal.zeros(1, 1), Reference.zeros(1, 1), payload
     goal.velocity[0], reference.command[0, 0] = velocity, command
     state = SimpleNamespace(drone_position=np.array(place, float).reshape(1, 1, 3))
     c, s = np.cos(yaw), np.sin(yaw)
     around = Surroundings(
         np.array(points, float).reshape(1, 1, -1, 3), np.array(position, float).reshape(1, 1, 3),
-        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).reshape(1, 1, 3, 3), sector_planes(AZIMUTHS), np.zeros(3),
+        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).reshape(1, 1, 3, 3),
+        sector_planes(margins.get("azimuths", AZIMUTHS)), np.zeros(3),
     )  # fmt: skip
     team = SimpleNamespace(goal=goal, reference=reference, state=state, around=around)
     kept = Margins(margin, margins.get("load", 0.0), margins.get("sector", 0.0))
@@ -105,6 +106,17 @@ def test_a_drone_stays_in_its_sector_beside_the_payload(yaw):
         asked, wanted = (center + turn @ [*each, 1.0] for each in (command, expected))
         place = center + turn @ [0.5, 0.5, 1.0]
         assert keep(place, asked, sector=0.1, payload=(center, yaw)) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("yaw", [0.3, -2.0])
+def test_an_oblique_sector_ends_where_it_is_as_far_to_the_next_slot(yaw):
+    """Slots at 20, 80 and 240 degrees: the first drone's sector is from 310 to 50."""
+    edge, center = np.deg2rad(50) + yaw, np.array([3.0, -2.0, 1.0])
+    along, across = np.array([np.cos(edge), np.sin(edge), 0]), np.array([np.sin(edge), -np.cos(edge), 0])
+    place = center + [*(np.array([np.cos(0.35 + yaw), np.sin(0.35 + yaw)])), 1.0]
+    asked = center + 0.7 * along - 0.2 * across + [0, 0, 1.0]  # 20 cm beyond the edge
+    kept = keep(place, asked, sector=0.1, payload=(center, yaw), azimuths=np.radians([20.0, 80.0, 240.0]))
+    assert kept == pytest.approx(center + 0.7 * along + 0.1 * across + [0, 0, 1.0])
 
 
 def test_sectors_of_two_are_halves_and_of_one_all():

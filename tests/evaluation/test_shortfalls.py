@@ -201,6 +201,36 @@ def test_a_success_of_ones_own_is_not_explained_by_the_criteria_of_another(regis
     assert told["missed"]["yaw_deg"]["episodes"] == 12 and told["unexplained"] == 0
 
 
+def test_a_criterion_counts_from_the_first_step_of_its_window_to_the_last(registries):
+    """The worst moment of a bound that is missed ever more, and ever less: the last and the first of 100 steps."""
+
+    def criteria(self):
+        more, less = (lambda sign=sign: sign * self.time for sign in (1, -1))
+        return Criterion("more_s", 1.0, lambda: more() - 1.0), Criterion("less_s", -1.0, lambda: less() + 9.0)
+
+    episodes = own("own_window", criteria=criteria, succeeded=lambda self: self.time < 0)
+    assert episodes["excess:more_s"] == pytest.approx(np.full(12, 3.0 - 1.0))
+    assert episodes["excess:less_s"] == pytest.approx(np.full(12, 9.0 - (3.0 - 2.0 + 0.02)))
+
+
+def test_a_landed_team_misses_its_clearance_by_what_a_drone_lacks():
+    vec = ml.make_vec("land", num_envs=2, **{"task_options.clearance": 0.3})
+    vec.reset(seed=0)
+    state, half = vec.world.state, vec.task.settings.drone_half
+    state.payload_position[:], state.payload_rotation[:] = (0, 0, 1.0), np.eye(3)
+    state.drone_position[:] = (0, 0, 5.0)
+    reach = vec.world.system.payload_size[0] / 2
+    state.drone_position[:, 1] = (reach + half + 0.2, 0, 1.0), (5.0, 0, half + 0.1)
+    (criterion,) = (each for each in vec.task.criteria() if each.name == "clearance_m")
+    lacks = vec.task.options.clearance - np.array([0.2, 0.1])
+    assert criterion.excess() == pytest.approx(lacks) and criterion.bound == 0.3
+
+
+def test_episodes_that_no_criterion_explains_are_those_without_a_failure():
+    values = made(success_rate=np.zeros(6, bool))  # the first two missed nothing that is known
+    assert explain(values, CAUSES)["unexplained"] == 2
+
+
 def made(**more):
     """Return six episodes: two successes, a tilt, a collision, two that missed the criterion."""
     values = {

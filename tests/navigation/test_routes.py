@@ -10,8 +10,10 @@ from conftest import make_system
 from test_team_clearance import exact_clearance
 
 from multilift_marl.errors import ConfigError
+from multilift_marl.navigation import planner
 from multilift_marl.navigation.formation_shapes import drone_places, find_breach
 from multilift_marl.navigation.planner import RouteSettings, find_route, measure_route
+from multilift_marl.navigation.team_clearance import hangs_over, make_scene
 from multilift_marl.planning.maps import draw_map, place_map
 from multilift_marl.planning.route import NoRoute
 from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
@@ -62,6 +64,51 @@ def test_a_route_keeps_away_from_obstacles_and_within_the_limits_of_shapes(rows)
         assert force.sum(axis=0) == pytest.approx(system.formation_force.sum(axis=0))
         assert find_breach(force, system) is None
     assert route.report.expanded > 0 and 6.0 <= route.report.length < 8.0
+
+
+SLOT = [  # 2 m long, 1.05 m high: the resting formation is as high, and has to keep its distance
+    (BOX, (1.0, 4.0, 0.65), (0.0, 0.0, 0.65), 0.0),
+    (BOX, (1.0, 4.0, 1.0), (0.0, 0.0, 3.35), 0.0),
+]
+
+
+def test_cables_lean_outwards_where_the_way_is_low(monkeypatch):
+    system, room = make_system(4), replace(ROOM, low=(-4.5, -3.0, 0.8), high=(4.5, 3.0, 1.8))
+    route = find_route(system, placed(SLOT), 0, START, GOAL, room)
+    assert least_clearance(route, system, SLOT) >= room.least_clearance
+    _, _, forces = route.evaluate(np.linspace(0, route.times[-1], 200))
+    assert all(find_breach(force, system) in (None, "the lean of a cable") for force in forces)
+    assert np.degrees(np.arctan2(np.hypot(forces[..., 0], forces[..., 1]), forces[..., 2])).max() < 50.5
+    heights = drone_places(system, forces)[..., 2].max(axis=1)
+    assert (
+        heights[[0, -1]] == pytest.approx(np.full(2, system.slots[:, 2].max()), abs=1e-3)
+        and heights.min() < heights[0] - 0.2
+    )
+    # On from the middle of the slot, in its shape; and from a route without low shapes that meets it.
+    departure = route.sample(np.array([0.5 * route.times[-1]]))[:, 0]
+    onward = find_route(system, placed(SLOT), 0, START, GOAL, room, departure)
+    assert onward.sample(np.zeros(1))[:3, 0] == pytest.approx(departure[:3], abs=1e-9)
+    assert least_clearance(onward, system, SLOT, 60) >= room.least_clearance
+    free = find_route(system, placed([]), 0, START, GOAL, room)
+    departure = free.sample(np.array([0.8]))[:, 0]
+    onward = find_route(system, placed(SLOT), 0, START, GOAL, room, departure)
+    assert onward.sample(np.zeros(1))[:3, 0, :-1] == pytest.approx(departure[:3], abs=1e-9)
+    assert least_clearance(onward, system, SLOT, 60) >= room.least_clearance
+
+    monkeypatch.setattr(planner, "hangs_over", lambda *_: False)
+    with pytest.raises(NoRoute):
+        find_route(system, placed(SLOT), 0, START, GOAL, replace(room, most=200_000))
+
+
+def test_things_hang_over_the_way_that_are_wholly_above_a_height():
+    tilted = np.deg2rad(30.0)
+    half = 0.5 * np.sin(tilted) + 0.1 * np.cos(tilted)  # of a board's height
+    obstacles = placed([(BOX, (0.5, 1.0, 0.1), (0.0, 0.0, 0.3 + half + 1e-6), 0.0)])
+    c, s = np.cos(tilted), np.sin(tilted)
+    obstacles.rotation[0, 0] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    assert hangs_over(make_scene(obstacles, 0), 0.3)
+    obstacles.position[0, 0, 2] -= 2e-6
+    assert not hangs_over(make_scene(obstacles, 0), 0.3) and not hangs_over(make_scene(placed([]), 0), 0.3)
 
 
 @pytest.mark.parametrize("num_drones", [1, 2, 3, pytest.param(6, marks=pytest.mark.slow), 8])

@@ -24,7 +24,7 @@ def fly(vec, policy, seconds=60.0, look=lambda: None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["navigate_dense", "navigate_narrow"])
+@pytest.mark.parametrize("name", ["navigate_dense", "navigate_narrow", "navigate_low"])
 @pytest.mark.parametrize("drones", [3, 4])
 def test_maps_are_passed(name, drones):
     vec = make(name, num_envs=4, num_drones=drones, **FLOWN)

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from conftest import make, refusal, zeros
 
-from multilift_marl.planning.maps import CAPACITY, LEVELS, Course, draw_map, formation_width, unit_length
+from multilift_marl.planning.maps import (
+    CAPACITY,
+    LEVELS,
+    Course,
+    draw_map,
+    formation_height,
+    formation_width,
+    unit_length,
+)
 from multilift_marl.rig.obstacles import BOX, CYLINDER, NONE
 from multilift_marl.sim.obstacles import clear_obstacles, place_obstacle
 from multilift_marl.tasks.navigate import PEAK
@@ -52,6 +60,26 @@ def test_courses_have_their_length_and_their_number_of_pillars():
     assert as_dense == Course(length=20.0).most_pillars("sparse")
     walls = [draw_map("narrow", 0, system, Course(length=length, walls=2)).obstacles for length in (8.0, 20.0)]
     assert len(walls[0]) == len(walls[1]) == 4 and Course(length=20.0).capacity("narrow") == CAPACITY
+
+
+@pytest.mark.parametrize("walls", [1, 2, 3, 8])
+def test_slots_are_as_high_as_asked_for_from_side_to_side(walls):
+    system, course = make("hover", num_envs=1, num_drones=6).world.system, Course(walls=walls, slots=(0.9, 1.2))
+    slots, half = system.slots, np.array([vehicle.half_size[2] for vehicle in system.vehicles])
+    height = (slots[:, 2] + half).max() + system.payload_size[2] / 2 - system.payload_center[2]
+    assert formation_height(system) == pytest.approx(height)
+    shares = []
+    for seed in range(30):
+        drawn = draw_map("low", seed, system, course)
+        assert len(drawn.obstacles) == 2 * walls <= CAPACITY
+        for sill, beam in zip(drawn.obstacles[::2], drawn.obstacles[1::2], strict=True):
+            assert sill.position[2] == sill.size[2] and sill.position[:2] == beam.position[:2]
+            assert sill.size[:2] == beam.size[:2] and sill.size[1] >= -drawn.low[1] + 1.0
+            opening = beam.position[2] - beam.size[2] - 2 * sill.size[2]
+            shares.append(opening / height)
+            assert beam.position[2] + beam.size[2] >= drawn.high[2] + system.slots[:, 2].max()
+            assert 2 * sill.size[2] + system.payload_size[2] < drawn.high[2]
+    assert 0.9 <= min(shares) < 0.92 and 1.18 < max(shares) <= 1.2
 
 
 def test_a_goal_is_seen_no_farther_away_than_on_the_usual_course():

@@ -70,6 +70,23 @@ def test_drones_beside_a_payload_too_wide_for_their_cables_are_refused():
 # The plan
 
 
+@pytest.mark.parametrize(("task", "advance"), [("takeoff", takeoff.advance), ("land", land.advance)])
+def test_accelerations_of_slots_are_the_slopes_of_their_velocities(task, advance):
+    vec, step, fastest = make(task, num_envs=1), 1e-4, 0.0
+    vec.reset(seed=0)
+    goal = vec.task.goal
+    for time in np.arange(0.13, 11.0, 0.16):
+        velocity = []
+        for at in (time - step, time + step, time):
+            vec.task.time[0] = at
+            advance(0, vec.task.view_for(advance))
+            velocity.append(goal.slot_velocity[0].copy())
+        slope = (velocity[1] - velocity[0]) / (2 * step)
+        np.testing.assert_allclose(goal.slot_acceleration[0], slope, atol=1e-4)
+        fastest = max(fastest, np.abs(slope).max())
+    assert fastest > 0.3
+
+
 def test_the_velocities_of_the_plan_are_those_of_target_and_slots():
     vec = make("takeoff", num_envs=1, **{"env.policy_hz": 250})
     vec.reset(seed=0)
