@@ -156,7 +156,7 @@ def _find_with(shapes: FormationShapes, fineness: float, request: _Request) -> t
     nearest = int(np.abs(shapes.choices - shape).sum(axis=1).argmin())
     least = settings.least_clearance * fineness**2
     step = fineness * STEP * (system.payload_size[:2].min() / 2 + body.radius.max()) * np.ones(3)
-    if shapes is make_shapes(system):
+    if len(shapes.modes) == len(make_shapes(system).modes):
         step[2] *= TALL
     else:  # a slot may be between two heights of the lattice: the curve rises or sinks into it
         step[2] *= LOW

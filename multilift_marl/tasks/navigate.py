@@ -278,6 +278,8 @@ class Navigate(Task):
         """See `Task.prepare`."""
         option, e, scenery = self.options, self.world.num_envs, self.world.system.scenery
         check_level(option)
+        if option.level == "low" and self.world.num_drones == 1:
+            raise ConfigError("task_options.level=low needs two drones or more, whose cables lean; set another level")
         if option.level == "given":
             self._given = given_map(option, self.world.system, self.world.obstacles)
         elif scenery.reserved < (rows := option.course.capacity(option.level)):

@@ -82,6 +82,11 @@ def test_slots_are_as_high_as_asked_for_from_side_to_side(walls):
     assert 0.9 <= min(shares) < 0.92 and 1.18 < max(shares) <= 1.2
 
 
+def test_one_drone_is_refused_where_cables_have_to_lean():
+    said = refusal(make, "navigate_low", num_envs=1, num_drones=1, **{"payload.shape": "point"})
+    assert "task_options.level=low needs two drones or more" in said
+
+
 def test_a_goal_is_seen_no_farther_away_than_on_the_usual_course():
     for length, seen in ((8.0, None), (20.0, 9.0)):
         vec = make("navigate", num_envs=2, **{"task_options.length": length, "scene.reserved": 23})
