@@ -116,6 +116,19 @@ def test_a_drone_that_could_not_hover_is_refused():
     )
 
 
+@pytest.mark.parametrize("names", [("vehicle_thrust_coefficient",), ("rotor_thrust_coefficient",),
+                                   ("vehicle_thrust_coefficient", "rotor_thrust_coefficient")])  # fmt: skip
+def test_a_drone_has_to_hover_by_its_weakest_rotors(names):
+    """The share of the thrust that hovering takes: as much as rotors may lose, all draws together."""
+    system = make_system(4)
+    needed = np.linalg.norm(system.hook_force + system.drone_mass[:, None] * [0, 0, GRAVITY], axis=1).max()
+    least = (needed / (4 * system.vehicle.rotor_thrust_max)) ** (1 / len(names))
+    known = {"randomization__payload_mass": 0.0}
+    make_system(4, **{"randomization.payload_mass": 0.0}, **{f"randomization.{n}": 1 - 1.001 * least for n in names})
+    said = refuse_system(4, **known, **{f"randomization__{name}": 1 - 0.999 * least for name in names})
+    assert all(f"lower {''.join(f'randomization.{name}, ' for name in names)}payload.mass" in said for name in names)
+
+
 def test_inertia_against_the_triangle_inequality():
     message = refuse_system(payload__inertia=[0.01, 0.01, 0.03])
     assert re.match(r"payload\.inertia \[0\.01, 0\.01, 0\.03\] is impossible: no moment may exceed the sum", message)
