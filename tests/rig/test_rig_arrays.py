@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import multilift_marl as ml
+from multilift_marl.mdp.initial_states import true_equilibrium
 
 
 def arrays_of(record) -> list[np.ndarray]:
@@ -26,3 +28,12 @@ def test_kernels_of_a_task_get_each_number_of_the_rig_once():
     assert vec.task.rig is vec.world.rig
     for number in (system.anchors, system.hooks, system.cable_length, system.drone_mass, system.slots):
         assert sum(array.shape == number.shape and (array == number).all() for array in held) == 1
+
+
+def test_loads_are_over_the_nominal_payload():
+    vec = ml.make_vec("hover", num_envs=2, num_threads=1, **{"randomization.payload_mass": 0.3})
+    _, info = vec.reset(seed=0)
+    assert vec.world.rig.load == 1.0
+    for env, mass in enumerate(info["randomization"]["payload_mass"].tolist()):
+        true = true_equilibrium(vec.world.rig, vec.world.parameters, env)
+        assert true.load == pytest.approx(mass / vec.world.system.payload_mass) and true.load != 1.0
