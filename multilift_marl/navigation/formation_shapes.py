@@ -35,6 +35,8 @@ _SCALES = (  # of level forces along x and y, to begin, by the axis whose extent
     [(along, narrow) for along in _LONGER for narrow in _DRAWN_IN],
     [(wide, wide) for wide in (1.3, 1.6, 2.0)],
 )
+_PARTS = 1.0, 0.98, 0.95, 0.9, 0.8, 0.7  # of a mode that ends outside the limits, tried in turn, and ...
+_LOW_PARTS = 1.0, 0.98, 0.95, 0.94, 0.93, 0.92, 0.91, 0.9, 0.8, 0.7  # ... of the lowest
 _ITERATIONS = 60
 _STEP = 1e-6  # of finite differences, over the largest force
 
@@ -118,6 +120,11 @@ def make_shapes(system: System, low: bool = False) -> FormationShapes:
     return _with_choices(shapes, limits)
 
 
+def has_low(modes: np.ndarray, system: System) -> bool:
+    """Return whether the modes (J, N, 3) of a team's shapes include the low one."""
+    return len(modes) > len(make_shapes(system).modes)
+
+
 def _with_choices(shapes: FormationShapes, limits: ShapeLimits) -> FormationShapes:
     """Return shapes with the choices: at rest, halfway and at the end of each mode, linked where all between hold."""
     count = len(shapes.modes)
@@ -164,7 +171,7 @@ def _least(axis: int, system: System, limits: ShapeLimits, free: np.ndarray) -> 
         first = np.tensordot(free, scaled - rest, axes=2)
         mode = np.tensordot(_minimize(first, rest, free, (axis, enough), limits), free, axes=1)
         # Of a mode that ends outside the limits, the part that is within.
-        for share in (1.0, 0.98, 0.95, 0.9, 0.8, 0.7):
+        for share in _LOW_PARTS if axis == 2 else _PARTS:
             within = all(_holds(rest + part * share * mode, limits) for part in np.linspace(0, 1, 33))
             extent = max(enough, _extent(rest + share * mode, system, axis))
             if within and extent < least - 1e-3:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from multilift_marl.navigation.formation_shapes import FormationShapes, make_shape_limits, make_shapes
+from multilift_marl.navigation.formation_shapes import FormationShapes, has_low, make_shape_limits, make_shapes
 from multilift_marl.navigation.motion import RouteMotion, move_team
 from multilift_marl.navigation.search import make_lattice, search_route, states_at
 from multilift_marl.navigation.smoothing import Band, coordinate_scale, smooth_knots, space_knots
@@ -102,11 +102,11 @@ def find_route(
     start = np.array(start if departure is None else departure[0, :4], dtype=float)
     goal = np.array(goal, dtype=float)
     scene = make_scene(obstacles, env)
-    tries = [make_shapes(system), make_shapes(system, low=True)]
-    if not hangs_over(scene, settings.ground) or len(tries[0].modes) == len(tries[1].modes):
-        tries.pop()
+    tries = [make_shapes(system)]
     if departure is not None and departure.shape[1] > 4 + len(tries[0].modes):  # that of a route in low shapes
         tries = [make_shapes(system, low=True)]
+    elif hangs_over(scene, settings.ground) and has_low((shapes := make_shapes(system, low=True)).modes, system):
+        tries.append(shapes)
     shapes = tries[0]
     body = make_body(system, shapes.rest, shapes.modes)
     space = _space(start, goal, scene, body, settings)
@@ -156,11 +156,11 @@ def _find_with(shapes: FormationShapes, fineness: float, request: _Request) -> t
     nearest = int(np.abs(shapes.choices - shape).sum(axis=1).argmin())
     least = settings.least_clearance * fineness**2
     step = fineness * STEP * (system.payload_size[:2].min() / 2 + body.radius.max()) * np.ones(3)
-    if len(shapes.modes) == len(make_shapes(system).modes):
-        step[2] *= TALL
-    else:  # a slot may be between two heights of the lattice: the curve rises or sinks into it
+    if has_low(shapes.modes, system):  # a slot may be between two heights of the lattice: the curve moves into it
         step[2] *= LOW
         least -= step[2] / 2
+    else:
+        step[2] *= TALL
     lattice = make_lattice(request.start, goal, request.space, step, body, shapes, (least, settings.comfort))
     way, expanded = search_route(lattice, request.start, nearest, body, request.scene, most)
     if not len(way):
@@ -255,7 +255,7 @@ def _make_route(states: np.ndarray, body: TeamBody, request: _Request) -> Route 
             best = knots, values, clearance
         knot = np.arange(len(knots))
         band.safe[np.abs(knot[:, None] - close).min(axis=1) <= 2.0] += CLOSER
-    if clearance.min() < settings.least_clearance:  # the repairs have made it worse, or there is no room
+    if has_low(body.modes, system) and clearance.min() < best[2].min():  # where there is little room repairs may harm
         knots, values, clearance = best
     if clearance.min() < settings.least_clearance:
         return None

@@ -28,11 +28,12 @@ PILLARS = {"sparse": (7, 1.15), "dense": (14, 0.72), "unknown": (11, 0.85)}  # h
 RADIUS = 0.12, 0.32  # of pillars
 GAPS = 0.5, 0.8  # range of the widths of a narrow map's gaps over the resting formation's
 ALONE = 4.0
-SPARE = 0.15  # that a gap is wider than the payload, at least
+SPARE = 0.15  # that a gap is wider, and a slot higher, than the payload, at least
 SLOTS = 1.0, 1.15  # range of the heights of a low map's slots over the resting formation's
 DEPTH = 0.4, 0.8  # of those slots along the way
 APART = 3.8  # from one to the next, at most
 SILL = 0.45, 0.1  # from so far below the height of start and goal to so far above, their lower edges
+ROOM = 0.05  # [m] above the payload over a sill
 SPAN = 2.4  # length of a low formation, and ...
 CLIMB = 0.25  # ... by how much of the way beyond that the next sill may be higher or lower
 WALLS = 3  # of a narrow or low map
@@ -130,7 +131,7 @@ def draw_map(level: str, seed: int, system: System, course: Course = COURSE) -> 
     reach = float(system.cable_length.max() + np.linalg.norm(system.anchors, axis=1).max())
     tall = high[2] + reach + 0.1
     if level == "low":
-        placed = _slots(rng, unit, tall, (height, formation_height(system)), course)
+        placed = _slots(rng, unit, tall, height, system, course)
     elif level == "narrow":
         least = float(system.payload_size[:2].min()) + SPARE * unit
         placed = _walls(rng, unit, tall, (formation_width(system), least), course)
@@ -177,21 +178,24 @@ def _pillars(
 
 
 def _slots(
-    rng: np.random.Generator, unit: float, tall: float, heights: tuple[float, float], course: Course
+    rng: np.random.Generator, unit: float, tall: float, height: float, system: System, course: Course
 ) -> list[Obstacle]:
     """Draw walls `tall` [m] across the way, each open between a sill and a beam from one side to the other.
 
-    `heights`: of start and goal, at least, and of the resting formation [m].
+    `height`: of start and goal, at least [m].
     """
     placed, walls = [], course.walls
     apart = min(APART, 2 * course.field / max(walls - 1, 1))
     step = CLIMB * max(apart - SPAN, 0.0)
     level = rng.uniform(-SILL[0], SILL[1])
+    thick, resting = float(system.payload_size[2]), formation_height(system)
+    # Over its sill the payload is below the ceiling, with room for a route.
+    most = height + CEILING * unit - thick / 2 + float(system.payload_center[2]) - ROOM
     for wall in range(walls):
         x = ((wall - (walls - 1) / 2) * apart + rng.uniform(-0.1, 0.1)) * unit
         half = 0.5 * rng.uniform(*DEPTH) * unit
-        sill = heights[0] + level * unit
-        beam = sill + rng.uniform(*course.slots) * heights[1]
+        sill = min(height + level * unit, most)
+        beam = sill + max(rng.uniform(*course.slots) * resting, thick + SPARE * unit)
         for foot, top in ((0.0, sill), (beam, max(tall, beam + 0.1))):
             size = half, (WIDTH + 1.5) * unit, (top - foot) / 2
             placed.append(Obstacle(BOX, size, (x, 0.0, (foot + top) / 2), 0.0))

@@ -105,6 +105,9 @@ def test_a_payload_whose_centre_is_off_the_middle_takes_unequal_tensions_in_a_lo
     alike = [low.rest * [scale, scale, 1.0] for scale in np.linspace(1, 3, 81)]
     least = min(height(system, each) for each in alike if find_breach(each, system) is None)
     assert height(system, force) < least - 0.2 and least < height(system, low.rest) - 0.15
+    # No formation is lower whose cables lean by 50 degrees.
+    bound = system.anchors[0, 2] + system.cable_length[0] * np.cos(np.deg2rad(50))
+    assert bound <= height(system, force) < bound + 0.02
 
 
 def test_a_shape_whose_drones_meet_is_a_breach():

@@ -16,7 +16,7 @@ from multilift_marl.navigation.planner import RouteSettings, find_route, measure
 from multilift_marl.navigation.team_clearance import hangs_over, make_scene
 from multilift_marl.planning.maps import draw_map, place_map
 from multilift_marl.planning.route import NoRoute
-from multilift_marl.sim.obstacles import BOX, CYLINDER, SPHERE, Obstacles, place_obstacle
+from multilift_marl.sim.obstacles import BOX, CYLINDER, HULL, SPHERE, Obstacles, place_obstacle
 
 START, GOAL = np.array([-3.0, 0.0, 1.5, 0.0]), np.array([3.0, 0.0, 1.5, 0.0])
 ROOM = RouteSettings(low=(-4.5, -3.0, 0.5), high=(4.5, 3.0, 3.2))
@@ -100,15 +100,30 @@ def test_cables_lean_outwards_where_the_way_is_low(monkeypatch):
         find_route(system, placed(SLOT), 0, START, GOAL, replace(room, most=200_000))
 
 
-def test_things_hang_over_the_way_that_are_wholly_above_a_height():
-    tilted = np.deg2rad(30.0)
-    half = 0.5 * np.sin(tilted) + 0.1 * np.cos(tilted)  # of a board's height
-    obstacles = placed([(BOX, (0.5, 1.0, 0.1), (0.0, 0.0, 0.3 + half + 1e-6), 0.0)])
-    c, s = np.cos(tilted), np.sin(tilted)
-    obstacles.rotation[0, 0] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-    assert hangs_over(make_scene(obstacles, 0), 0.3)
-    obstacles.position[0, 0, 2] -= 2e-6
-    assert not hangs_over(make_scene(obstacles, 0), 0.3) and not hangs_over(make_scene(placed([]), 0), 0.3)
+def test_things_hang_over_the_way_that_are_above_a_height_or_slanted():
+    def hangs(kind, height, turn=((1, 0, 0), (0, 1, 0), (0, 0, 1))):
+        size = (0.2, 0.2, 0.2) if kind == SPHERE else (0.5, 0.4, 0.2)
+        obstacles = placed([(kind, size, (0.0, 0.0, height), 0.0)])
+        obstacles.rotation[0, 0] = turn @ obstacles.rotation[0, 0]
+        return hangs_over(make_scene(obstacles, 0), 0.3)
+
+    c, s = np.cos(0.1), np.sin(0.1)
+    lying, leaning = [[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    for height in (0.5 + 1e-6, 0.5 - 1e-6):
+        assert hangs(BOX, height) == hangs(SPHERE, height) == (height > 0.5)
+        assert hangs(SPHERE, height, leaning) == (height > 0.5)
+        assert hangs(BOX, height - 0.1, lying) == hangs(BOX, height - 0.3, lying) == False  # noqa: E712
+        assert hangs(BOX, height, leaning) and hangs(CYLINDER, height - 1.0, leaning) and hangs(HULL, height)
+    assert not hangs_over(make_scene(placed([]), 0), 0.3)
+
+
+def test_a_team_passes_below_a_plank_that_leans_to_the_ground():
+    system, plank = make_system(4), placed([(BOX, (0.15, 15.0, 0.05), (0.0, 0.0, 1.6), 0.0)])
+    c, s = np.cos(np.deg2rad(8)), np.sin(np.deg2rad(8))
+    plank.rotation[0, 0] = [[1, 0, 0], [0, c, -s], [0, s, c]]
+    room = RouteSettings(low=(-4.9, -0.9, 0.7), high=(4.9, 0.9, 1.2))
+    route = find_route(system, plank, 0, np.array([-4.0, 0, 1, 0]), np.array([4.0, 0, 1, 0]), room)
+    assert route.report.clearance >= room.least_clearance and len(route.modes) == 3
 
 
 @pytest.mark.parametrize("num_drones", [1, 2, 3, pytest.param(6, marks=pytest.mark.slow), 8])

@@ -51,6 +51,13 @@ def test_preset_passes_the_checks_of_ones_own_vehicle(preset):
     assert resolve_vehicles(VehicleConfig(preset=preset), 2) == (PRESETS[preset],) * 2
 
 
+def test_a_rotor_hovers_on_the_momentum_that_its_disc_gives_to_the_air():
+    """f = 2 ρ A v²: the air that passes the disc at v leaves at 2 v, with the momentum f per second."""
+    vehicle, speed = PRESETS["falcon"], 5.0
+    through = 1.225 * np.pi * vehicle.rotor_radius**2 * speed  # [kg/s]
+    assert vehicle.disc_momentum * speed**2 == pytest.approx(through * 2 * speed, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     "preset, speed", [("falcon", 983.9), ("hummingbird", 453.2), ("iris", 805.5), ("crazyflie_id", 1986.3)]
 )

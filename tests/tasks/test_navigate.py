@@ -82,6 +82,18 @@ def test_slots_are_as_high_as_asked_for_from_side_to_side(walls):
     assert 0.9 <= min(shares) < 0.92 and 1.18 < max(shares) <= 1.2
 
 
+@pytest.mark.parametrize("size", [[0.4, 0.4, 0.8], [0.3, 0.3, 1.0], [0.4, 0.4, 0.1]])
+def test_slots_leave_room_for_any_payload(size):
+    """Over each sill below the ceiling, and below each beam, however low slots are asked for."""
+    system = make("navigate_low", num_envs=1, **{"payload.size": size}).world.system
+    for seed in range(100):
+        drawn = draw_map("low", seed, system, Course(walls=2, slots=(0.1, 0.1)))
+        for sill, beam in zip(drawn.obstacles[::2], drawn.obstacles[1::2], strict=True):
+            edge = 2 * sill.size[2]
+            assert edge + size[2] / 2 - system.payload_center[2] <= drawn.high[2] - 0.1 - 0.049
+            assert beam.position[2] - beam.size[2] >= edge + size[2] + 0.15 * unit_length(system) - 1e-9
+
+
 def test_one_drone_is_refused_where_cables_have_to_lean():
     said = refusal(make, "navigate_low", num_envs=1, num_drones=1, **{"payload.shape": "point"})
     assert "task_options.level=low needs two drones or more" in said
