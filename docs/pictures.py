@@ -38,8 +38,8 @@ STRIPS: dict[str, tuple[str, dict, str, int, tuple[float, ...]]] = {
     "mixed_team": ("hover", MIXED, "formation_integral", 0, (0.02, 6.0)),
 }
 
-CAMERAS = {name: "chase" for name, strip in STRIPS.items() if strip[2] == "mpc_route" and name != "navigate_low"}
-CAMERAS["gate"] = "chase"
+OWN_CAMERAS = {"gate": "chase", "navigate_low": "side"}
+CAMERAS = {name: "chase" for name, strip in STRIPS.items() if strip[2] == "mpc_route"} | OWN_CAMERAS
 
 
 def draw(name: str) -> np.ndarray:

@@ -113,7 +113,7 @@ def test_an_oblique_sector_ends_where_it_is_as_far_to_the_next_slot(yaw):
     """Slots at 20, 80 and 240 degrees: the first drone's sector is from 310 to 50."""
     edge, center = np.deg2rad(50) + yaw, np.array([3.0, -2.0, 1.0])
     along, across = np.array([np.cos(edge), np.sin(edge), 0]), np.array([np.sin(edge), -np.cos(edge), 0])
-    place = center + [*(np.array([np.cos(0.35 + yaw), np.sin(0.35 + yaw)])), 1.0]
+    place = center + [np.cos(0.35 + yaw), np.sin(0.35 + yaw), 1.0]
     asked = center + 0.7 * along - 0.2 * across + [0, 0, 1.0]  # 20 cm beyond the edge
     kept = keep(place, asked, sector=0.1, payload=(center, yaw), azimuths=np.radians([20.0, 80.0, 240.0]))
     assert kept == pytest.approx(center + 0.7 * along + 0.1 * across + [0, 0, 1.0])

@@ -80,10 +80,8 @@ def test_cables_lean_outwards_where_the_way_is_low(monkeypatch):
     assert all(find_breach(force, system) in (None, "the lean of a cable") for force in forces)
     assert np.degrees(np.arctan2(np.hypot(forces[..., 0], forces[..., 1]), forces[..., 2])).max() < 50.5
     heights = drone_places(system, forces)[..., 2].max(axis=1)
-    assert (
-        heights[[0, -1]] == pytest.approx(np.full(2, system.slots[:, 2].max()), abs=1e-3)
-        and heights.min() < heights[0] - 0.2
-    )
+    assert heights[[0, -1]] == pytest.approx(np.full(2, system.slots[:, 2].max()), abs=1e-3)
+    assert heights.min() < heights[0] - 0.2
     # On from the middle of the slot, in its shape; and from a route without low shapes that meets it.
     departure = route.sample(np.array([0.5 * route.times[-1]]))[:, 0]
     onward = find_route(system, placed(SLOT), 0, START, GOAL, room, departure)
@@ -112,7 +110,7 @@ def test_things_hang_over_the_way_that_are_above_a_height_or_slanted():
     for height in (0.5 + 1e-6, 0.5 - 1e-6):
         assert hangs(BOX, height) == hangs(SPHERE, height) == (height > 0.5)
         assert hangs(SPHERE, height, leaning) == (height > 0.5)
-        assert hangs(BOX, height - 0.1, lying) == hangs(BOX, height - 0.3, lying) == False  # noqa: E712
+        assert not hangs(BOX, height - 0.1, lying) and not hangs(BOX, height - 0.3, lying)
         assert hangs(BOX, height, leaning) and hangs(CYLINDER, height - 1.0, leaning) and hangs(HULL, height)
     assert not hangs_over(make_scene(placed([]), 0), 0.3)
 

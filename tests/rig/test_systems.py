@@ -123,10 +123,13 @@ def test_a_drone_has_to_hover_by_its_weakest_rotors(names):
     system = make_system(4)
     needed = np.linalg.norm(system.hook_force + system.drone_mass[:, None] * [0, 0, GRAVITY], axis=1).max()
     least = (needed / (4 * system.vehicle.rotor_thrust_max)) ** (1 / len(names))
-    known = {"randomization__payload_mass": 0.0}
-    make_system(4, **{"randomization.payload_mass": 0.0}, **{f"randomization.{n}": 1 - 1.001 * least for n in names})
-    said = refuse_system(4, **known, **{f"randomization__{name}": 1 - 0.999 * least for name in names})
-    assert all(f"lower {''.join(f'randomization.{name}, ' for name in names)}payload.mass" in said for name in names)
+
+    def drawn(share):
+        return {"randomization__payload_mass": 0.0} | {f"randomization__{name}": 1 - share for name in names}
+
+    make_system(4, **{key.replace("__", "."): value for key, value in drawn(1.001 * least).items()})
+    said = refuse_system(4, **drawn(0.999 * least))
+    assert f"lower {''.join(f'randomization.{name}, ' for name in names)}payload.mass" in said
 
 
 def test_inertia_against_the_triangle_inequality():
