@@ -86,7 +86,11 @@ FLIGHTS: dict[str, Flight] = {
         "track_realistic", {}, "track_realistic", "figure-eight, 2 m/s, 4 m/s², realistic", scripts=FOLLOWING
     ),
     "track_realistic_5_8": Flight(
-        "track_realistic_fast", {}, "track_realistic_fast", "figure-eight, 5 m/s, 8 m/s², realistic", scripts=FOLLOWING
+        "track_realistic_fast",
+        {},
+        "track_realistic_fast",
+        "figure-eight, 5 m/s, 8 m/s², realistic without rotor wash",
+        scripts=FOLLOWING,
     ),
     "track_follow_2_2": Flight(
         "track_follow", FASTER, "track_follow", "figure-eight, 2 m/s, 2 m/s², no preview", scripts=FOLLOWING

@@ -20,7 +20,7 @@ _NAMES = {
     "track_5_8": "track_agile",
     "track_rates_2_4": "track_agile",
     "track_rates_5_8": "track_agile",
-    "track_realistic_2_4": "track_realistic",
+    "track_realistic_2_4": "track_wash",
     "track_realistic_5_8": "track_realistic_fast",
     "gate_realistic": "gate_realistic",
     "gate_realistic_3": "gate_realistic",

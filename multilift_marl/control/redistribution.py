@@ -15,6 +15,7 @@ from multilift_marl.control.gains import Gains
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import clip
 from multilift_marl.physical import GRAVITY
+from multilift_marl.remember import remember
 from multilift_marl.rig.system import System
 
 TILTS = np.radians(np.arange(0.0, 71.0))  # tried in this order
@@ -91,6 +92,7 @@ def redistribute(
     return None
 
 
+@remember
 def redistributed_slots(system: System, gains: Gains, hangs: bool, max_offset: float) -> np.ndarray:
     """Return by how much each slot moves for each lost drone, (N lost, N, 3) in slot frames [m]; 0 where none holds.
 

@@ -8,7 +8,6 @@ apart, cables taut and steep; there c_j = 1.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from math import atan2, hypot
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from multilift_marl.control.cable_forces import RANK, wrench_matrix
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import add, norm, put, row, scale, segment_distance, sub, unit
 from multilift_marl.mdp.failures import make_limits
+from multilift_marl.remember import remember
 from multilift_marl.rig.separation import SAFE_SPARE
 from multilift_marl.rig.system import System
 
@@ -106,9 +106,9 @@ def find_breach(forces: np.ndarray, system: System) -> str | None:
     return names[worst] if spare[worst] < -1e-9 else None
 
 
-@lru_cache(maxsize=32)
+@remember
 def make_shapes(system: System, low: bool = False) -> FormationShapes:
-    """Return the shapes of a team, with `low` also low ones; the same system gives the same ones, from memory."""
+    """Return the shapes of a team, with `low` also low ones; those of an equal system are remembered."""
     rest = system.formation_force.copy()
     limits = make_shape_limits(system)
     modes = []

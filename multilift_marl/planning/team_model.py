@@ -231,7 +231,7 @@ def accelerations(x, model, load, w):
     for i in range(6):
         w.acceleration[i] = right[i, 0]
     for n in range(count):
-        _swing_cable(x, n, q, model, w)
+        swing_cable(x, n, q, model, w)
 
 
 @kernel
@@ -289,7 +289,7 @@ def turning_of_anchor(n, arm, w):
 
 
 @kernel
-def _swing_cable(x, n, q, model, w):
+def swing_cable(x, n, q, model, w):
     """Write tension and c̈ of cable n: L d̈ = h − d (d·h) − L |ḋ|² d, h the drone's acceleration beside the anchor's."""
     a, d, h = w.acceleration, w.direction[n], w.across[n]
     tension = w.pull[n]

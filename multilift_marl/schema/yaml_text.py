@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -86,6 +88,11 @@ def parse_yaml(text: str) -> Any:
     Raises:
         ValueError: it is no YAML, or more than a configuration needs; one sentence without an end.
     """
+    return deepcopy(_parse(text))
+
+
+@lru_cache(maxsize=64)  # configurations that each other is based on are read again and again
+def _parse(text: str) -> Any:
     try:
         loader = _Loader(text)
         try:

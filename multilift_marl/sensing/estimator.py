@@ -34,6 +34,7 @@ from multilift_marl.math3d import (
     vec,
 )
 from multilift_marl.physical import GRAVITY
+from multilift_marl.remember import remember
 from multilift_marl.sensing.sensors import Sensors
 from multilift_marl.sensing.suite import Sensor, SensorSuite, white
 from multilift_marl.sim.earth import Site
@@ -163,6 +164,7 @@ class StateEstimator:
         return arrays | {f"estimated_{name}": getattr(self.state, name) for name in names}
 
 
+@remember
 def make_gains(suite: SensorSuite, level_field: float) -> FilterGains:
     """Return the gains of the filter for the sensors of a suite.
 

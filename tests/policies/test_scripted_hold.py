@@ -163,7 +163,7 @@ def test_ones_own_script_can_be_corrected(registries, tmp_path):
 
 
 def test_base_policies_by_tuned_gains_have_names(monkeypatch, tmp_path):
-    assert tuple(LINEAR) == train_schema.BASE_POLICIES and len(train_schema.TUNED) == 23
+    assert tuple(LINEAR) == train_schema.BASE_POLICIES and len(train_schema.TUNED) == 24
     monkeypatch.chdir(tmp_path)
     for name in train_schema.TUNED:
         kind = tuned_policy(name)
