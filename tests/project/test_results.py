@@ -258,6 +258,8 @@ def test_kept_weights_were_trained_by_the_recipe(weights):
         "task_options.success_tension",
         *(key for key in later if key.startswith(("train.diffmpc.", "train.dagger."))),
         *(key for key in later if key.startswith("env.obstacles.")),
+        # overrides that take back those of the recipe that it is based on
+        *(key for key in later if key.startswith("train.overrides.") and recipe[key] == recipe[key[16:]]),
     }
     stored["train.residual"] = check_base_policy(stored["train.residual"])  # tuned gains had no names once
     own |= {key for key in stored if stored[key] == {} and any(name.startswith(f"{key}.") for name in later)}
