@@ -7,7 +7,6 @@ import pickle
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import wraps
-from threading import Lock
 from typing import ParamSpec, TypeVar
 
 P = ParamSpec("P")
@@ -21,18 +20,14 @@ def remember(function: Callable[P, R]) -> Callable[P, R]:
     `functools.lru_cache` cannot: it takes no arrays, and compares a `System` by identity.
     """
     kept: OrderedDict[bytes, tuple[R]] = OrderedDict()
-    lock = Lock()
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         key = hashlib.sha256(pickle.dumps((args, kwargs))).digest()
-        with lock:
-            found = kept.pop(key, None)
-        found = found or (function(*args, **kwargs),)
-        with lock:
-            kept[key] = found
-            if len(kept) > _MOST:
-                kept.popitem(last=False)
+        found = kept.pop(key, None) or (function(*args, **kwargs),)
+        kept[key] = found  # as the last one
+        if len(kept) > _MOST:
+            kept.popitem(last=False)
         return found[0]
 
     return call
