@@ -16,7 +16,7 @@ from multilift_marl.kernels.jit import kernel
 from multilift_marl.math3d import clip
 from multilift_marl.physical import GRAVITY
 from multilift_marl.remember import remember
-from multilift_marl.rig.system import System
+from multilift_marl.rig.system import System, resting_rotations
 
 TILTS = np.radians(np.arange(0.0, 71.0))  # tried in this order
 AXES = np.radians(np.arange(0.0, 360.0, 5.0))  # horizontal axes of the tilt
@@ -70,14 +70,15 @@ def redistribute(
         # 2. Where the drones are that exert them, each held by the spring that its position gain is.
         size = np.linalg.norm(force, axis=2, keepdims=True)
         stretched = system.cable_length[keep, None] + size / system.cable_stiffness[keep, None]
-        moved = arms[:, keep] + stretched * force / size - system.slots[keep]
+        place = arms[:, keep] + stretched * force / size - _hook_arms(force, keep, system)
+        moved = place - system.slots[keep]
         stiffness = (gains.mass * gains.k_p)[keep, None]
         # Beyond the place itself: a drone pulled by ΔF hangs back by ΔF/κ, so its slot is put that much farther.
         offset = _to_slots(moved + (force - system.formation_force[keep]) / stiffness, system.slot_azimuth[keep])
         # 3. What is possible.
         lifted = force + GRAVITY * (gains.mass + system.cable_mass)[keep, None] * [0.0, 0.0, 1.0]
         thrust = np.linalg.norm(lifted, axis=2) / (4 * gains.thrust_max[keep])
-        height = (moved + system.slots[keep])[..., 2].min(axis=1)
+        height = place[..., 2].min(axis=1)
         possible = balanced & (thrust.max(axis=1) <= thrust_share) & (height >= LEAST_HEIGHT)
         possible &= np.abs(offset).max(axis=(1, 2)) <= max_offset
         if possible.any():
@@ -126,6 +127,16 @@ def plan_offset(seconds: float, held: np.ndarray, cosine: float, hangs: bool) ->
     share = share**2 * (3.0 - 2.0 * share)
     down = GIVE_DOWN + GIVE_NEAR * cosine
     return share * held[0] + giving * GIVE_OUT, share * held[1], share * held[2] - giving * down
+
+
+def _hook_arms(force: np.ndarray, drones: np.ndarray, system: System) -> np.ndarray:
+    """Return where the hooks of drones that hold cable forces (A, M, 3) [N] are beside them, alike [m]."""
+    if not system.hooks.any():
+        return np.zeros(3)
+    vehicles, heading = tuple(system.vehicles[n] for n in drones), system.heading[drones]
+    held = force + GRAVITY * system.cable_mass[drones, None] * [0.0, 0.0, 1.0]
+    turned = np.array([resting_rotations(vehicles, each, heading) for each in held])
+    return np.einsum("anij,nj->ani", turned, system.hooks[drones])
 
 
 def _tilted(tilt: float, axes: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.planning.plan_messages import BYTES, SAID, Post, hear, said_at, seed_of
 from multilift_marl.planning.riccati import IterationWork, Objective, Problem, find_gains, take_step
-from multilift_marl.planning.soft_limits import Surroundings
+from multilift_marl.planning.soft_limits import Surroundings, TeamPoints
 from multilift_marl.planning.team_model import (
     ModelWork,
     TeamModel,
@@ -232,7 +232,10 @@ def improve_own(n, start, states, inputs, problem, work):
         work.weights, work.end, work.rate, objective.tension[n : n + 1], objective.thrust[n : n + 1],
         objective.separation[n : n + 1, n : n + 1], objective.weights,
     )  # fmt: skip
-    alone = Problem(work.targets, work.asked, h, one, work.loads, own, problem.around)
+    around, points = problem.around, problem.around.points
+    body = TeamPoints(points.corners, points.radius[n : n + 1], points.reach, points.clearance, points.weight)
+    here = Surroundings(around.env, around.obstacles, around.ahead, body, around.others)
+    alone = Problem(work.targets, work.asked, h, one, work.loads, own, here)
     find_gains(work.states, work.inputs, alone, 0.0, work.iteration)
     take_step(work.start, work.states, work.inputs, alone, work.iteration)
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from multilift_marl.control.formation import wrap
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.team_model import ModelWork, TeamModel, accelerations
@@ -174,6 +175,7 @@ def _find_effects(x, before, dt, unknowns, model, priors, work):
     middle, w, load, missing, effect = work.middle, work.model, work.load, work.missing, work.effect
     for i in range(x.shape[0]):
         middle[i] = 0.5 * (x[i] + before[i])
+    middle[5] = before[5] + 0.5 * wrap(x[5] - before[5])
     for i in range(PAYLOAD):
         load[i] = unknowns[i]
     accelerations(middle, model, load, w)

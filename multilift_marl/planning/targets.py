@@ -17,6 +17,7 @@ from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.trajectory import attitude_of
 from multilift_marl.rig.system import System
 from multilift_marl.schema.control import ControlConfig
+from multilift_marl.schema.sections import RandomizationConfig
 
 MAX_LEAP = MAX_DISTANCE - 0.25  # [m] from a target to the next one: nearer than what counts as failure
 CLEARANCE = 0.1  # [m] of the payload from the ground at a target
@@ -32,9 +33,11 @@ class Bounds(NamedTuple):
     tilts: bool
     """Whether it can hold a tilted payload at all: it takes three anchors that are not in line."""
     thrust: np.ndarray
-    """(N,) of each drone [N]."""
+    """(N,) of each drone with its weakest rotors [N]."""
     load: float
     """Heaviest payload over the nominal one."""
+    drone: float
+    """Heaviest drone over the nominal one."""
     separation: np.ndarray
     """(N, N) of drones [m]."""
     cables: np.ndarray
@@ -47,13 +50,14 @@ class Bounds(NamedTuple):
     """(N,) with which drones hold their places [N/m]."""
 
 
-def make_bounds(system: System, control: ControlConfig, limits: Limits, load: float) -> Bounds:
-    """Return the bounds of a team whose payload may be `load` times the nominal mass, some margin left."""
+def make_bounds(system: System, control: ControlConfig, limits: Limits, ranges: RandomizationConfig) -> Bounds:
+    """Return the bounds of a team with what may be drawn in `ranges`, some margin left."""
     spread, gains = system.anchors - system.anchors.mean(axis=0), make_gains(control, system)
     return Bounds(
         tilts=bool(np.linalg.matrix_rank(spread, tol=1e-6) >= 2),
-        thrust=np.array([0.9 * 4 * vehicle.rotor_thrust_max for vehicle in system.vehicles]),
-        load=load,
+        thrust=np.array([0.9 * 4 * vehicle.rotor_thrust_max for vehicle in system.vehicles]) * ranges.weakest_rotor,
+        load=1 + ranges.payload_mass,
+        drone=1 + ranges.vehicle_mass,
         separation=MARGIN * limits.separation,
         cables=MARGIN * limits.cables,
         half=limits.payload_half,
@@ -119,7 +123,9 @@ def _within(e, goal, rig, bounds):
     for n in range(rig.slots.shape[0]):
         slot, cable_weight = vec(goal.slots, e, n), (0.0, 0.0, rig.cable_weight[n])
         cable_force = sub(vec(goal.cable_force, e, n), cable_weight)
-        carried = add(scale(bounds.load, cable_force), add(cable_weight, (0.0, 0.0, rig.mass[n] * GRAVITY)))
+        carried = add(
+            scale(bounds.load, cable_force), add(cable_weight, (0.0, 0.0, bounds.drone * rig.mass[n] * GRAVITY))
+        )
         if norm(carried) > bounds.thrust[n]:
             return False
         if slot[2] - position[2] < ABOVE * rig.cable_length[n]:

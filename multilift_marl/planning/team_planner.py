@@ -207,7 +207,8 @@ def prepare_team(e, given, times, flat, plans, work):
     for k in range(steps + 1):
         at = min(k, shape.shape[0] - 1)
         motion = FlatMotion(positions[e, k], rotations[e, k], shape[at])
-        set_flat_state(motion, starts[e, 5], loads[e], flat, work.flat, targets[k])
+        # A goal that turns far is followed on: its yaw is near to that of the step before.
+        set_flat_state(motion, targets[k - 1, 5] if k else starts[e, 5], loads[e], flat, work.flat, targets[k])
     # Numbers of a state: 6 of the payload's pose, 2 N of the cables' directions, their rates, then 3 N of thrust.
     q = 6 + 2 * (nu // 3)
     for k in range(steps + 1):

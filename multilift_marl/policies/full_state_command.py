@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from multilift_marl.kernels.jit import kernel
+from multilift_marl.math3d import mul, put, row, thrust_frame, vec
 from multilift_marl.physical import GRAVITY
 from multilift_marl.planning.team_model import ModelWork, TeamModel, accelerations
 
@@ -59,6 +60,9 @@ class FullStateCommand:
             off, faster = own.drone_position - was, own.drone_velocity - moved
             position += np.where(np.isfinite(off), off, 0.0)  # a drone may know nothing for a moment
             velocity += np.where(np.isfinite(faster), faster, 0.0)
+        else:
+            later = self._hook_arms(thrust + vec.task.dt * rate)
+            velocity -= (later - self._hook_arms(thrust)) / vec.task.dt
         total = (gains.mass + gains.load_share)[:, None]
         rotors = thrust if vec.config.control.drag_feedforward else thrust + drag
         force = rotors - total * acceleration - gains.mass[:, None] * [0.0, 0.0, GRAVITY]
@@ -85,7 +89,7 @@ class FullStateCommand:
         return np.clip(action / self._scales, -1.0, 1.0)
 
     def _drone_motion(self, states: np.ndarray, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions, velocities and accelerations (E, N, 3) of the drones in states (E, 12 + 7 N)."""
+        """Return positions of drones, velocities and accelerations of their hooks (E, N, 3) in states (E, 12 + 7 N)."""
         model, n = self._model, self._vec.num_drones
         count, q = len(states), 6 + 2 * n
         write_tensions(states, model, loads, self._work, self._tension)
@@ -97,11 +101,27 @@ class FullStateCommand:
         cable = np.concatenate([level, up], axis=-1)
         turning = np.concatenate([swing, -(level * swing).sum(axis=-1, keepdims=True) / up], axis=-1)
         length = model.length[:, None]
-        position = states[:, None, :3] + arm + length * cable
-        velocity = states[:, None, q : q + 3] + np.cross(rates[:, None], arm) + length * turning
         thrust = states[:, 2 * q :].reshape(count, n, 3)
+        position = states[:, None, :3] + arm + length * cable - self._hook_arms(thrust)
+        velocity = states[:, None, q : q + 3] + np.cross(rates[:, None], arm) + length * turning
         acceleration = (thrust - self._tension[..., None] * cable) / model.drone_mass[:, None] - [0.0, 0.0, GRAVITY]
         return position, velocity, acceleration
+
+    def _hook_arms(self, thrust: np.ndarray) -> np.ndarray:
+        """Return the hooks of drones from their centres (E, N, 3) [m], by thrust vectors (E, N, 3)."""
+        arms = np.zeros(thrust.shape)
+        write_hook_arms(thrust, self._vec.task.planned.drone_yaw, self._vec.task.rig, arms)
+        return arms
+
+
+@kernel
+def write_hook_arms(thrust, yaw, rig, arms):
+    """Write the hooks of drones from their centres (E, N, 3) [m], by thrust vectors and the teams' headings (E,)."""
+    if rig.hooked:
+        for e in range(thrust.shape[0]):
+            for n in range(thrust.shape[1]):
+                frame = thrust_frame(vec(thrust, e, n), yaw[e] + rig.heading[n])
+                put(arms[e, n], mul(frame, row(rig.hooks, n)))
 
 
 @kernel

@@ -106,7 +106,6 @@ class TeamMpc:
             late = CAMERA_DELAY if cameras else 0.0
             share = SHARE if cameras else ONBOARD if onboard else UNFILTERED
             self._observer = TeamObserver(self.planner.model, teams, share, late)
-        lag = max(vehicle.rotor_time_constant for vehicle in system.vehicles)
         self._full_state, self._feedback = None, settings.feedback
         interface = self._interface(vec)
         if self._feedback < 1.0 and interface != "full_state":
@@ -116,10 +115,11 @@ class TeamMpc:
             )
         if interface == "full_state":
             self._full_state = FullStateCommand(vec, self.planner.model, settings.delay, self._feedback == 1.0)
+        lag = np.array([vehicle.rotor_time_constant for vehicle in system.vehicles]).repeat(3)
         self._lead = lag + 0.5 * self._dt if settings.lead is None else settings.lead
         self._drag = np.array([vehicle.drag for vehicle in system.vehicles], float)
         self._lift = np.array([vehicle.thrust_coefficient for vehicle in system.vehicles], float)
-        under_way = round(settings.delay / self._dt)
+        under_way = _whole_steps(settings.delay, self._dt)
         self._sent = np.zeros((under_way + 1, teams, 3 * n))
         self._starts = np.zeros((under_way + 1, teams, 12 + 7 * n))  # of the plans for now and later
         self._fresh, self._acted = np.ones(teams, bool), np.zeros(teams)
@@ -314,11 +314,15 @@ class TeamMpc:
             rotation, rates = self._target_attitude()
         arm = np.einsum("eij,nj->eni", rotation, model.anchors)
         turning = np.einsum("eij,ej->ei", rotation, rates)
-        hook = own.drone_position + np.einsum("enij,nj->eni", own.drone_rotation, self._vec.world.system.hooks)
+        hooks = self._vec.world.system.hooks
+        hook = own.drone_position + np.einsum("enij,nj->eni", own.drone_rotation, hooks)
+        hook_velocity = own.drone_velocity + np.einsum(
+            "enij,enj->eni", own.drone_rotation, _cross(own.drone_body_rates, hooks)
+        )
         cable = hook - position[:, None] - arm
         length = np.linalg.norm(cable, axis=-1, keepdims=True)
         direction = cable / length
-        moved = own.drone_velocity - velocity[:, None] - _cross(turning[:, None], arm)
+        moved = hook_velocity - velocity[:, None] - _cross(turning[:, None], arm)
         swing = (moved - direction * (direction * moved).sum(-1, keepdims=True)) / length
         air = np.einsum("enji,enj->eni", own.drone_rotation, own.drone_velocity)
         drag = np.einsum("enij,enj->eni", own.drone_rotation, self._drag * air)
@@ -372,6 +376,17 @@ class TeamMpc:
         action[..., 3] = (cosine * roll - sine * pitch) / fastest
         action[..., 4] = (sine * roll + cosine * pitch) / fastest
         return np.clip(action, -1.0, 1.0)
+
+
+def _whole_steps(delay: float, dt: float) -> int:
+    """Return how many policy steps a delay [s] is."""
+    steps = round(delay / dt)
+    if abs(delay - steps * dt) > 1e-6:
+        raise ConfigError(
+            f"planner.delay={delay:g} is no whole number of policy steps of {dt:g} s, in which plans are made; set "
+            f"planner.delay={int(delay / dt) * dt:g} or {(int(delay / dt) + 1) * dt:g}"
+        )
+    return steps
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

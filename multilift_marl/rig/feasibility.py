@@ -208,8 +208,10 @@ def _check_controller(config: SystemConfig, system: System) -> None:
             f"control.reference_frequency={control.reference_frequency:g} rad/s is more than a quarter of "
             f"sim.control_hz={rate:g}, at which its filter is no longer smooth; lower it or raise sim.control_hz"
         )
-    attitude = control.attitude_frequency or max(0.7 / vehicle.rotor_time_constant for vehicle in system.vehicles)
-    position = control.position_frequency or attitude / 5  # null: as fast as motors allow, see control/gains.py
+    # No loop is faster than motors allow, whatever is set, see control/gains.py.
+    motors = max(0.7 / vehicle.rotor_time_constant for vehicle in system.vehicles)
+    attitude = min(control.attitude_frequency or motors, motors)
+    position = min(control.position_frequency or motors, attitude / 5)
     for loop, frequency in (("attitude", attitude), ("position", position)):
         damping = getattr(control, f"{loop}_damping")
         # An explicit step h takes the share 2 ζ ω h from a velocity: beyond 1 that changes its sign.

@@ -208,9 +208,8 @@ class Pose(Task):
             warn_of_time(last, (targets - 1) * hold + option.way_seconds, length)
             # Actions point as observations do.
             self.planned = Goal.zeros(e, n)._replace(slot_frame=self.goal.slot_frame)
-        heaviest = 1 + self.config.randomization.payload_mass
         self.settings = PoseSettings(
-            holdable=make_bounds(system, self.config.control, self.limits, heaviest),
+            holdable=make_bounds(system, self.config.control, self.limits, self.config.randomization),
             bounds=RestBounds.of(option),
             success_seconds=option.success_seconds,
             hold=hold,

@@ -200,7 +200,7 @@ def test_numbers_that_no_flight_can_have_are_named_with_their_bounds_and_unit(ke
             "control.attitude_frequency=21.2121 rad/s",
             "raise sim.control_hz",
         ),
-        ({"control.attitude_frequency": 200.0}, "control.attitude_frequency", "raise sim.control_hz"),
+        ({"control.attitude_damping": 7.0}, "control.attitude_frequency=20 rad/s", "raise sim.control_hz"),
     ],
 )
 def test_what_the_time_step_cannot_follow_is_refused(overrides, culprit, cure):

@@ -13,8 +13,8 @@ from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.baselines import fitting_scripts, make_scripted
 
 
-def solve(name: str, lost: int = 0, thrust_share: float = 0.8, max_offset: float = 1.0, hangs: bool = True):
-    config = load_config(name)
+def solve(name: str, lost: int = 0, thrust_share: float = 0.8, max_offset: float = 1.0, hangs: bool = True, **keys):
+    config = load_config(name, keys)
     system, gains = config.system, make_gains(config.control, config.system)
     return system, redistribute(system, gains, lost, hangs, thrust_share, max_offset)
 
@@ -37,6 +37,31 @@ def test_six_drones_lose_one_and_stay_level_while_four_cannot():
     tilts = {name: np.rad2deg(solve(name)[1].tilt) for name in ("loss", "loss_6")}
     assert tilts["loss_6"] <= 1.5 and 35 < tilts["loss"] < 45
     assert np.rad2deg(solve("loss", hangs=False)[1].tilt) <= 5
+
+
+@pytest.mark.parametrize(("name", "hangs"), [("loss", True), ("loss_6", False)])
+def test_hooks_end_up_where_cables_hold_the_payload(name, hangs):
+    """A drone is above its hook, wherever that is: cable, hook and slot close the way from the anchor."""
+    for hook in ([0.0, 0.0, 0.0], [0.03, -0.02, -0.05]):
+        system, found = solve(name, hangs=hangs, **{"cable.hook": hook})
+        gains, found_anchors = make_gains(load_config(name).control, system), []
+        for n in range(1, system.num_drones):
+            c, s = np.cos(system.slot_azimuth[n]), np.sin(system.slot_azimuth[n])
+            slot = system.slots[n] + np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ found.offset[n]
+            drone = slot - (found.force[n] - system.formation_force[n]) / (gains.mass[n] * gains.k_p[n])
+            lifted = found.force[n] + GRAVITY * system.drone_mass[n] * np.array([0, 0, 1])
+            z = lifted / np.linalg.norm(lifted)
+            y = np.cross(z, [np.cos(system.heading[n]), np.sin(system.heading[n]), 0])
+            y /= np.linalg.norm(y)
+            cable = drone + np.column_stack([np.cross(y, z), y, z]) @ system.hooks[n]
+            size = np.linalg.norm(found.force[n])
+            cable -= found.force[n] / size * (system.cable_length[n] + size / system.cable_stiffness[n])
+            found_anchors.append(cable)
+        # However the payload is tilted, its anchors are as far from each other as they are.
+        apart = [
+            np.linalg.norm(each[:, None] - each, axis=-1) for each in (np.array(found_anchors), system.anchors[1:])
+        ]
+        np.testing.assert_allclose(*apart, atol=1e-3)
 
 
 def test_less_thrust_or_room_means_more_tilt():

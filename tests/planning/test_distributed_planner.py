@@ -18,6 +18,7 @@ from multilift_marl.planning.team_model import ModelWork, accelerations, make_mo
 from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.schema.planner import PlannerConfig
 from multilift_marl.sensing.communication import Links
+from multilift_marl.sim.obstacles import SPHERE, Obstacles, place_obstacle
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "results"))
 
@@ -191,6 +192,25 @@ def test_drones_keep_away_from_where_others_say_they_are():
         c = found[6 : 6 + 2 * N].reshape(N, 2)
         gaps.append(np.linalg.norm(c - c.mean(axis=0), axis=1).mean())
     assert gaps[1] > gaps[0] + 0.01
+
+
+@pytest.mark.parametrize("preset", [["iris", "iris", "iris"], ["falcon", "iris", "iris"]])
+def test_each_drone_keeps_clear_of_obstacles_by_its_own_size(preset):
+    """A sphere 0.27 m from an iris, whose own one has 0.255 m, repels it whoever else is in the team."""
+    system = ml.load_config("hover", {"env.num_drones": N, "vehicle.preset": preset}).system
+    model, rest, moves = make_model(system), np.zeros(state_size(N)), []
+    pose = np.tile([0.0, 0.0, 2.0], (5, 1)), np.tile(np.eye(3), (5, 1, 1))
+    team = make_flat_team(model, system)
+    set_flat_state(FlatMotion(*pose, steady_shape(team)), 0.0, np.zeros(7), team, FlatWork.of(N), rest)
+    c = rest[8:10]
+    drone = rest[:3] + model.anchors[1] + model.length[1] * np.array([*c, np.sqrt(1 - c @ c)])
+    for gap in (9.0, 0.27):
+        obstacles = Obstacles.zeros(1, 1)
+        place_obstacle(0, 0, obstacles, SPHERE, (0.2, 0.2, 0.2), tuple(drone + [0.0, 0.0, 0.2 + gap]))
+        apart = DistributedPlanner(system, PlannerConfig(clearance=0.1), 1, obstacles, links())
+        plans = apart.plan(np.tile(rest, (N, 1)), *held(apart, N)[:2], 0.0, held(apart, N)[2])
+        moves.append(plans.inputs[1, :, 3:6].copy())
+    assert np.abs(moves[1] - moves[0]).max() > 1.0
 
 
 def test_a_message_holds_seven_numbers_of_each_step_and_seven_of_the_load():

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import multilift_marl as ml
 from multilift_marl.planning.flatness import FlatMotion, FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.team_model import ModelWork, make_model, state_size, step_state
 from multilift_marl.planning.team_observer import TeamObserver
+from multilift_marl.policies.full_state_command import rotations
 
 N, DT, LATE = 3, 0.02, 0.008
 Q = 6 + 2 * N
 
 
-@pytest.fixture(scope="module")
-def flown():
-    """The model of a team, and 3 s of its states under thrusts that swing it."""
+def fly(speed=0.0):
+    """Return the model of a team, and 3 s of its states from a speed [m/s] on, under thrusts that swing it."""
     system = ml.load_config("hover", {"env.num_drones": N}).system
     model, x, after = make_model(system), np.zeros(state_size(N)), np.zeros(state_size(N))
     pose = np.tile([0.0, 0.0, 1.0], (5, 1)), np.tile(np.eye(3), (5, 1, 1))
     team = make_flat_team(model, system)
     set_flat_state(FlatMotion(*pose, steady_shape(team)), 0.0, np.zeros(7), team, FlatWork.of(N), x)
+    x[Q] = speed
     work, rest, states = ModelWork.of(N), x[2 * Q :].copy(), [x.copy()]
     for k in range(150):
         thrust = rest.copy()
@@ -30,6 +32,11 @@ def flown():
         x, after = after.copy(), x
         states.append(x.copy())
     return model, np.array(states)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    return fly()
 
 
 def observe(model, measured, late):
@@ -42,11 +49,29 @@ def test_without_noise_states_are_what_is_measured(flown):
     assert observe(model, states, 0.0) == pytest.approx(states, abs=1e-9)
 
 
-def test_a_late_pose_is_the_pose_of_then(flown):
-    model, states = flown
+def seen_late(model, states):
+    """Return what is measured of states where all of the payload's pose is late, and cables go from there to drones."""
     measured = states.copy()
-    measured[:, :3] -= LATE * states[:, Q : Q + 3]
-    assert observe(model, measured, LATE)[50:] == pytest.approx(states[50:], abs=1e-3)
+    for x, y in zip(states, measured, strict=True):
+        rotation, then = rotations(x[None, 3:6])[0], x[:6].copy()
+        turned = Rotation.from_matrix(rotation) * Rotation.from_rotvec(-LATE * x[Q + 3 : Q + 6])
+        then[:3] -= LATE * x[Q : Q + 3]
+        then[3:6] = turned.as_euler("ZYX")[::-1]
+        for n in range(N):
+            c = x[6 + 2 * n : 8 + 2 * n]
+            drone = x[:3] + rotation @ model.anchors[n] + model.length[n] * np.array([*c, np.sqrt(1 - c @ c)])
+            cable = drone - then[:3] - turned.as_matrix() @ model.anchors[n]
+            y[6 + 2 * n : 8 + 2 * n] = (cable / np.linalg.norm(cable))[:2]
+        y[:6] = then
+    return measured
+
+
+@pytest.mark.parametrize("speed", [0.0, 5.0])
+def test_a_late_pose_is_the_pose_of_then_also_for_cables(speed):
+    model, states = fly(speed)
+    found = observe(model, seen_late(model, states), LATE)[50:]
+    assert found == pytest.approx(states[50:], abs=1e-3)
+    assert found[:, 6:Q] == pytest.approx(states[50:, 6:Q], abs=1e-4)
 
 
 def test_with_noise_places_and_velocities_are_better_than_measured(flown):

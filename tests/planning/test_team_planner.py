@@ -229,6 +229,19 @@ def planned(system, states, **settings):
     return planner, planner.plan(states, positions, rotations, 0.02, offsets)
 
 
+def test_targets_turn_on_beyond_half_a_turn(system):
+    """A goal that turns through 6 rad within the horizon is planned as one turn: yaw does not leap back by 2 π."""
+    _, rest = at_rest(system)
+    rest[5] = 0.5
+    planner = TeamPlanner(system, PlannerConfig(steps=60, step=0.1), 1)
+    angles = 0.5 + planner.times
+    c, s, zero = np.cos(angles), np.sin(angles), np.zeros_like(angles)
+    rotations = np.moveaxis(np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]]), (0, 1), (2, 3))
+    positions = np.tile([0.0, 0.0, 1.0], (1, *angles.shape, 1))
+    plans = planner.plan(rest[None], positions, rotations[None], 0.02, np.zeros((1, len(angles), 12)))
+    np.testing.assert_allclose(plans.targets[0, :, 5], angles[:, 2], atol=1e-6)
+
+
 def test_plans_of_teams_do_not_depend_on_their_neighbours(system):
     _, rest = at_rest(system)
     rng = np.random.default_rng(2)
@@ -250,6 +263,30 @@ def test_a_plan_that_is_not_finite_begins_anew_and_says_so(system):
     poses = np.tile([0.0, 0.0, 1.0], (*shape, 1)), np.tile(np.eye(3), (*shape, 1, 1))
     again = planner.plan(states, *poses, 0.02, np.zeros((*shape[:2], 12)))
     assert not again.failed.any() and np.isfinite(again.states).all()
+
+
+def test_estimates_do_not_feel_the_heading_pass_half_a_turn(system):
+    """Two flights that differ by half a turn alone, seen with headings in (-π, π], of which one passes π."""
+    found = []
+    for begin in (-0.1, np.pi - 0.1):
+        model, x = at_rest(system)
+        turn = np.array([[np.cos(begin), -np.sin(begin)], [np.sin(begin), np.cos(begin)]])
+        x[5], x[Q + 5], x[4] = begin, 1.0, 0.3
+        for part in (x[6:Q].reshape(N, 2), x[2 * Q :].reshape(N, 3)[:, :2]):
+            part[:] = part @ turn.T
+        estimator, after, scratch, turned = ForceEstimator(model, 1, 0.2), np.zeros(SIZE), ModelWork.of(N), 0.0
+        for _ in range(60):
+            seen = x.copy()
+            seen[5] = np.remainder(seen[5] + np.pi, 2 * np.pi) - np.pi
+            turned = max(turned, x[5] - begin)
+            estimator.update(seen[None], 0.02, np.ones(1, bool))
+            for _ in range(20):
+                step_state(x, np.zeros(NU), 1e-3, model, np.zeros(7), scratch, after)
+                x, after = after.copy(), x
+        assert turned > 0.15
+        found.append(estimator.forces[0].reshape(N, 3).copy())
+    np.testing.assert_allclose(found[1] * [-1, -1, 1], found[0], atol=1e-6)
+    assert np.abs(found[0]).max() < 0.02
 
 
 def estimate(system, load, forces, seconds=6.0):

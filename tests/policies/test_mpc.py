@@ -191,6 +191,26 @@ def test_what_it_cannot_fly_is_refused(config, overrides, said):
     assert said in refusal(make_scripted, "mpc", vec)
 
 
+@pytest.mark.parametrize("delay", [0.01, 0.03])
+def test_a_delay_between_policy_steps_is_refused(delay):
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1, **BY_RATES, **{"planner.delay": delay})
+    message = refusal(make_scripted, "mpc", vec)
+    assert message.startswith(f"planner.delay={delay:g} is no whole number of policy steps of 0.02 s")
+    assert f"set planner.delay={delay - 0.01:g} or {delay + 0.01:g}" in message
+
+
+def test_thrusts_lead_by_the_lag_of_each_drones_own_motors():
+    lags = [0.02, 0.1, 0.02, 0.05]
+    own = {"vehicle.rotor_time_constant_up": lags, "vehicle.rotor_time_constant_down": lags}
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1, num_drones=4, **BY_RATES, **own)
+    policy, (observation, _) = make_scripted("mpc", vec), vec.reset(seed=0)
+    policy.act(observation)
+    plans = policy.planner.plans
+    ahead = policy._sent[-1, 0] - plans.states[0, 0, -12:]
+    np.testing.assert_allclose(ahead, (np.repeat(lags, 3) + 0.01) * plans.inputs[0, 0], atol=1e-9)
+    assert np.abs(plans.inputs[0, 0]).min() > 1e-3
+
+
 WIDE = {f"control.{key}": wide for key, (_, wide) in ENOUGH["full_state"].items()}
 FULL_STATE = {"control.action": "full_state"} | WIDE
 PARTS = ("position", "rotation", "velocity", "body_rates")

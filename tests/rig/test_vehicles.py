@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import GRAVITY, drone_gains, floats, free_world, load, make_system, refuse_system
 
+import multilift_marl as ml
 from multilift_marl.control.allocation import allocate
 from multilift_marl.control.gains import DroneGains, make_gains
 from multilift_marl.control.geometric import attitude_torque
@@ -188,6 +189,12 @@ def test_rising_and_falling_rotors_lag_each_by_its_own_constant(start, thrust, c
 def damping(eigenvalues: np.ndarray) -> float:
     """Return the least damping ratio; negative if unstable."""
     return float((-eigenvalues.real / np.abs(eigenvalues)).min())
+
+
+@pytest.mark.parametrize("loop", ["attitude", "position", "yaw"])
+def test_a_frequency_far_above_its_bound_is_accepted_as_any_above_it(caplog, loop):
+    ml.make_vec("hover", num_envs=1, **{f"control.{loop}_frequency": 900.0})
+    assert any(f"control.{loop}_frequency=900 is above" in each.getMessage() for each in caplog.records)
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -6,7 +6,7 @@ from math import pi
 
 import numpy as np
 import pytest
-from conftest import bold_actions, make, refusal, same, zeros
+from conftest import GRAVITY, bold_actions, make, refusal, same, zeros
 
 import multilift_marl as ml
 from multilift_marl.control.cable_forces import is_stable
@@ -291,6 +291,22 @@ def test_teams_that_cannot_hold_a_tilt_get_level_targets(num_drones):
     vec.reset(seed=0)
     assert (vec.task.own.plan.pose[..., 4:] == 0).all()
     assert np.abs(vec.task.own.plan.pose[..., 3]).max() > pi / 2
+
+
+@pytest.mark.parametrize("hidden", [{}, {"vehicle_mass": 0.3}, {"vehicle_thrust_coefficient": 0.15}])
+def test_targets_are_held_with_the_weakest_rotors_and_the_heaviest_drones(hidden):
+    keys = {f"randomization.{key}": width for key, width in hidden.items()} | CALM
+    vec = make("pose", num_envs=64, num_drones=4, **{"payload.mass": 2.2}, **keys)
+    vec.reset(seed=0)
+    task, worst = vec.task, 0.0
+    mass = (1 + hidden.get("vehicle_mass", 0.0)) * vec.world.system.drone_mass
+    for e in range(64):
+        for stage in range(1, task.own.plan.pose.shape[1]):
+            set_goal_from_plan(e, stage, task.own.plan, task.goal, task.rig)
+            lifted = task.goal.cable_force[e] + GRAVITY * mass[:, None] * [0, 0, 1]
+            worst = max(worst, np.linalg.norm(lifted, axis=1).max())
+    most = 4 * vec.world.system.vehicles[0].rotor_thrust_max
+    assert 0.5 * most < worst < 0.9 * (1 - hidden.get("vehicle_thrust_coefficient", 0.0)) * most
 
 
 def test_a_point_payload_counts_as_turned_as_its_way_is():
