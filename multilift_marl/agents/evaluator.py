@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from multilift_marl.config.config import Config
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.evaluation.metrics import FEWEST, is_better, join_episodes, summarize
-from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.evaluation.rollout import run_episodes, trace_episode
 from multilift_marl.policies.baselines import make_base_policy
 from multilift_marl.policies.policy import Policy
 from multilift_marl.tasks import find_task
@@ -142,6 +143,16 @@ class Evaluator:
         """Return the best policy so far."""
         assert self.best is not None
         return LearnedPolicy(self.best, "the run's best")
+
+    def draw_best(self, folder: Path) -> Path:
+        """Return the path of a picture in a folder, of the first episode of the best policy so far."""
+        from multilift_marl.evaluation.plots import plot_paths  # matplotlib takes a while
+
+        assert self.best is not None
+        policy, path = self.best_policy(), folder / "flight.png"
+        trace = trace_episode(self.config, policy.bind, 0, self.config.seed)
+        plot_paths(path, trace, f"best policy so far, iteration {self.best['iteration']}")
+        return path
 
     def _confirm(self, candidate: LearnedPolicy, iteration: int) -> bool:
         """Return whether a policy beats the best one on fresh episodes, too.

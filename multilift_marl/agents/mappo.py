@@ -162,6 +162,19 @@ def check_batch(train: TrainConfig, vec: MultiliftVec, num_envs: int, rigs: int 
 
 
 @torch.no_grad()
+def check_finite(learner: Learner, iteration: int) -> None:
+    """Refuse, by a ConfigError, networks that are of no use any more after learning in an iteration, from 0."""
+    # A deviation of 0, or one beyond single precision, shows before the weights do.
+    deviation = learner.actor.log_std.exp().square().log()
+    numbers = (deviation, *learner.actor.state_dict().values(), *learner.critic.state_dict().values())
+    if not all(each.isfinite().all() for each in numbers):
+        raise ConfigError(
+            f"training diverged in iteration {iteration + 1}: its networks hold numbers that are not finite; lower "
+            "train.learning_rate or train.critic_learning_rate and train anew"
+        )
+
+
+@torch.no_grad()
 def estimate_advantage(learner: Learner, batch: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
     """Return generalised advantage estimates and values (E, T, N, 1) of rollouts (Schulman et al., ICLR 2016).
 

@@ -32,7 +32,7 @@ from multilift_marl.agents.initial import find_initial
 from multilift_marl.agents.learning_rollouts import LearningRollouts
 from multilift_marl.agents.loggers import check_logger, hyperparameters
 from multilift_marl.agents.logging import RunLog, describe_evaluation, quietly, say, write_versions
-from multilift_marl.agents.mappo import adapted_rate, check_batch, make_learner, update
+from multilift_marl.agents.mappo import adapted_rate, check_batch, check_finite, make_learner, update
 from multilift_marl.agents.policy import check_policy
 from multilift_marl.agents.resuming import check_content, check_needed, load_networks
 from multilift_marl.agents.rigs import divide_rigs
@@ -42,7 +42,6 @@ from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.config.precedence import give_way
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason
-from multilift_marl.evaluation.rollout import trace_episode
 from multilift_marl.plugins import import_modules
 from multilift_marl.trust import check_cluster, review
 
@@ -131,7 +130,7 @@ class Trainer:
                 self._train(log, bar, name)
             except Abandoned:
                 self._rescue()
-            except ConfigError:  # of workers that are lost, say
+            except ConfigError:  # of workers that are lost, say, or of networks that are
                 self._rescue()
                 raise
             finally:
@@ -188,7 +187,7 @@ class Trainer:
             ):
                 unsaved = not self._attempt(partial(self.save, "last"))
             if values.get("eval/best_iteration") == self.iteration:
-                self._attempt(lambda: log.write_picture("flight", self._draw_best(), self.frames))
+                self._attempt(lambda: log.write_picture("flight", self.evaluator.draw_best(self.folder), self.frames))
             quietly(bar.set_postfix, shown)
             quietly(bar.update, not first)
         if unsaved:
@@ -247,6 +246,7 @@ class Trainer:
             torch.set_num_threads(train.threads)
             values = update(self.learner, batches)
             torch.set_num_threads(1)
+        check_finite(self.learner, self.iteration)
         actor["lr"] = rate
         # In the warm-up the policy does not move: a KL of 0 would only raise the rate.
         if train.desired_kl and self.iteration >= train.warmup and "approx_kl" in values:
@@ -350,15 +350,6 @@ class Trainer:
         best, path = self.evaluator.best, self.folder / "checkpoints" / "best.pt"
         if best is not None and not (path.is_file() and load_checkpoint(path).get("iteration") == best["iteration"]):
             save_checkpoint(path, best)
-
-    def _draw_best(self) -> Path:
-        """Return the path of a picture of the first episode of the best policy."""
-        from multilift_marl.evaluation.plots import plot_paths  # matplotlib takes a while
-
-        policy, path = self.evaluator.best_policy(), self.folder / "flight.png"
-        trace = trace_episode(self.config, policy.bind, 0, self.config.seed)
-        plot_paths(path, trace, f"best policy so far, iteration {self.iteration}")
-        return path
 
 
 def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Trainer:
