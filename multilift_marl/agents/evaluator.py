@@ -115,7 +115,9 @@ class Evaluator:
     @property
     def _measure(self) -> dict[str, Any]:
         """What scores have to have in common to be compared."""
-        return {"compared_by": self.error, "episodes": self.config.eval.episodes}
+        measure = {"compared_by": self.error, "episodes": self.config.eval.episodes}
+        # Scores without that number are of rigs that all flew the same episodes.
+        return measure | ({"rigs": len(rigs)} if (rigs := self.config.train.rigs) else {})
 
     def _score(self, flown: dict[str, np.ndarray]) -> list[float]:
         if self.error not in flown:
@@ -169,7 +171,9 @@ class Evaluator:
     ) -> dict[str, np.ndarray]:
         """Return the metrics of each episode of a block, in the task's own environment or in another one."""
         rigs, seed = evaluated_rigs(environment or self.config), self.config.seed
-        # Rounded up, so that each rig has its share; blocks of episodes never meet.
+        # Rounded up, so that each rig has its share; neither those of two rigs nor blocks of episodes ever meet.
         each, first = -(-self.config.eval.episodes // len(rigs)), block * _BLOCK
-        flown = [run_episodes(rig, make_policy, each, seed, TRAINING_EVALUATION, first=first) for rig in rigs]
-        return join_episodes(flown)
+        return join_episodes([
+            run_episodes(rig, make_policy, each, seed, TRAINING_EVALUATION, first=first + k * each)
+            for k, rig in enumerate(rigs)
+        ])  # fmt: skip

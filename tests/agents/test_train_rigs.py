@@ -133,11 +133,33 @@ def test_evaluations_fly_every_rig(tmp_path):
     values = trainer.evaluate()
     policy = LearnedPolicy(trainer._content(), "the run")
     config = trainer.config
-    returns = [
-        run_episodes(build_config(config.model_dump(), rig), policy.bind, 2, config.seed, TRAINING_EVALUATION)["return"]
-        for rig in RIGS
-    ]
+    returns = []
+    for k, rig in enumerate(RIGS):
+        flown = build_config(config.model_dump(), rig)
+        found = run_episodes(flown, policy.bind, 2, config.seed, TRAINING_EVALUATION, first=2 * k)
+        returns.append(found["return"])
     assert values["eval/return"] == pytest.approx(np.concatenate(returns).mean(), rel=1e-12)
+
+
+def test_rigs_that_are_equal_are_evaluated_in_different_episodes(tmp_path):
+    trainer = make_trainer(tmp_path, **{"train.rigs": [{}, {}], "eval.episodes": 4})
+    evaluator, whole = trainer.evaluator, make_trainer(tmp_path, **{"eval.episodes": 4}).evaluator
+    policy = LearnedPolicy(trainer._content(), "the run")
+    twice, once = (each._fly(policy.bind, 3)["return"] for each in (evaluator, whole))
+    assert len(np.unique(twice)) == 4 and np.array_equal(twice, once)
+
+
+def test_a_score_of_rigs_in_the_same_episodes_is_measured_anew(tmp_path, monkeypatch):
+    trainer = make_trainer(tmp_path, **{"train.rigs": [{}, {}], "eval.episodes": 2})
+    trainer.evaluate()
+    best = trainer.evaluator.best
+    score = best["score"]
+    best |= {"score": [2.0, 0.0]}
+    trainer.evaluate()
+    assert best["score"] == [2.0, 0.0]
+    del best["rigs"]  # as before
+    trainer.evaluate()
+    assert best["score"] == score
 
 
 @pytest.mark.parametrize(
