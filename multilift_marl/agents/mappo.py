@@ -123,6 +123,11 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     return Learner(config, actor, critic, StochasticPolicy(actor), optimizer)
 
 
+def in_warmup(train: TrainConfig, iteration: int) -> bool:
+    """Return whether the critic alone learns: by its untrained values a good actor would only get worse."""
+    return train.algorithm in ("mappo", "ippo") and iteration < train.warmup
+
+
 def check_communication(train: TrainConfig, env: EnvConfig) -> None:
     """Refuse, by a ConfigError, networks of a team whose drones do not all hear each other."""
     if train.actor != "local" and env.sensing in ("onboard", "blind") and env.communication != "all":

@@ -32,7 +32,7 @@ from multilift_marl.agents.initial import find_initial
 from multilift_marl.agents.learning_rollouts import LearningRollouts
 from multilift_marl.agents.loggers import check_logger, hyperparameters
 from multilift_marl.agents.logging import RunLog, describe_evaluation, quietly, say, write_versions
-from multilift_marl.agents.mappo import adapted_rate, check_batch, check_finite, make_learner, update
+from multilift_marl.agents.mappo import adapted_rate, check_batch, check_finite, in_warmup, make_learner, update
 from multilift_marl.agents.policy import check_policy
 from multilift_marl.agents.resuming import check_content, check_needed, load_networks
 from multilift_marl.agents.rigs import divide_rigs
@@ -150,6 +150,12 @@ class Trainer:
         shown: dict[str, str] = {}
         unsaved = tabled = False
         self._best_saved = self._attempt(self._restore_best)
+        if in_warmup(self.config.train, self.iterations - 1):
+            say(
+                f"warning: the policy of this training learns nothing: its {self.iterations} iterations are within "
+                f"train.warmup={self.config.train.warmup}, where the critic learns alone; lower train.warmup or raise "
+                "train.frames"
+            )
         while not (self.finished or self._stopper.asked):
             start = time.perf_counter()
             first = self.evaluator.best is None  # the policy that it begins with; untrained, it acts as its base policy
@@ -234,8 +240,7 @@ class Trainer:
         # Before the warm-up takes the actor's rate, which the critic may share.
         critic["lr"] = train.critic_learning_rate * left if train.critic_learning_rate else actor["lr"]
         rate = actor["lr"]
-        # The critic learns alone at first: by its untrained values a good actor would only get worse.
-        if self.iteration < train.warmup and train.algorithm in ("mappo", "ippo"):
+        if in_warmup(train, self.iteration):
             actor["lr"] = 0.0
         batches = self.rollouts.collect(self.iteration)
         sampling = time.perf_counter() - start
