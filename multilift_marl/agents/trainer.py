@@ -215,7 +215,8 @@ class Trainer:
         """Have the policy act in the environments of the present stage."""
         self.env, environment = envs[0], self.curriculum.environment
         self.rollouts = make_rollouts(environment, envs, self.learner)
-        self.episodes = EpisodeStatistics([env.vec for env in envs], environment.env.num_envs)
+        vecs, began = [env.vec for env in envs], self.curriculum.began
+        self.episodes = EpisodeStatistics(vecs, environment.env.num_envs, began)
 
     def _advance(self, success: float | None) -> None:
         """Go on to the next stage where the present one is over."""
@@ -257,7 +258,7 @@ class Trainer:
         if train.desired_kl and self.iteration >= train.warmup and "approx_kl" in values:
             actor["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
         learning = values.pop("learning_seconds")
-        values |= self.episodes.read(batches, self.iteration - self.curriculum.began)
+        values |= self.episodes.read(batches, self.iteration)
         self.iteration += 1
         return values | {
             "learning_rate": rate,
@@ -346,7 +347,10 @@ class Trainer:
             raise CheckpointError(
                 f"the checkpoint does not fit this version or system ({reason(error)}); train anew"
             ) from error
-        self.episodes.returns[:] = content["returns"].numpy()
+        if isinstance(self.rollouts, LearningRollouts) and self.rollouts.begins_anew:
+            self.episodes.began = content["iteration"]
+        else:
+            self.episodes.returns[:] = content["returns"].numpy()
         self.iteration, self.seconds = content["iteration"], content["seconds"]
         self.evaluator.best, self.evaluator.initial = content["best_policy"], content.get("initial_policy")
 
