@@ -22,6 +22,7 @@ from multilift_marl.agents.checkpoint import (
     make_run_folder,
     making_run,
     save_checkpoint,
+    saved_iteration,
     unlock_run,
 )
 from multilift_marl.agents.curriculum import Curriculum
@@ -184,13 +185,8 @@ class Trainer:
             self.seconds += time.perf_counter() - start
             if not self._best_saved:
                 self._best_saved = self._attempt(self._restore_best)
-            if (
-                unsaved
-                or first
-                or self.iteration % self.config.train.checkpoint_every == 0
-                or last
-                or self._stopper.asked
-            ):
+            due = self.iteration % self.config.train.checkpoint_every == 0
+            if unsaved or first or due or last or self._stopper.asked:
                 unsaved = not self._attempt(partial(self.save, "last"))
             if values.get("eval/best_iteration") == self.iteration:
                 self._attempt(lambda: log.write_picture("flight", self.evaluator.draw_best(self.folder), self.frames))
@@ -357,7 +353,7 @@ class Trainer:
     def _restore_best(self) -> None:
         """Write the best policy of a resumed run, which may have found another one after its last checkpoint."""
         best, path = self.evaluator.best, self.folder / "checkpoints" / "best.pt"
-        if best is not None and not (path.is_file() and load_checkpoint(path).get("iteration") == best["iteration"]):
+        if best is not None and saved_iteration(path) != best["iteration"]:
             save_checkpoint(path, best)
 
 

@@ -108,6 +108,18 @@ def test_checkpoint_without_policy_is_named(tmp_path):
         load_policy(tmp_path / "x.pt")
 
 
+@pytest.mark.parametrize("damage", [lambda path: path.write_bytes(b"torn"), lambda path: path.unlink()])
+def test_a_best_policy_that_cannot_be_read_is_written_again(tmp_path, damage, capsys):
+    trainer = make_trainer(tmp_path, **{"train.frames": 256, "eval.every": 100})
+    trainer.step()
+    trainer.evaluate()
+    trainer.save("last")
+    best = trainer.folder / "checkpoints" / "best.pt"
+    damage(best)
+    assert resume_run(trainer.folder, {}).run()
+    assert load_checkpoint(best)["iteration"] in (1, 2) and "warning" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", ["latest", "runs/none"])
 def test_missing_run_is_named(tmp_path, name):
     with pytest.raises(CheckpointError, match="no run"):
