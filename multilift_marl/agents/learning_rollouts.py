@@ -57,7 +57,7 @@ class LearningRollouts(ABC):
     def _begin(self, seed: int | None = None) -> None:
         """Begin episodes, those of a seed or the next ones, at different times."""
         self.env.vec.reset(seed=seed)
-        self.env.vec.stagger(self._total)
+        self.env.vec.stagger(self._total, len(self._learner.config.rigs) or 1)
         self._started = True
 
     def get_state(self) -> dict[str, torch.Tensor]:

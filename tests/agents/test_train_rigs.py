@@ -113,6 +113,18 @@ def test_rigs_may_fly_episodes_of_their_own_length(tmp_path):
     assert [rig.env.episode_seconds for rig in evaluated_rigs(trainer.config)] == [0.2, 0.8]
 
 
+@pytest.mark.parametrize("algorithm", ["mappo", "dagger"])
+def test_each_rig_begins_at_all_phases_of_an_episode(tmp_path, algorithm):
+    """Together they are spread as evenly as as many environments of one rig."""
+    keys = {"train.algorithm": algorithm, "train.dagger.teacher": "payload_geometric", "env.num_envs": 12}
+    trainer = make_trainer(tmp_path, **keys, **{"train.rigs": [{}, {}, {}]})
+    trainer.rollouts.get_state()  # they begin
+    parts = trainer.rollouts._parts if algorithm == "mappo" else trainer.rollouts.flights
+    vecs = [part.env.vec for part in parts]
+    assert all(np.ptp(vec.steps) > 0.5 * vec.max_steps for vec in vecs)
+    assert sorted(np.concatenate([vec.steps for vec in vecs])) == [i * vecs[0].max_steps // 12 for i in range(12)]
+
+
 @pytest.mark.slow
 def test_rigs_resume_bit_for_bit(tmp_path):
     whole = make_trainer(tmp_path, **TWO)
