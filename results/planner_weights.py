@@ -141,7 +141,7 @@ def change(errors: np.ndarray, others: np.ndarray) -> tuple[float, float]:
 def main(arguments: list[str]) -> None:
     """Train, search, fly, and write the table."""
     defaults = {"seeds": 3, "frames": 96000, "episodes": 48, "methods": ",".join(METHODS)}
-    values = read_options(arguments, defaults)
+    values = read_options(arguments, defaults, zero=["seeds"])
     seeds, frames, episodes = (values[key] for key in ("seeds", "frames", "episodes"))
     methods = values["methods"].split(",")
     check_known("method", methods, METHODS)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, NoReturn
 
 from multilift_marl.errors import CheckpointError, ConfigError, nearest
 
 
-def read_options(arguments: Iterable[str], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options key=value of a script, each of the type of its default.
+def read_options(arguments: Iterable[str], defaults: Mapping[str, Any], zero: Collection[str] = ()) -> dict[str, Any]:
+    """Return the options key=value of a script, each of the type of its default: text or a whole number.
+
+    Args:
+        arguments: of the script.
+        defaults: by key.
+        zero: keys of numbers that may be 0.
 
     Raises:
-        ConfigError: an argument of another form, a key that there is not, or no whole number of at least 0.
+        ConfigError: an argument of another form, a key that there is not, or no such number.
     """
     options = dict(defaults)
     for argument in arguments:
@@ -21,8 +26,9 @@ def read_options(arguments: Iterable[str], defaults: Mapping[str, Any]) -> dict[
         if not equals:
             raise ConfigError(f"'{argument}' is not of the form key=value; keys: {', '.join(defaults) or 'none'}")
         check_known("key", [key], defaults)
-        if isinstance(defaults[key], int) and not text.isdecimal():
-            raise ConfigError(f"{key} must be a whole number, but is '{text}'")
+        if isinstance(defaults[key], int) and not (text.isdecimal() and (int(text) or key in zero)):
+            least = 0 if key in zero else 1
+            raise ConfigError(f"{key} must be a whole number of at least {least}, but is '{text}'")
         options[key] = type(defaults[key])(text)
     return options
 
@@ -32,8 +38,7 @@ def check_known(what: str, names: Iterable[str], known: Iterable[str]) -> None:
     known = list(known)
     for name in names:
         if name not in known:
-            listed = f"; known: {', '.join(known)}" if len(known) <= 20 else ""
-            raise ConfigError(f"unknown {what} '{name}'{nearest(name, known) or listed}")
+            raise ConfigError(f"unknown {what} '{name}'{nearest(name, known)}")
 
 
 def run_script(main: Callable[[list[str]], object]) -> NoReturn:
