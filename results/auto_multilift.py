@@ -22,11 +22,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from script import run_script
 
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.envs.core import MultiliftVec
+from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.plots import POLICY_COLOURS
 from multilift_marl.evaluation.rollout import Trace, run_episodes, trace_episode
 from multilift_marl.policies.baselines import fitting_scripts, make_scripted
@@ -103,6 +105,8 @@ def main(arguments: list[str]) -> None:
     """Evaluate, print, write and draw."""
     if not arguments or not Path(arguments[0]).is_dir():
         sys.exit(__doc__)
+    if not all(each.isdecimal() and int(each) for each in arguments[1:2]):
+        raise ConfigError(f"the number of episodes must be a whole one of at least 1, but is '{arguments[1]}'")
     time, reference, position, angles = read_published(Path(arguments[0]))
     distance = np.linalg.norm(position - reference, axis=1)
     parts = np.sqrt(np.mean(np.hstack([position - reference, angles]) ** 2, axis=0))
@@ -138,4 +142,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(main)

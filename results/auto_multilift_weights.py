@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from script import check_known, read_options, run_script
 
 from multilift_marl.agents.trainer import Trainer
 from multilift_marl.config.load import load_config
@@ -58,11 +59,14 @@ def train(way: str, seed: int, path: str) -> dict[str, str]:
 
 def main(arguments: list[str]) -> None:
     """Train and write the table."""
-    path, *rest = arguments
-    values = {"seeds": "5", "ways": "adam"} | dict(argument.split("=", 1) for argument in rest)
+    path, *rest = arguments or ["help"]
+    if not Path(path).is_file():
+        sys.exit(__doc__)
+    values = read_options(rest, {"seeds": 5, "ways": "adam"})
+    check_known("way", values["ways"].split(","), WAYS)
     lines = []
     for way in values["ways"].split(","):
-        for seed in range(int(values["seeds"])):
+        for seed in range(values["seeds"]):
             lines.append(train(way, seed, path))
             print(lines[-1], flush=True)
             with TABLE.open("w", newline="", encoding="utf-8") as file:
@@ -72,4 +76,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(main)

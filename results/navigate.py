@@ -8,16 +8,16 @@ written to docs/data/navigate.csv, and successes of four drones to docs/navigate
 from __future__ import annotations
 
 import csv
-import sys
 from pathlib import Path
 
 import numpy as np
+from script import check_known, read_options, run_script
 
 from multilift_marl.config.load import load_config
 from multilift_marl.evaluation.metrics import wilson
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.mdp.failures import CAUSES
-from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.baselines import SCRIPTED, make_scripted
 
 HERE = Path(__file__).parent / "navigate"
 DOCS = Path(__file__).parents[1] / "docs"
@@ -137,14 +137,16 @@ def write_page() -> None:
 
 def main(arguments: list[str]) -> None:
     """Fly and write the table."""
-    values = {"maps": "1000", "rows": ",".join(ROWS), "policies": "mpc_route"}
-    values |= dict(argument.split("=", 1) for argument in arguments)
-    for row in values["rows"].split(","):
-        for policy in values["policies"].split(","):
-            fly(row, policy, int(values["maps"]))
+    values = read_options(arguments, {"maps": 1000, "rows": ",".join(ROWS), "policies": "mpc_route"}, zero=["maps"])
+    rows, policies = values["rows"].split(","), values["policies"].split(",")
+    check_known("row", rows, ROWS)
+    check_known("policy", policies, SCRIPTED)
+    for row in rows:
+        for policy in policies:
+            fly(row, policy, values["maps"])
     write_table()
     write_page()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(main)

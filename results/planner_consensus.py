@@ -12,16 +12,17 @@ for all (`fixed`). Written to docs/data/planner_consensus.csv.
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Callable, Iterable
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from script import read_options, run_script
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
+from multilift_marl.errors import ConfigError
 from multilift_marl.planning.distributed_planner import DistributedPlanner
 from multilift_marl.planning.expert import TeamExpert
 from multilift_marl.planning.team_model import (
@@ -220,14 +221,16 @@ def admm(team: Team, starts: np.ndarray, penalties: tuple[float, float], exchang
 
 def main(arguments: list[str]) -> None:
     """Compare, print, write."""
-    values = {"drones": "3,4,6", "starts": "5"} | dict(each.split("=", 1) for each in arguments)
+    values = read_options(arguments, {"drones": "3,4,6", "starts": 5})
+    if wrong := [each for each in values["drones"].split(",") if not each.isdecimal()]:
+        raise ConfigError(f"drones must be whole numbers, 3,4,6 say, but one is '{wrong[0]}'")
     rows = []
     for n in map(int, values["drones"].split(",")):
         team, rng = Team(load_config("hover", {"env.num_drones": n})), np.random.default_rng(0)
         q = 6 + 2 * n
         width = np.zeros(state_size(n))  # of displacements and velocities, small enough for linear plans
         width[:3], width[3:5], width[6:q], width[q : q + 3] = 0.01, 0.005, 0.003, 0.02
-        starts = width * rng.normal(size=(int(values["starts"]), len(width)))
+        starts = width * rng.normal(size=(values["starts"], len(width)))
         kinds = {"jacobi": [team.mean_excess(starts, [jacobi(team, s, e) for s in starts]) for e in EXCHANGES]}
         flown = [admm(team, starts, pair, max(EXCHANGES)) for pair in product(PENALTIES, PENALTIES)]
         table = np.array([[team.mean_excess(starts, found[e - 1]) for e in EXCHANGES] for found in flown])
@@ -243,4 +246,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(main)

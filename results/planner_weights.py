@@ -3,7 +3,8 @@
 Four ways to weights of `control.action=planner_weights`, in `track_weights_realistic`: those of `planner` as they are;
 CMA-ES over 13 constants (`pip install cma`); a network by `train.algorithm=diffmpc`; and one by `mappo`, the last three
 with as many environment steps. Each is flown on the paths below, on the same evaluation episodes. What is done is kept
-in results/planner_weights, and not done again; docs/data/planner_weights.csv is written of all that is there.
+in results/planner_weights, and not done again; docs/data/planner_weights.csv is written of all that is there, with
+seeds=0 of that alone. Changes are 95 % intervals over training seeds and episodes.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ from typing import Any
 
 import cma
 import numpy as np
+from script import check_known, read_options, run_script
 
 from multilift_marl.agents.policy import load_policy, strip_checkpoint
 from multilift_marl.agents.trainer import Trainer
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
-from multilift_marl.evaluation.metrics import bootstrap
+from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.metrics import bootstrap_seeds
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.policies.policy import Policy
 
@@ -81,7 +84,8 @@ def learn(config: Config, method: str, frames: int, seed: int) -> Path:
         own |= {"train.algorithm": "mappo", "train.horizon": 128, "train.warmup": 4, "train.initial_std": 0.2}
     folder = HERE / f"run_{method}_{seed}"
     (folder / "checkpoints").mkdir(parents=True, exist_ok=True)
-    Trainer(build_config(config.model_dump(), own), folder).run()
+    if not Trainer(build_config(config.model_dump(), own), folder).run():
+        sys.exit(f"stopped: {method} of seed {seed} is not kept; start again to train it anew")
     path = HERE / f"{method}_{seed}.pt"
     strip_checkpoint(folder / "checkpoints" / "last.pt", path)
     return path
@@ -92,37 +96,60 @@ def find(config: Config, method: str, frames: int, seed: int) -> Callable[[Multi
     if method == "cma":
         kept = HERE / f"cma_{seed}.json"
         if not kept.exists():
-            kept.write_text(json.dumps(search(config, frames, seed).round(4).tolist()), encoding="utf-8")
-        action = np.array(json.loads(kept.read_text(encoding="utf-8")))
+            found = {"frames": frames, "action": search(config, frames, seed).round(4).tolist()}
+            kept.write_text(json.dumps(found), encoding="utf-8")
+        found = json.loads(kept.read_text(encoding="utf-8"))
+        check_kept(kept, "frames", found["frames"], frames)
+        action = np.array(found["action"])
         return lambda vec: Constant(vec, action)
     path = HERE / f"{method}_{seed}.pt"
-    return load_policy(path if path.exists() else learn(config, method, frames, seed)).bind
+    policy = load_policy(path if path.exists() else learn(config, method, frames, seed))
+    check_kept(path, "frames", policy.config.train.frames, frames)
+    return policy.bind
+
+
+def check_kept(path: Path, what: str, kept: int, asked: int) -> None:
+    """Refuse, by a ConfigError, a file that is kept of another effort than is asked for."""
+    if kept != asked:
+        raise ConfigError(f"{path} is kept of {what}={kept}, not {asked}; set {what}={kept}, or delete it")
 
 
 def fly(
-    config: Config, name: str, make: Callable[[MultiliftVec], Policy], episodes: int
+    config: Config, name: str, make: Callable[[MultiliftVec], Policy] | None, episodes: int
 ) -> list[dict[str, np.ndarray]]:
-    """Return success and errors of episodes on each path, flown now unless they are kept."""
+    """Return success and errors of episodes on each path, flown now unless they are kept; without a policy all are."""
     flown = []
     for number, options in enumerate(PATHS.values()):
         kept = HERE / f"{name}_path{number}.npz"
-        if not kept.exists():
+        if make is not None and not kept.exists():
             found = run_episodes(build_config(config.model_dump(), options), make, episodes, SEED)
             np.savez_compressed(kept, **{key: found[key] for key in ("success_rate", "payload_rmse_m")})
         flown.append(dict(np.load(kept)))
+        check_kept(kept, "episodes", len(flown[-1]["success_rate"]), episodes)
     return flown
+
+
+def change(errors: np.ndarray, others: np.ndarray) -> tuple[float, float]:
+    """Return the 95 % interval of the mean difference of errors (S, n) from others' in the same episodes.
+
+    Seeds of the one have nothing to do with those of the other, so that any pairs of them do; one seed stands for all.
+    """
+    pairs = min((len(each) for each in (errors, others) if len(each) > 1), default=1)
+    return bootstrap_seeds(errors[:pairs] - others[:pairs])
 
 
 def main(arguments: list[str]) -> None:
     """Train, search, fly, and write the table."""
-    values = {"seeds": "3", "frames": "96000", "episodes": "48", "methods": ",".join(METHODS)}
-    values |= dict(argument.split("=", 1) for argument in arguments)
-    seeds, frames, episodes = (int(values[key]) for key in ("seeds", "frames", "episodes"))
+    defaults = {"seeds": 3, "frames": 96000, "episodes": 48, "methods": ",".join(METHODS)}
+    values = read_options(arguments, defaults, zero=["seeds"])
+    seeds, frames, episodes = (values[key] for key in ("seeds", "frames", "episodes"))
+    methods = values["methods"].split(",")
+    check_known("method", methods, METHODS)
     config = load_config(CONFIG, {"env.num_threads": 1})
     HERE.mkdir(exist_ok=True)
     hand = fly(config, "hand", lambda vec: Constant(vec, np.zeros(vec.action_size)), episodes)
     for seed in range(seeds):
-        for method in values["methods"].split(","):
+        for method in methods:
             make = find(config, method, frames, seed)
             flown = fly(config, f"{method}_{seed}", make, episodes)
             print(method, seed, [f"{100 * each['payload_rmse_m'].mean():.2f}" for each in flown], flush=True)
@@ -130,7 +157,7 @@ def main(arguments: list[str]) -> None:
     for method in METHODS:
         names = sorted(path.name.removesuffix("_path0.npz") for path in HERE.glob(f"{method}_*_path0.npz"))
         if names:
-            teams[method] = [[dict(np.load(HERE / f"{name}_path{k}.npz")) for k in range(len(PATHS))] for name in names]
+            teams[method] = [fly(config, name, None, episodes) for name in names]
     lines = []
     for number, path in enumerate(PATHS):
         for method, flights in teams.items():
@@ -143,8 +170,7 @@ def main(arguments: list[str]) -> None:
             line["rmse_of_seeds_cm"] = " ".join(f"{100 * each.mean():.2f}" for each in errors)
             for other in ("hand", "cma"):
                 if other in teams and other != method:
-                    theirs = np.mean([flight[number]["payload_rmse_m"] for flight in teams[other]], axis=0)
-                    low, high = bootstrap(errors.mean(axis=0) - theirs)
+                    low, high = change(errors, np.stack([flight[number]["payload_rmse_m"] for flight in teams[other]]))
                     line[f"change_from_{other}_cm"] = f"{100 * low:.2f} to {100 * high:.2f}"
             lines.append(line)
     columns = list(dict.fromkeys(name for line in lines for name in line))
@@ -155,4 +181,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(main)

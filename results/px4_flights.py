@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from script import check_known, read_options, run_script
 
+from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.metrics import bootstrap
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -161,17 +163,24 @@ def print_table(lines: list[dict[str, str]]) -> None:
             print(f"hover_learned - hover_conditions{margin}, {name}: {gain.mean():.2f} ({low:.2f} to {high:.2f})")
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments: list[str]) -> None:
     """Fly what is not in the file yet."""
-    options = dict(argument.split("=", 1) for argument in arguments if argument != "table")
-    out = Path(options.get("out", ROOT / "docs" / "data" / "px4_runs.csv"))
+    defaults = {"out": str(ROOT / "docs" / "data" / "px4_runs.csv"), "rows": "hover,circle", "flights": 20}
+    defaults |= {"px4": "", "policy": "", "instance": "0"}
+    options = read_options([argument for argument in arguments if argument != "table"], defaults)
+    out = Path(options["out"])
     if "table" in arguments:
+        if not out.is_file():
+            raise ConfigError(f"there is no {out}; fly first, or give out=")
         with out.open(newline="") as file:
             print_table(list(csv.DictReader(file)))
-        return 0
-    rows = options.get("rows", "hover,circle").split(",")
-    if "policy" in options:
+        return
+    rows = options["rows"].split(",")
+    if not options["px4"]:
+        raise ConfigError("px4= is missing; give the folder of a built PX4: px4=DIR")
+    if options["policy"]:
         ROWS["hover_learned"] = ["config=hover_px4", f"policy={options['policy']}"]
+    check_known("row", rows, ROWS)
     known: set[tuple[str, int]] = set()
     if out.is_file():
         with out.open(newline="") as file:
@@ -179,15 +188,14 @@ def main(arguments: list[str]) -> int:
     else:
         out.write_text(",".join(COLUMNS) + "\n")
     for row in rows:
-        for seed in range(FIRST, FIRST + int(options.get("flights", 20))):
+        for seed in range(FIRST, FIRST + options["flights"]):
             if (row, seed) in known:
                 continue
-            line = fly(row, seed, options["px4"], options.get("instance", "0"))
+            line = fly(row, seed, options["px4"], options["instance"])
             with out.open("a", newline="") as file:
                 csv.DictWriter(file, COLUMNS, lineterminator="\n").writerow(line)
             print(line, flush=True)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run_script(main)

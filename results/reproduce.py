@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from flights import FLIGHTS, HERE, MPC, OWN_PLANNERS, ROOT, SCRIPTED, SEED, episodes_of, error_metric
+from script import check_known, read_options, run_script
 from searched import SEARCHED, settings_of
 from tables import write_tables
 
@@ -179,7 +180,8 @@ def _call_here(content: bytes, root: str, scripts: str) -> str:
 
 
 def list_jobs(flight: str, only: str = "") -> list[Job]:
-    """Return the policies of a flight, or the one called `only`."""
+    """Return the policies of a flight, or the one called `only`; a ConfigError if there is none."""
+    check_known("flight", [flight], FLIGHTS)
     config = load_config(FLIGHTS[flight].config, FLIGHTS[flight].overrides)
     scripts = fitting_scripts(MultiliftVec(build_config(config.model_dump(), SCRIPTED | {"env.num_envs": 1})))
     weights = sorted((HERE / FLIGHTS[flight].recipe).glob("seed*/policy.pt"))
@@ -187,6 +189,7 @@ def list_jobs(flight: str, only: str = "") -> list[Job]:
     scripts = [name for name in scripts if name in (FLIGHTS[flight].scripts or scripts)]
     scripts += ["mpc"] if can_plan(config) else []
     jobs = [*(Job(flight, name, "") for name in scripts), *(Job(flight, w.parent.name, str(w)) for w in weights)]
+    check_known(f"team of {flight}", [only] if only else [], [job.team for job in jobs])
     return [job for job in jobs if only in ("", job.team)]
 
 
@@ -243,18 +246,20 @@ def fly(job: Job) -> str:
 def ship(recipes: list[str]) -> None:
     """Copy the weights of seed 0 to where `ml.load_policy` finds them."""
     for recipe in recipes:
-        shipped = ROOT / "multilift_marl" / "policies" / f"{recipe}.pt"
-        shipped.write_bytes((HERE / recipe / "seed0" / "policy.pt").read_bytes())
+        kept, shipped = HERE / recipe / "seed0" / "policy.pt", ROOT / "multilift_marl" / "policies" / f"{recipe}.pt"
+        if not kept.is_file():
+            raise ConfigError(f"there is no {kept}; train it first: python results/reproduce.py train {recipe}")
+        shipped.write_bytes(kept.read_bytes())
 
 
 def main(arguments: list[str]) -> None:
     """Run the named command."""
     what, *rest = [each for each in arguments if "=" not in each] or ["help"]
-    options = dict(each.split("=", 1) for each in arguments if "=" in each)
-    workers, address = int(options.pop("workers", cpu_count())), options.pop("ray", "")
-    if options:
-        sys.exit(__doc__)
+    options = read_options([each for each in arguments if "=" in each], {"workers": cpu_count(), "ray": ""})
+    workers, address = options["workers"], options["ray"]
     if what == "train" and rest:
+        if wrong := [seed for seed in rest[1:] if not seed.isdecimal()]:
+            raise ConfigError(f"seeds must be whole numbers, but one is '{wrong[0]}'")
         train(rest[0], [int(seed) for seed in rest[1:]] or [0], workers, address)
     elif what == "keep" and len(rest) == 2:
         keep(rest[0], Path(rest[1]))
@@ -269,7 +274,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except KeyboardInterrupt:
-        sys.exit(130)
+    run_script(main)

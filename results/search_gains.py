@@ -127,8 +127,9 @@ def fly(config: Config, script: type[Formation], seed: int, cost: Cost = "errors
     """Simulate one episode in every environment of `config`, an equal share of them with each of `train.rigs`."""
     rigs = evaluated_rigs(config)
     each = max(1, config.env.num_envs // len(rigs))
-    parts = [run_episodes(rig, script, each, seed, TRAINING_EVALUATION) for rig in rigs]
-    flown = join_episodes(parts)
+    flown = join_episodes([
+        run_episodes(rig, script, each, seed, TRAINING_EVALUATION, first=k * each) for k, rig in enumerate(rigs)
+    ])  # fmt: skip
     tracks = config.task == "track"
     error, success = flown[find_task(config.task).ERROR], flown["success_rate"].mean()
     turned = np.zeros_like(error) if tracks else flown["payload_attitude_error_deg"]

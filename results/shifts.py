@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any
 
 from flights import FLIGHTS, HERE, SCRIPTED, error_metric
+from script import check_known, read_options, run_script
 from searched import SEARCHED, settings_of
 from tables import best_baseline
 
@@ -42,8 +43,17 @@ def fly(
     return {key: float(result[name].mean()) for key, name in names.items()}
 
 
-def main(flights: list[str], episodes: int = EPISODES) -> None:
+def main(arguments: list[str]) -> None:
     """Evaluate, print, and write what all the episodes gave."""
+    flights = [each for each in arguments if "=" not in each]
+    episodes = read_options([each for each in arguments if "=" in each], {"episodes": EPISODES})["episodes"]
+    if not flights:
+        sys.exit(__doc__)
+    check_known("flight", flights, FLIGHTS)
+    if missing := [flight for flight in flights if not best_baseline(flight)]:
+        raise ConfigError(
+            f"no baseline of {missing[0]} has been evaluated; first: python results/reproduce.py evaluate {missing[0]}"
+        )
     import torch
 
     from multilift_marl.agents.policy import load_policy
@@ -77,6 +87,4 @@ def main(flights: list[str], episodes: int = EPISODES) -> None:
 
 
 if __name__ == "__main__":
-    named = [word for word in sys.argv[1:] if "=" not in word]
-    options = {key: int(value) for key, _, value in (word.partition("=") for word in sys.argv[1:] if "=" in word)}
-    sys.exit(main(named, **options) if named else __doc__)
+    run_script(main)

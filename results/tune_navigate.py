@@ -16,6 +16,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from script import check_known, read_options, run_script
 
 import multilift_marl as ml
 from multilift_marl.envs.core import MultiliftVec
@@ -63,17 +64,21 @@ def fly(level: str, name: str, numbers: dict[str, float], maps: int, seed: int) 
 
 def main(arguments: list[str]) -> None:
     """Print the table."""
-    what, *pairs = arguments
-    options = {"maps": "8" if what == "tune" else "40", "seed": "0"} | dict(pair.split("=") for pair in pairs)
-    policies = options.get("policies", ",".join(CANDIDATES if what == "tune" else POLICIES)).split(",")
+    what, *pairs = arguments or ["help"]
+    if what not in ("tune", "fly"):
+        sys.exit(__doc__)
+    maps, known = (8, tuple(CANDIDATES)) if what == "tune" else (40, POLICIES)
+    options = read_options(pairs, {"maps": maps, "seed": 0, "policies": ",".join(known)}, zero=["seed"])
+    policies = options["policies"].split(",")
+    check_known("policy", policies, known)
     print(f"{'':74s}{''.join(f'{level:>9s}' for level in [*LEVELS, 'mean'])}", flush=True)
     for name in policies:
         for numbers in CANDIDATES[name] if what == "tune" else [{}]:
             begun = process_time()
-            shares = [fly(level, name, numbers, int(options["maps"]), int(options["seed"])) for level in LEVELS]
+            shares = [fly(level, name, numbers, options["maps"], options["seed"]) for level in LEVELS]
             cells = "".join(f"{100 * share:9.1f}" for share in [*shares, np.mean(shares)])
             print(f"{name:22s} {numbers or ''!s:50s} {cells}  {process_time() - begun:5.0f} s of CPU", flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(main)

@@ -9,10 +9,9 @@ fly as many fresh maps.
 
 from __future__ import annotations
 
-import sys
-
 import cma
 import numpy as np
+from script import check_known, read_options, run_script
 
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
@@ -50,8 +49,9 @@ def fly(config: Config, policy: str, numbers: dict[str, float], maps: int, seed:
 def main(arguments: list[str]) -> None:
     """Search."""
     named = {"policy": "formation_repelled", "config": "navigate_senses"}
-    values = named | {"maps": "48", "generations": "12", "seed": "500"} | dict(each.split("=", 1) for each in arguments)
-    policy, maps, seed = values["policy"], int(values["maps"]), int(values["seed"])
+    values = read_options(arguments, named | {"maps": 48, "generations": 12, "seed": 500}, zero=["seed"])
+    policy, maps, seed = values["policy"], values["maps"], values["seed"]
+    check_known("rule", [policy], RANGES)
     config, ranges = load_config(values["config"], {"env.num_threads": 1}), RANGES[policy]
     kept = {name: float(getattr(SCRIPTED[policy], name)) for name in ranges}
     low, high = np.array(list(ranges.values())).T
@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> None:
     options = {"bounds": [0, 1], "popsize": 8, "seed": seed, "verbose": -9}
     search = cma.CMAEvolutionStrategy(begin, 0.25, options)
     best = [kept]
-    for generation in range(int(values["generations"])):
+    for generation in range(values["generations"]):
         points = search.ask()
         candidates = [dict(zip(ranges, (low + point * (high - low)).tolist(), strict=True)) for point in points]
         flown = [fly(config, policy, numbers, maps, seed + 1 + generation) for numbers in candidates]
@@ -79,4 +79,4 @@ def describe(numbers: dict[str, float], success: float) -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(main)

@@ -16,19 +16,22 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from multilift_marl.agents.policy import load_policy
+from multilift_marl.command import CommandOptions, run_command, split_options
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, parse_overrides
+from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import MultiliftVec
-from multilift_marl.errors import ConfigError
+from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.evaluation.metrics import bootstrap_seeds, wilson
 from multilift_marl.evaluation.rollout import run_episodes
-from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.baselines import SCRIPTED, make_scripted
 from multilift_marl.policies.policy import Policy
+from multilift_marl.schema.values import Int
 
 TRAINING, EVALUATION = 500, 1000  # seeds
 BATCH = 64  # episodes of a round
@@ -93,13 +96,26 @@ def fit(config: Config, learned: Callable[[MultiliftVec], Policy], rounds: int) 
     return matrix
 
 
-def main(arguments: list[str]) -> None:
+class Options(CommandOptions):
+    """Keys of the comparison beside those of the configuration."""
+
+    policy: str = Field("", description="the learned teams, runs of one recipe, with commas between them")
+    episodes: Annotated[Int, Field(ge=1)] = Field(200, description="that all of them fly")
+    rounds: Annotated[Int, Field(ge=0)] = Field(4, description="of flights that the twin is fitted to; 0: no twin")
+    others: str = Field("", description="baselines, with commas between them")
+    table: str | None = Field(None, description="CSV file that the rows go to")
+
+
+def main(given: dict[str, Any]) -> int:
     """Fit, fly and say."""
-    values: dict[str, Any] = parse_overrides(arguments)
-    own = {"episodes": 200, "rounds": 4, "others": "", "table": None}
-    own = {key: values.pop(key, default) for key, default in own.items()}
-    names, episodes = values.pop("policy").split(","), int(own["episodes"])
-    policies = [load_policy(name) for name in names]
+    options, values = split_options(Options, given)
+    if not options.policy:
+        raise ConfigError("policy= is missing; give the learned team: policy=runs/<run>, or a shipped one")
+    others, episodes = [name for name in options.others.split(",") if name], options.episodes
+    for other in others:
+        if other not in SCRIPTED and ":" not in other:
+            raise ConfigError(f"others names no baseline '{other}'{nearest(other, SCRIPTED)}")
+    policies = [load_policy(name) for name in options.policy.split(",")]
     config = build_config(policies[0].config.model_dump(), values)
     seeds = [f" of seed {policy.config.seed}" if len(policies) > 1 else "" for policy in policies]
     if len(set(seeds)) < len(seeds):
@@ -107,10 +123,10 @@ def main(arguments: list[str]) -> None:
     teams: dict[str, Callable[[MultiliftVec], Policy]] = {}
     for seed, policy in zip(seeds, policies, strict=True):
         teams[f"learned{seed}"] = policy.bind
-        if int(own["rounds"]):
-            matrix = fit(config, policy.bind, int(own["rounds"]))
+        if options.rounds:
+            matrix = fit(config, policy.bind, options.rounds)
             teams[f"linear twin{seed}"] = partial(Linear.bind, matrix)
-    for other in filter(None, own["others"].split(",")):
+    for other in others:
         teams[other] = partial(make_scripted, other)
     flown = {
         who: run_episodes(config, make, episodes, EVALUATION)["success_rate"].astype(float)
@@ -127,8 +143,9 @@ def main(arguments: list[str]) -> None:
             row["learned_minus_this"] = f"{low:.1f} to {high:.1f}"
         rows.append(row)
         print(*(f"{key}={value}" for key, value in row.items()))
-    if own["table"]:
-        keep(Path(own["table"]), " ".join(f"{key}={value}" for key, value in values.items()), rows)
+    if options.table:
+        keep(Path(options.table), " ".join(f"{key}={value}" for key, value in values.items()), rows)
+    return 0
 
 
 def keep(path: Path, changes: str, rows: list[dict[str, Any]]) -> None:
@@ -145,4 +162,4 @@ def keep(path: Path, changes: str, rows: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(run_command(main, __doc__ or "", Options, None, None))

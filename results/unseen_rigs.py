@@ -9,13 +9,13 @@ The policy was trained with four falcons, cables of equal length and a plate of 
 from __future__ import annotations
 
 import csv
-import sys
 import tempfile
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from flights import ROOT
+from script import read_options, run_script
 
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.config.load import load_config
@@ -75,8 +75,9 @@ def evaluate(rig: str, overrides: dict[str, Any], episodes: int) -> list[dict[st
     return rows
 
 
-def main(episodes: int = EPISODES) -> None:
+def main(arguments: list[str]) -> None:
     """Evaluate, print and, with all episodes, write."""
+    episodes = read_options(arguments, {"episodes": EPISODES})["episodes"]
     with tempfile.TemporaryDirectory() as folder:
         mesh = Path(folder) / "l_shape.obj"
         write_prism(mesh, L_SHAPE, 0.1)
@@ -92,7 +93,4 @@ def main(episodes: int = EPISODES) -> None:
 
 
 if __name__ == "__main__":
-    given = dict(word.partition("=")[::2] for word in sys.argv[1:])
-    if set(given) - {"episodes"}:
-        sys.exit(__doc__)
-    main(int(given.get("episodes", EPISODES)))
+    run_script(main)

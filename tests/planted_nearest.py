@@ -19,8 +19,8 @@ from planted_mutations import Fault
 
 UNINTERPRETED = (  # they start processes, compile, or look at documents and recorded results
     "checkpoints", "examples", "export", "honest_training", "hooks", "kernels", "leaks", "memory", "model_cards",
-    "new_task", "package", "peers", "platforms", "plugins", "release", "results", "site", "soak", "start",
-    "train_command", "types", "view", "view_browser", "window", "workers",
+    "new_task", "package", "peers", "platforms", "plugins", "release", "result_scripts", "results", "site", "soak",
+    "start", "train_command", "types", "view", "view_browser", "window", "workers",
 )  # fmt: skip
 MOST = 400  # tests tried as Python
 STATED = (  # tests of numbers that are assigned at import, by what documents and recipes say of them

@@ -80,6 +80,15 @@ def parse_checkpoint(content: bytes, path: Path) -> dict[str, Any]:
     return found
 
 
+def saved_iteration(path: Path) -> int | None:
+    """Return the iteration of a run's checkpoint, None where there is none that can be read."""
+    try:
+        iteration: int | None = load_checkpoint(path).get("iteration")
+    except CheckpointError:
+        return None
+    return iteration
+
+
 def copy_content(content: Any) -> Any:
     """Return the content of a checkpoint with copies of its tensors, which training changes."""
     if isinstance(content, torch.Tensor):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from multilift_marl.errors import CheckpointError, pip_install, reason, shorten
 
+CONTRACT_FORMAT = "multilift_marl policy 1"
 AGAIN = "export the policy again, python -m multilift_marl.export run=<run>"
 _FLOATS = "tensor(float)"  # as onnxruntime calls an array of float32
 _PROBES = (1, 1), (2, 3)  # teams and drones that a network is tried with
@@ -155,3 +157,19 @@ class Network:
 
     def _error(self, what: str) -> CheckpointError:
         return CheckpointError(f"{self._source} {what}; {AGAIN}")
+
+
+def read_contract(path: Path) -> dict[str, Any]:
+    """Return the contract beside a network."""
+    if not path.is_file():
+        raise CheckpointError(f"no exported policy {path}: give the .onnx file that multilift_marl.export wrote")
+    file = path.with_suffix(".json")
+    try:
+        contract = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CheckpointError(f"{path} has no contract {file.name} beside it; put it there, or {AGAIN}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{file} is no contract of a policy ({reason(error)}); {AGAIN}") from error
+    if not isinstance(contract, dict) or contract.get("format") != CONTRACT_FORMAT:
+        raise CheckpointError(f"{file} was not written by multilift_marl (or by another version); {AGAIN}")
+    return contract

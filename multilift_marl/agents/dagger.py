@@ -152,7 +152,7 @@ class TaughtFlights(LearningRollouts):
     def set_state(self, saved: dict[str, Any]) -> None:
         """Go on in the episodes after those that were under way."""
         super().set_state(saved)
-        self.env.vec.reset()
+        self._begin()
 
 
 class DaggerRollouts(LearningRollouts):
@@ -167,6 +167,8 @@ class DaggerRollouts(LearningRollouts):
     Raises:
         ConfigError: a teacher that cannot fly these environments, or more steps than this machine's memory holds.
     """
+
+    begins_anew = True
 
     def __init__(self, envs: list[MultiliftEnv], learner: Learner, total: int):
         super().__init__(envs[0], learner, total)

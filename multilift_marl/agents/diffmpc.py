@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from multilift_marl.agents.learning_rollouts import LearningRollouts, join_steps, list_step
-from multilift_marl.agents.mappo import Learner
+from multilift_marl.agents.mappo import Learner, check_finite
 from multilift_marl.agents.rollouts import Batches
 from multilift_marl.diffmpc.weighted_planner import FlightGradient, WeightedPlanner
 from multilift_marl.envs.core import MultiliftVec
@@ -100,6 +100,7 @@ class DiffMpcRollouts(LearningRollouts):
                 continue
             begin = time.perf_counter()
             loss, norm = self._learn()
+            check_finite(self._learner, iteration)  # it flies on with them
             losses.append(loss)
             norms.append(norm)
             self._shift(every)

@@ -68,5 +68,5 @@ def make_rollouts(
     if train.workers:
         return Workers(environment, learner.actor, envs[0].vec.purpose)
     policies = [learner.policy, *(StochasticPolicy(learner.actor) for _ in envs[1:])]
-    parts = [Rollouts(env, own, train.horizon, total) for env, own in zip(envs, policies, strict=True)]
+    parts = [Rollouts(env, own, train.horizon, total, len(envs)) for env, own in zip(envs, policies, strict=True)]
     return RigRollouts(parts) if train.rigs else parts[0]

@@ -17,12 +17,15 @@ class EpisodeStatistics:
     Args:
         vecs: environments like those of the rollouts, of each rig.
         num_envs: environments of all rigs together.
+        began: iteration in which their first episodes begin.
 
     Attributes:
+        began: as given.
         returns: of the episodes in flight (E,).
     """
 
-    def __init__(self, vecs: list[MultiliftVec], num_envs: int):
+    def __init__(self, vecs: list[MultiliftVec], num_envs: int, began: int = 0):
+        self.began = began
         self._length, self._terms = max(vec.max_steps for vec in vecs), vecs[0].reward_terms
         self.returns = np.zeros(num_envs)
 
@@ -30,7 +33,7 @@ class EpisodeStatistics:
         """Return the statistics of the batches of one iteration, by name."""
         rewards = np.concatenate([b["next", "agents", "reward"].mean(dim=(-2, -1)).double().numpy() for b in batches])
         done = np.concatenate([batch["next", "done"].squeeze(-1).numpy() for batch in batches])
-        elapsed = iteration * done.shape[1] + np.arange(done.shape[1])
+        elapsed = (iteration - self.began) * done.shape[1] + np.arange(done.shape[1])
         counted = done & (elapsed >= self._length)
         finished = []
         for t in range(rewards.shape[1]):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from multilift_marl.config.config import Config
 from multilift_marl.envs.core import TRAINING_EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.evaluation.metrics import FEWEST, is_better, join_episodes, summarize
-from multilift_marl.evaluation.rollout import run_episodes
+from multilift_marl.evaluation.rollout import run_episodes, trace_episode
 from multilift_marl.policies.baselines import make_base_policy
 from multilift_marl.policies.policy import Policy
 from multilift_marl.tasks import find_task
@@ -114,7 +115,9 @@ class Evaluator:
     @property
     def _measure(self) -> dict[str, Any]:
         """What scores have to have in common to be compared."""
-        return {"compared_by": self.error, "episodes": self.config.eval.episodes}
+        measure = {"compared_by": self.error, "episodes": self.config.eval.episodes}
+        # Scores without that number are of rigs that all flew the same episodes.
+        return measure | ({"rigs": len(rigs)} if (rigs := self.config.train.rigs) else {})
 
     def _score(self, flown: dict[str, np.ndarray]) -> list[float]:
         if self.error not in flown:
@@ -143,6 +146,16 @@ class Evaluator:
         assert self.best is not None
         return LearnedPolicy(self.best, "the run's best")
 
+    def draw_best(self, folder: Path) -> Path:
+        """Return the path of a picture in a folder, of the first episode of the best policy so far."""
+        from multilift_marl.evaluation.plots import plot_paths  # matplotlib takes a while
+
+        assert self.best is not None
+        policy, path = self.best_policy(), folder / "flight.png"
+        trace = trace_episode(self.config, policy.bind, 0, self.config.seed)
+        plot_paths(path, trace, f"best policy so far, iteration {self.best['iteration']}")
+        return path
+
     def _confirm(self, candidate: LearnedPolicy, iteration: int) -> bool:
         """Return whether a policy beats the best one on fresh episodes, too.
 
@@ -158,7 +171,9 @@ class Evaluator:
     ) -> dict[str, np.ndarray]:
         """Return the metrics of each episode of a block, in the task's own environment or in another one."""
         rigs, seed = evaluated_rigs(environment or self.config), self.config.seed
-        # Rounded up, so that each rig has its share; blocks of episodes never meet.
+        # Rounded up, so that each rig has its share; neither those of two rigs nor blocks of episodes ever meet.
         each, first = -(-self.config.eval.episodes // len(rigs)), block * _BLOCK
-        flown = [run_episodes(rig, make_policy, each, seed, TRAINING_EVALUATION, first=first) for rig in rigs]
-        return join_episodes(flown)
+        return join_episodes([
+            run_episodes(rig, make_policy, each, seed, TRAINING_EVALUATION, first=first + k * each)
+            for k, rig in enumerate(rigs)
+        ])  # fmt: skip

@@ -18,9 +18,10 @@ import onnxscript  # noqa: F401 (torch's exporter works by it; so a missing one 
 import torch
 from torch import nn
 
+from multilift_marl.agents.contract import CONTRACT_FORMAT
 from multilift_marl.agents.logging import package_versions
 from multilift_marl.agents.networks import Actor, Normalizer
-from multilift_marl.agents.policy import CONTRACT_FORMAT, LearnedPolicy, TrainedPolicy
+from multilift_marl.agents.policy import LearnedPolicy, TrainedPolicy
 from multilift_marl.config.config import Config
 from multilift_marl.control.action_interface import THRUST, ControlContext
 from multilift_marl.control.actions import ACTIONS

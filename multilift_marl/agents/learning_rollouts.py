@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,6 +19,9 @@ from multilift_marl.envs.torchrl_env import MultiliftEnv
 class LearningRollouts(ABC):
     """With the interface of `Rollouts`.
 
+    Class attributes:
+        begins_anew: whether `set_state` discards the episodes that were under way.
+
     Args:
         env: what is simulated.
         learner: whose actor flies, and learns.
@@ -28,6 +31,8 @@ class LearningRollouts(ABC):
         env: as given.
         values: numbers to log of the last batch.
     """
+
+    begins_anew: ClassVar[bool] = False
 
     def __init__(self, env: MultiliftEnv, learner: Learner, total: int):
         self.env, self.values = env, dict[str, float]()
@@ -47,10 +52,13 @@ class LearningRollouts(ABC):
     def start(self) -> None:
         """Begin episodes, unless there are any."""
         if not self._started:
-            vec = self.env.vec
-            vec.reset(seed=vec.config.seed)
-            vec.stagger(self._total)
-            self._started = True
+            self._begin(self.env.vec.config.seed)
+
+    def _begin(self, seed: int | None = None) -> None:
+        """Begin episodes, those of a seed or the next ones, at different times."""
+        self.env.vec.reset(seed=seed)
+        self.env.vec.stagger(self._total, len(self._learner.config.rigs) or 1)
+        self._started = True
 
     def get_state(self) -> dict[str, torch.Tensor]:
         """See `Rollouts.get_state`."""

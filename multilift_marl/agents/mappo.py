@@ -123,6 +123,11 @@ def make_learner(config: TrainConfig, env: MultiliftEnv) -> Learner:
     return Learner(config, actor, critic, StochasticPolicy(actor), optimizer)
 
 
+def in_warmup(train: TrainConfig, iteration: int) -> bool:
+    """Return whether the critic alone learns: by its untrained values a good actor would only get worse."""
+    return train.algorithm in ("mappo", "ippo") and iteration < train.warmup
+
+
 def check_communication(train: TrainConfig, env: EnvConfig) -> None:
     """Refuse, by a ConfigError, networks of a team whose drones do not all hear each other."""
     if train.actor != "local" and env.sensing in ("onboard", "blind") and env.communication != "all":
@@ -158,6 +163,19 @@ def check_batch(train: TrainConfig, vec: MultiliftVec, num_envs: int, rigs: int 
         raise ConfigError(
             f"a batch of {steps} steps takes {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
             "train.horizon or env.num_envs"
+        )
+
+
+@torch.no_grad()
+def check_finite(learner: Learner, iteration: int) -> None:
+    """Refuse, by a ConfigError, networks that are of no use any more after learning in an iteration, from 0."""
+    # A deviation of 0, or one beyond single precision, shows before the weights do.
+    deviation = learner.actor.log_std.exp().square().log()
+    numbers = (deviation, *learner.actor.state_dict().values(), *learner.critic.state_dict().values())
+    if not all(each.isfinite().all() for each in numbers):
+        raise ConfigError(
+            f"training diverged in iteration {iteration + 1}: its networks hold numbers that are not finite; lower "
+            "train.learning_rate or train.critic_learning_rate and train anew"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import os
 from collections.abc import Iterable
 from itertools import zip_longest
@@ -12,11 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from multilift_marl.agents.contract import AGAIN, Network, open_network, read_fields
+from multilift_marl.agents.contract import AGAIN, Network, open_network, read_contract, read_fields
 from multilift_marl.agents.meanings import changed_meanings, spell
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
-from multilift_marl.errors import CheckpointError, ConfigError, nearest, pip_install, reason, warn_once
+from multilift_marl.errors import CheckpointError, ConfigError, nearest, pip_install, warn_once
 from multilift_marl.plugins import identify, named
 from multilift_marl.policies.baselines import SCRIPTED, check_interface, make_scripted
 from multilift_marl.policies.policy import Policy
@@ -25,7 +24,6 @@ from multilift_marl.trust import review, trusting
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
-CONTRACT_FORMAT = "multilift_marl policy 1"  # of the contract beside an exported network
 _SHIPPED = Path(__file__).resolve().parents[1] / "policies"
 _NEEDED = {"config": dict, "actor": dict, "observation_names": list, "action_names": list, "frames": int}
 """What a policy needs of a checkpoint."""
@@ -227,7 +225,7 @@ class ExportedPolicy(TrainedPolicy):
     """
 
     def __init__(self, path: Path):
-        self.contract = _read_contract(path)
+        self.contract = read_contract(path)
         needed = read_fields(self.contract, path.with_suffix(".json"))
         review(needed.config, path)
         action = [number.name for number in needed.action.numbers]
@@ -303,9 +301,12 @@ def load_policy(name: str | Path, checkpoint: str = "best", trust: bool = False)
 
     Raises:
         CheckpointError: missing, truncated or foreign.
-        ConfigError: its configuration is of another version, or a module that it needs is missing or may not run.
+        ConfigError: its configuration is of another version, a module that it needs is missing or may not run, or a
+            checkpoint is asked for of what is no run.
         ModuleNotFoundError: a checkpoint needs torch, the `train` extra; an exported policy onnxruntime, `export`.
     """
+    if checkpoint != "best" and (kind := _kind(str(name))) != "run":
+        raise ConfigError(f"checkpoint={checkpoint} means nothing to the {kind} '{name}'; leave it out")
     with trusting(trust):
         return ExportedPolicy(Path(name)) if str(name).endswith(".onnx") else _load_learned(name, checkpoint)
 
@@ -332,16 +333,23 @@ def find_checkpoint(name: str | Path, checkpoint: str = "best") -> tuple[Path, P
     except ModuleNotFoundError as error:
         message = f"ml.load_policy needs {error.name}: {pip_install('train')}"
         raise ModuleNotFoundError(message, name=error.name) from error
-    # A file or a run in the current folder goes before a shipped policy of that name, another folder does not.
-    if text in shipped_policies() and not (os.path.isfile(text) or os.path.isdir(os.path.join(text, "checkpoints"))):
-        if checkpoint != "best":
-            raise ConfigError(f"checkpoint={checkpoint} means nothing to the shipped policy '{text}'; leave it out")
+    kind = _kind(text)
+    if kind == "shipped policy":
         return _SHIPPED / f"{text}.pt", Path("runs") / f"shipped-{text}"
-    if os.path.isfile(text) or text.endswith(".pt"):
+    if kind == "file":
         return Path(name), Path(name).parent
     folder = find_run(name, others=shipped_policies())
     file = folder / "checkpoints" / f"{checkpoint}.pt" if checkpoint in ("best", "last") else Path(checkpoint)
     return file if file.is_file() or checkpoint != "best" else file.with_name("last.pt"), folder
+
+
+def _kind(name: str) -> str:
+    """Return what a name stands for: a file, a shipped policy, or a run."""
+    if os.path.isfile(name) or name.endswith((".pt", ".onnx")):
+        return "file"
+    # A run in the current folder goes before a shipped policy of that name, another folder does not.
+    own = os.path.isdir(os.path.join(name, "checkpoints"))
+    return "shipped policy" if name in shipped_policies() and not own else "run"
 
 
 def first_difference(kind: str, there: Iterable[str], here: Iterable[str]) -> str:
@@ -378,19 +386,3 @@ def strip_checkpoint(path: str | Path, out: str | Path) -> None:
 
     content = load_checkpoint(path)
     save_checkpoint(Path(out), {key: content[key] for key in _NEEDED})
-
-
-def _read_contract(path: Path) -> dict[str, Any]:
-    """Return the contract beside a network."""
-    if not path.is_file():
-        raise CheckpointError(f"no exported policy {path}: give the .onnx file that multilift_marl.export wrote")
-    file = path.with_suffix(".json")
-    try:
-        contract = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise CheckpointError(f"{path} has no contract {file.name} beside it; put it there, or {AGAIN}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{file} is no contract of a policy ({reason(error)}); {AGAIN}") from error
-    if not isinstance(contract, dict) or contract.get("format") != CONTRACT_FORMAT:
-        raise CheckpointError(f"{file} was not written by multilift_marl (or by another version); {AGAIN}")
-    return contract

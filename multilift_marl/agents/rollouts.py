@@ -46,13 +46,15 @@ class Rollouts:
         policy: that acts in it; its weights may change between two batches.
         horizon: T, steps of each environment in a batch.
         total: environments of the training, of which these are those from `env.vec.first_env` on.
+        rigs: that share them.
 
     Attributes:
         env: as given.
     """
 
-    def __init__(self, env: MultiliftEnv, policy: StochasticPolicy, horizon: int, total: int):
-        self.env, self._policy, self._horizon, self._total = env, policy, horizon, total
+    def __init__(self, env: MultiliftEnv, policy: StochasticPolicy, horizon: int, total: int, rigs: int = 1):
+        self.env, self._policy, self._horizon = env, policy, horizon
+        self._total, self._rigs = total, rigs
         self._batches: Iterator[TensorDictBase] | None = None  # of the collector, once it has started
         self._restored = False
 
@@ -106,7 +108,7 @@ class Rollouts:
         )
         self._batches = iter(collector)
         if not self._restored:
-            vec.stagger(self._total)
+            vec.stagger(self._total, self._rigs)
 
 
 class Part(Protocol):

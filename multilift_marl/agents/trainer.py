@@ -22,6 +22,7 @@ from multilift_marl.agents.checkpoint import (
     make_run_folder,
     making_run,
     save_checkpoint,
+    saved_iteration,
     unlock_run,
 )
 from multilift_marl.agents.curriculum import Curriculum
@@ -32,7 +33,7 @@ from multilift_marl.agents.initial import find_initial
 from multilift_marl.agents.learning_rollouts import LearningRollouts
 from multilift_marl.agents.loggers import check_logger, hyperparameters
 from multilift_marl.agents.logging import RunLog, describe_evaluation, quietly, say, write_versions
-from multilift_marl.agents.mappo import adapted_rate, check_batch, make_learner, update
+from multilift_marl.agents.mappo import adapted_rate, check_batch, check_finite, in_warmup, make_learner, update
 from multilift_marl.agents.policy import check_policy
 from multilift_marl.agents.resuming import check_content, check_needed, load_networks
 from multilift_marl.agents.rigs import divide_rigs
@@ -42,7 +43,6 @@ from multilift_marl.config.load import build_config, dump_config
 from multilift_marl.config.precedence import give_way
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import CheckpointError, ConfigError, reason
-from multilift_marl.evaluation.rollout import trace_episode
 from multilift_marl.plugins import import_modules
 from multilift_marl.trust import check_cluster, review
 
@@ -131,7 +131,7 @@ class Trainer:
                 self._train(log, bar, name)
             except Abandoned:
                 self._rescue()
-            except ConfigError:  # of workers that are lost, say
+            except ConfigError:  # of workers that are lost, say, or of networks that are
                 self._rescue()
                 raise
             finally:
@@ -151,6 +151,12 @@ class Trainer:
         shown: dict[str, str] = {}
         unsaved = tabled = False
         self._best_saved = self._attempt(self._restore_best)
+        if in_warmup(self.config.train, self.iterations - 1):
+            say(
+                f"warning: the policy of this training learns nothing: its {self.iterations} iterations are within "
+                f"train.warmup={self.config.train.warmup}, where the critic learns alone; lower train.warmup or raise "
+                "train.frames"
+            )
         while not (self.finished or self._stopper.asked):
             start = time.perf_counter()
             first = self.evaluator.best is None  # the policy that it begins with; untrained, it acts as its base policy
@@ -179,16 +185,11 @@ class Trainer:
             self.seconds += time.perf_counter() - start
             if not self._best_saved:
                 self._best_saved = self._attempt(self._restore_best)
-            if (
-                unsaved
-                or first
-                or self.iteration % self.config.train.checkpoint_every == 0
-                or last
-                or self._stopper.asked
-            ):
+            due = self.iteration % self.config.train.checkpoint_every == 0
+            if unsaved or first or due or last or self._stopper.asked:
                 unsaved = not self._attempt(partial(self.save, "last"))
             if values.get("eval/best_iteration") == self.iteration:
-                self._attempt(lambda: log.write_picture("flight", self._draw_best(), self.frames))
+                self._attempt(lambda: log.write_picture("flight", self.evaluator.draw_best(self.folder), self.frames))
             quietly(bar.set_postfix, shown)
             quietly(bar.update, not first)
         if unsaved:
@@ -210,7 +211,8 @@ class Trainer:
         """Have the policy act in the environments of the present stage."""
         self.env, environment = envs[0], self.curriculum.environment
         self.rollouts = make_rollouts(environment, envs, self.learner)
-        self.episodes = EpisodeStatistics([env.vec for env in envs], environment.env.num_envs)
+        vecs, began = [env.vec for env in envs], self.curriculum.began
+        self.episodes = EpisodeStatistics(vecs, environment.env.num_envs, began)
 
     def _advance(self, success: float | None) -> None:
         """Go on to the next stage where the present one is over."""
@@ -235,8 +237,7 @@ class Trainer:
         # Before the warm-up takes the actor's rate, which the critic may share.
         critic["lr"] = train.critic_learning_rate * left if train.critic_learning_rate else actor["lr"]
         rate = actor["lr"]
-        # The critic learns alone at first: by its untrained values a good actor would only get worse.
-        if self.iteration < train.warmup and train.algorithm in ("mappo", "ippo"):
+        if in_warmup(train, self.iteration):
             actor["lr"] = 0.0
         batches = self.rollouts.collect(self.iteration)
         sampling = time.perf_counter() - start
@@ -247,12 +248,13 @@ class Trainer:
             torch.set_num_threads(train.threads)
             values = update(self.learner, batches)
             torch.set_num_threads(1)
+        check_finite(self.learner, self.iteration)
         actor["lr"] = rate
         # In the warm-up the policy does not move: a KL of 0 would only raise the rate.
         if train.desired_kl and self.iteration >= train.warmup and "approx_kl" in values:
             actor["lr"] = adapted_rate(rate, values["approx_kl"], train.desired_kl)
         learning = values.pop("learning_seconds")
-        values |= self.episodes.read(batches, self.iteration - self.curriculum.began)
+        values |= self.episodes.read(batches, self.iteration)
         self.iteration += 1
         return values | {
             "learning_rate": rate,
@@ -341,24 +343,18 @@ class Trainer:
             raise CheckpointError(
                 f"the checkpoint does not fit this version or system ({reason(error)}); train anew"
             ) from error
-        self.episodes.returns[:] = content["returns"].numpy()
+        if isinstance(self.rollouts, LearningRollouts) and self.rollouts.begins_anew:
+            self.episodes.began = content["iteration"]
+        else:
+            self.episodes.returns[:] = content["returns"].numpy()
         self.iteration, self.seconds = content["iteration"], content["seconds"]
         self.evaluator.best, self.evaluator.initial = content["best_policy"], content.get("initial_policy")
 
     def _restore_best(self) -> None:
         """Write the best policy of a resumed run, which may have found another one after its last checkpoint."""
         best, path = self.evaluator.best, self.folder / "checkpoints" / "best.pt"
-        if best is not None and not (path.is_file() and load_checkpoint(path).get("iteration") == best["iteration"]):
+        if best is not None and saved_iteration(path) != best["iteration"]:
             save_checkpoint(path, best)
-
-    def _draw_best(self) -> Path:
-        """Return the path of a picture of the first episode of the best policy."""
-        from multilift_marl.evaluation.plots import plot_paths  # matplotlib takes a while
-
-        policy, path = self.evaluator.best_policy(), self.folder / "flight.png"
-        trace = trace_episode(self.config, policy.bind, 0, self.config.seed)
-        plot_paths(path, trace, f"best policy so far, iteration {self.iteration}")
-        return path
 
 
 def new_run(config: Config, name: str, runs: Path = Path("runs")) -> Trainer:

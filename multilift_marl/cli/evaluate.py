@@ -202,7 +202,8 @@ def _find_team(options: Options, overrides: dict[str, Any]) -> _Team:
         return _find_named(options, find_policy(options.policy), options.policy, overrides)
     _refuse_recipe("run", options.run)
     policy = load_policy(options.run, options.checkpoint)
-    if options.checkpoint == "best" and getattr(policy, "frames", None) == 0:
+    untrained = getattr(policy, "frames", None) == 0 and not Path(options.run).is_file()
+    if options.checkpoint == "best" and untrained:
         print(f"note: {UNTRAINED}")
     if options.config is not None:
         return _find_named(options, policy, options.run, overrides)

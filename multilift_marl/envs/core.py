@@ -203,17 +203,19 @@ class MultiliftVec:
         """Environments (E,) bool that must be reset before the next step."""
         return self._ended.copy()
 
-    def stagger(self, total: int | None = None) -> None:
+    def stagger(self, total: int | None = None, rigs: int = 1) -> None:
         """Shorten the episodes in progress to evenly spread lengths, so that time limits no longer coincide.
 
         A learner then sees all phases of an episode in every batch.
 
         Args:
             total: environments among which these are those from `first_env` on; None: these are all.
+            rigs: that share them, as many each, one rig after the other; each then sees all phases, too.
         """
         first, total = (0, self.num_envs) if total is None else (self.first_env, total)
-        # Environment k of `total` goes on as if the share k/total of its episode were over.
-        self.steps[:] = (first + np.arange(self.num_envs)) * self.max_steps // total
+        rig, own = np.divmod(first + np.arange(self.num_envs), total // rigs)
+        # Rigs take turns; the k-th of all goes on as if the share k/total of its episode were over.
+        self.steps[:] = (own * rigs + rig) * self.max_steps // total
 
     @property
     def drawn(self) -> dict[str, np.ndarray]:
@@ -232,8 +234,7 @@ class MultiliftVec:
         """
         # `copy` goes through `__reduce__`: the twin has a world of its own.
         twin = copy(self)
-        shard = twin.world.shards[0]
-        pipeline = twin._pipelines[shard.lo]
+        pipeline = twin._pipelines[twin.world.shards[0].lo]
         seconds = np.zeros(len(pipeline.stages))
         if (twin.episodes < 0).any():
             twin.reset()

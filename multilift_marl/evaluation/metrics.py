@@ -129,6 +129,12 @@ def summarize(episodes: dict[str, np.ndarray], causes: Sequence[str] = CAUSES) -
     return result
 
 
+def derived_names(causes: Sequence[str]) -> set[str]:
+    """Return the names of what `summarize` derives from what is measured."""
+    rates = {f"failure_{cause}_rate" for cause in causes[1:]}
+    return rates | {f"{name}_{kind}" for name in _APART for kind in ("held", "successful")}
+
+
 def compare(policy: dict[str, np.ndarray], baseline: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     """Return the mean paired difference, policy minus baseline, of every metric of `run_episodes`.
 

@@ -11,9 +11,9 @@ from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.evaluation.metrics import join_episodes
+from multilift_marl.evaluation.metrics import derived_names, join_episodes
 from multilift_marl.evaluation.outline import obstacle_corners, payload_surface
-from multilift_marl.evaluation.shortfalls import ShortfallMeter
+from multilift_marl.evaluation.shortfalls import ShortfallMeter, is_shortfall
 from multilift_marl.mdp.failures import MAX_DISTANCE
 from multilift_marl.policies.policy import Policy
 from multilift_marl.sim.parameters import Parameters
@@ -118,6 +118,7 @@ def measure_episodes(
         on_step: called with the environments after every step.
 
     Raises:
+        ConfigError: see `own_metrics`; or its names change.
         ValueError: the policy's actions do not fit the environment.
     """
     e, dt = vec.num_envs, vec.task.dt
@@ -130,12 +131,8 @@ def measure_episodes(
     result |= {"success_rate": np.zeros(e, bool), "failure_cause": np.zeros(e, int)}
     previous = np.zeros((e, vec.num_drones, vec.action_size))
     meter = ShortfallMeter(vec)
-    of_policy: Callable[[], dict[str, np.ndarray]] = getattr(policy, "metrics", dict)
-
-    def own() -> dict[str, np.ndarray]:
-        return vec.task.metrics() | of_policy()
-
-    result |= {name: np.zeros(e) for name in own()}
+    own = own_metrics(vec, policy)
+    result |= {name: np.zeros(e) for name in own}
     for step in range(vec.max_steps):
         action = policy.act(observation)
         observation, reward, terminated, truncated, info = vec.step(action)
@@ -161,7 +158,12 @@ def measure_episodes(
         if ended.any():
             result["success_rate"][ended] = info["success"][ended]
             result["failure_cause"][ended] = info["failure_cause"][ended]
-            for name, source in (_at_end(vec) | own()).items():
+            now = own_metrics(vec, policy)
+            for name in now.keys() ^ own.keys():
+                raise ConfigError(
+                    f"metrics() must report the same names at all times, NaN where there is no number, but not '{name}'"
+                )
+            for name, source in (_at_end(vec) | now).items():
                 result[name][ended] = source[ended]
             running &= ~ended
         if not running.any():
@@ -195,6 +197,25 @@ def measure_episodes(
     }
 
 
+def own_metrics(vec: MultiliftVec, policy: Policy) -> dict[str, np.ndarray]:
+    """Return what task and policy report of the episodes so far, numbers (E,) by name.
+
+    Raises:
+        ConfigError: a name that evaluation has itself, or both of them.
+    """
+    found: dict[str, np.ndarray] = {}
+    known = {*MEASURED, *derived_names(vec.failure_causes)}
+    for who, ask in ((f"task {vec.task.name}", vec.task.metrics), ("the policy", getattr(policy, "metrics", dict))):
+        reported = ask()
+        for name in reported:
+            if name in known or name in found or is_shortfall(name):
+                raise ConfigError(
+                    f"metrics() of {who} reports '{name}', which evaluation has itself; give it another name"
+                )
+        found |= reported
+    return found
+
+
 def _tilt(vec: MultiliftVec) -> np.ndarray:
     """Return the angle between the payload's vertical axis and that of the world (E,) [deg]."""
     return np.rad2deg(np.arccos(np.clip(vec.world.state.payload_rotation[:, 2, 2], -1, 1)))
@@ -224,6 +245,13 @@ def _along_axes(vec: MultiliftVec) -> np.ndarray:
 
 
 _AT_END = ("cable_tension_min_n", "cable_tension_max_n", "slack_time_s", "min_separation_m", "energy_j")
+
+
+MEASURED = (
+    "success_rate", "failure_cause", "precise_rate", "payload_position_error_m", "payload_attitude_error_deg",
+    "payload_tilt_deg", "payload_rmse_m", "settling_time_s", "return", "action_rate", *_AXES, *_AT_END,
+)  # fmt: skip
+"""What is measured of all episodes, beside shortfalls; of one drone no separation."""
 
 
 def _at_end(vec: MultiliftVec) -> dict[str, np.ndarray]:

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer, same
+from conftest import make_trainer, refusal, same
 
 from multilift_marl._platform import STOPPING, lock_file
 from multilift_marl.agents import checkpoint, policy, stopping
 from multilift_marl.agents.checkpoint import find_run, load_checkpoint, save_checkpoint
 from multilift_marl.agents.policy import find_checkpoint, load_policy, strip_checkpoint
 from multilift_marl.agents.trainer import resume_run
+from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.cli.train import main as train
 from multilift_marl.config.load import build_config
 from multilift_marl.errors import CheckpointError
@@ -107,10 +108,44 @@ def test_checkpoint_without_policy_is_named(tmp_path):
         load_policy(tmp_path / "x.pt")
 
 
+@pytest.mark.parametrize("damage", [lambda path: path.write_bytes(b"torn"), lambda path: path.unlink()])
+def test_a_best_policy_that_cannot_be_read_is_written_again(tmp_path, damage, capsys):
+    trainer = make_trainer(tmp_path, **{"train.frames": 256, "eval.every": 100})
+    trainer.step()
+    trainer.evaluate()
+    trainer.save("last")
+    best = trainer.folder / "checkpoints" / "best.pt"
+    damage(best)
+    assert resume_run(trainer.folder, {}).run()
+    assert load_checkpoint(best)["iteration"] in (1, 2) and "warning" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", ["latest", "runs/none"])
 def test_missing_run_is_named(tmp_path, name):
     with pytest.raises(CheckpointError, match="no run"):
         find_run(name, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["hover", "x.onnx", "best.pt", "other"])
+@pytest.mark.parametrize("checkpoint", ["last", "some.pt"])
+def test_a_checkpoint_beside_what_is_no_run_is_refused(tmp_path, monkeypatch, name, checkpoint):
+    trainer = make_trainer(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    for each in ("best", "last", "other"):
+        trainer.save(each, tmp_path / f"{each}.pt")
+    (tmp_path / "other.pt").rename("other")
+    said = refusal(load_policy, name, checkpoint)
+    assert f"checkpoint={checkpoint} means nothing to " in said and f"'{name}'; leave it out" in said
+    assert load_policy("best.pt").frames == 0
+
+
+def test_no_other_checkpoint_of_a_file_is_spoken_of(tmp_path, capsys):
+    trainer = make_trainer(tmp_path)
+    trainer.save("best")
+    short = ["episodes=1", "env.episode_seconds=0.1", "baseline=none"]
+    for run, spoken in ((trainer.folder, True), (trainer.folder / "checkpoints" / "best.pt", False)):
+        assert evaluate([f"run={run}", f"out={tmp_path / 'flown'}", *short]) == 0
+        assert ("checkpoint=last" in capsys.readouterr().out) == spoken
 
 
 def test_observations_of_another_environment_are_refused(tmp_path):

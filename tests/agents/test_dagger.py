@@ -89,6 +89,20 @@ def test_a_training_that_is_resumed_near_its_end_learns_in_what_is_left(tmp_path
     assert ["loss" in again.step() for _ in range(4)] == [False, True, True, True]
 
 
+def test_a_training_that_is_resumed_begins_episodes_at_all_times_and_counts_whole_ones(tmp_path):
+    """Of those that were under way nothing is left; those that begin are cut short, as at first."""
+    trainer = new_run(config(**{"env.episode_seconds": 1.0}), "first", tmp_path)
+    for _ in range(3):
+        trainer.step()
+    assert trainer.episodes.returns.any()
+    trainer.evaluate()
+    trainer.save("last")
+    again = resume_run(trainer.folder, {})
+    assert not again.episodes.returns.any()
+    assert sorted(again.rollouts.flights[0].env.vec.steps) == [0, 12, 25, 37]
+    assert ["return" in again.step() for _ in range(4)] == [False, False, True, True]
+
+
 def test_steps_are_kept_as_they_were_flown_and_the_oldest_make_room():
     """Of a step that only resets nothing is kept."""
     small = {"train.dagger.capacity": 150, "train.dagger.teacher_share": 1.0, "env.episode_seconds": 0.5}

@@ -11,7 +11,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import multilift_marl as ml
-from multilift_marl.agents.policy import CONTRACT_FORMAT, ExportedPolicy
+from multilift_marl.agents.contract import CONTRACT_FORMAT
+from multilift_marl.agents.policy import ExportedPolicy
 from multilift_marl.cli.evaluate import main as evaluate
 from multilift_marl.config.load import load_config
 from multilift_marl.errors import CheckpointError, ConfigError

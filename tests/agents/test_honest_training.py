@@ -10,7 +10,7 @@ from conftest import SMALL, make_trainer, refusal
 
 from multilift_marl.agents import evaluator
 from multilift_marl.agents.checkpoint import load_checkpoint
-from multilift_marl.agents.evaluator import Gain
+from multilift_marl.agents.evaluator import Evaluator, Gain
 from multilift_marl.agents.logging import describe_evaluation, read_metrics
 from multilift_marl.agents.trainer import Trainer, new_run
 from multilift_marl.cli.train import _compare
@@ -78,7 +78,7 @@ def test_the_best_policy_is_the_best_on_fresh_episodes_too(tmp_path, monkeypatch
 
     monkeypatch.setattr(evaluator, "run_episodes", fly)
     monkeypatch.setattr(Trainer, "step", step)
-    monkeypatch.setattr(Trainer, "_draw_best", lambda trainer: PICTURE)
+    monkeypatch.setattr(Evaluator, "draw_best", lambda evaluator, folder: PICTURE)
     trainer = make_trainer(tmp_path, **{"eval.episodes": 40, "eval.keep": keep})
     assert trainer.run()
     kept = load_checkpoint(trainer.folder / "checkpoints" / "best.pt")

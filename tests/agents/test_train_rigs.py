@@ -113,6 +113,18 @@ def test_rigs_may_fly_episodes_of_their_own_length(tmp_path):
     assert [rig.env.episode_seconds for rig in evaluated_rigs(trainer.config)] == [0.2, 0.8]
 
 
+@pytest.mark.parametrize("algorithm", ["mappo", "dagger"])
+def test_each_rig_begins_at_all_phases_of_an_episode(tmp_path, algorithm):
+    """Together they are spread as evenly as as many environments of one rig."""
+    keys = {"train.algorithm": algorithm, "train.dagger.teacher": "payload_geometric", "env.num_envs": 12}
+    trainer = make_trainer(tmp_path, **keys, **{"train.rigs": [{}, {}, {}]})
+    trainer.rollouts.get_state()  # they begin
+    parts = trainer.rollouts._parts if algorithm == "mappo" else trainer.rollouts.flights
+    vecs = [part.env.vec for part in parts]
+    assert all(np.ptp(vec.steps) > 0.5 * vec.max_steps for vec in vecs)
+    assert sorted(np.concatenate([vec.steps for vec in vecs])) == [i * vecs[0].max_steps // 12 for i in range(12)]
+
+
 @pytest.mark.slow
 def test_rigs_resume_bit_for_bit(tmp_path):
     whole = make_trainer(tmp_path, **TWO)
@@ -133,11 +145,33 @@ def test_evaluations_fly_every_rig(tmp_path):
     values = trainer.evaluate()
     policy = LearnedPolicy(trainer._content(), "the run")
     config = trainer.config
-    returns = [
-        run_episodes(build_config(config.model_dump(), rig), policy.bind, 2, config.seed, TRAINING_EVALUATION)["return"]
-        for rig in RIGS
-    ]
+    returns = []
+    for k, rig in enumerate(RIGS):
+        flown = build_config(config.model_dump(), rig)
+        found = run_episodes(flown, policy.bind, 2, config.seed, TRAINING_EVALUATION, first=2 * k)
+        returns.append(found["return"])
     assert values["eval/return"] == pytest.approx(np.concatenate(returns).mean(), rel=1e-12)
+
+
+def test_rigs_that_are_equal_are_evaluated_in_different_episodes(tmp_path):
+    trainer = make_trainer(tmp_path, **{"train.rigs": [{}, {}], "eval.episodes": 4})
+    evaluator, whole = trainer.evaluator, make_trainer(tmp_path, **{"eval.episodes": 4}).evaluator
+    policy = LearnedPolicy(trainer._content(), "the run")
+    twice, once = (each._fly(policy.bind, 3)["return"] for each in (evaluator, whole))
+    assert len(np.unique(twice)) == 4 and np.array_equal(twice, once)
+
+
+def test_a_score_of_rigs_in_the_same_episodes_is_measured_anew(tmp_path, monkeypatch):
+    trainer = make_trainer(tmp_path, **{"train.rigs": [{}, {}], "eval.episodes": 2})
+    trainer.evaluate()
+    best = trainer.evaluator.best
+    score = best["score"]
+    best |= {"score": [2.0, 0.0]}
+    trainer.evaluate()
+    assert best["score"] == [2.0, 0.0]
+    del best["rigs"]  # as before
+    trainer.evaluate()
+    assert best["score"] == score
 
 
 @pytest.mark.parametrize(

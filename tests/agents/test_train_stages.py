@@ -9,8 +9,9 @@ from conftest import make_trainer, refusal
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+from multilift_marl.agents.evaluator import Evaluator
 from multilift_marl.agents.logging import read_metrics
-from multilift_marl.agents.trainer import Trainer, resume_run
+from multilift_marl.agents.trainer import resume_run
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.errors import CheckpointError
 from multilift_marl.rig.resolve import resolve_system
@@ -110,7 +111,7 @@ def test_workers_go_through_the_same_stages(tmp_path):
 
 
 def test_the_stage_is_logged_and_announced(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(Trainer, "_draw_best", lambda trainer: PICTURE)
+    monkeypatch.setattr(Evaluator, "draw_best", lambda evaluator, folder: PICTURE)
     trainer = make_trainer(tmp_path, **stages({"frames": BATCH}, {"frames": 2 * BATCH}), **{"train.frames": 3 * BATCH})
     assert trainer.run()
     rows = read_metrics(trainer.folder)

@@ -338,6 +338,19 @@ def test_in_the_warmup_the_critic_alone_learns(tmp_path, desired_kl):
         assert same == [iteration < 2, False]
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "warmup", "said"), [("mappo", 2, True), ("ippo", 3, True), ("mappo", 1, False), ("dagger", 12, False)]
+)
+def test_a_training_within_its_warmup_says_that_it_learns_nothing(tmp_path, capsys, algorithm, warmup, said):
+    teacher = {"train.dagger.teacher": "payload_geometric"}
+    keys = {"train.algorithm": algorithm, "train.warmup": warmup, "train.frames": 2 * 128, "eval.every": 100}
+    trainer = make_trainer(tmp_path, **keys, **teacher)
+    assert trainer.run()
+    shown = capsys.readouterr().out
+    assert (f"its 2 iterations are within train.warmup={warmup}" in shown) == said
+    assert ("lower train.warmup or raise train.frames" in shown) == said
+
+
 def test_the_critic_has_its_own_learning_rate(tmp_path):
     trainer = make_trainer(
         tmp_path, **{"train.learning_rate": 1e-4, "train.critic_learning_rate": 3e-3, "train.final_learning_rate": 0.5}

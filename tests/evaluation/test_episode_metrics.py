@@ -34,7 +34,7 @@ class FilmTask(SimpleNamespace):
 class Film:
     """Environments in which all happens as it was drawn before; episode e fails in step `fails[e]`, 0: never."""
 
-    num_drones, action_size = 2, 3
+    num_drones, action_size, failure_causes = 2, 3, ("none",)
 
     def __init__(self, fails, seed: int = 0, steps: int = STEPS, rmse_after: float = 0.5):
         self.num_envs, self.max_steps, self.fails = len(fails), steps, np.array(fails)
@@ -47,7 +47,7 @@ class Film:
         self.yaw, self.tilts = self.rng.uniform(-3, 3, e), 0.3 * self.rng.random((steps, e))
         self.stats = self.rng.random((5, steps, e))
         goal = SimpleNamespace(yaw=self.yaw, position=np.zeros((e, 3)))
-        self.task = FilmTask(dt=DT, rmse_after=rmse_after, goal=goal, in_error_window=self.late)
+        self.task = FilmTask(name="film", dt=DT, rmse_after=rmse_after, goal=goal, in_error_window=self.late)
         self.world = SimpleNamespace()
         self.show(0)
 

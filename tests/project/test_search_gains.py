@@ -51,6 +51,16 @@ def test_the_search_measures_what_evaluations_do(name, script):
     assert paid[1:] == evaluated[1:]
 
 
+def test_rigs_of_a_search_fly_different_episodes(monkeypatch):
+    flown, run = [], search_gains.run_episodes
+    monkeypatch.setattr(
+        search_gains, "run_episodes", lambda *args, first: flown.append(first) or run(*args, first=first)
+    )
+    keys = {"env.num_envs": 6, "env.episode_seconds": 0.1, "train.rigs": [{}, {}, {}], "env.num_threads": 1}
+    search_gains.fly(ml.load_config("hover", keys), LINEAR["formation"], seed=3)
+    assert flown == [0, 2, 4]
+
+
 @pytest.mark.slow
 def test_the_search_prints_gains_that_a_script_can_have(capsys):
     keys = {"config": "hover", "minutes": 1e-3, "env.num_envs": 4, "env.episode_seconds": 2.0}
