@@ -50,7 +50,8 @@ python train.py config=hover                         # train it again
 
 - Weights are of training seed 0, verdicts of all recorded seeds, as in [results.md](results.md), where the gains are;
   training is environment steps and minutes, of a machine that did other work too.
-- Performance on real drones is unknown, on other rigs, numbers of drones or conditions known only where `shifts` of the card state it.
+- Performance on real drones is unknown, on other rigs, numbers of drones or conditions known only
+  where `shifts` of the card state it.
 - Environments with other observations or another [action interface](control.md#action-interfaces) are refused.
 - Weights are licensed under Apache-2.0 ([NOTICE](../NOTICE)).
 """
