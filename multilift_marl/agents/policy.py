@@ -20,7 +20,7 @@ from multilift_marl.errors import CheckpointError, ConfigError, nearest, pip_ins
 from multilift_marl.plugins import identify, named
 from multilift_marl.policies.baselines import SCRIPTED, check_interface, make_scripted
 from multilift_marl.policies.policy import Policy
-from multilift_marl.trust import review, trusting
+from multilift_marl.trust import find_foreign, review, trusting
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -365,6 +365,8 @@ def check_policy(content: dict[str, Any], source: str) -> None:
     for key in ("observation_names", "action_names"):
         if not all(isinstance(name, str) for name in content[key]):
             raise CheckpointError(f"{source} holds no policy ('{key}' must be words); {cure}")
+    if foreign := find_foreign(content["config"]):
+        raise CheckpointError(f"{source} holds no policy ({foreign}); {cure}")
 
 
 def shipped_policies() -> list[str]:
