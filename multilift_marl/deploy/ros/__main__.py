@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._interrupt import ending_at_once
+from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
 from multilift_marl.agents.policy import NamedPolicy, find_policy
 from multilift_marl.command import CommandOptions, limit_torch_threads, run_command, split_options
 from multilift_marl.config.config import Config
@@ -139,14 +139,15 @@ def _run(values: dict[str, Any]) -> int:
     limit_torch_threads()
     node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
     ending = f"{describe_reach(options.domain, options.allow_network, options.ros)} (Ctrl-C ends it)"
-    if options.role in FLYING:
-        _fly(options, config, policy, node, ending)
-    elif options.role == "geometric_control":
-        _control(options, config, node, ending)
-    elif options.role == "clock":
-        _broadcast(options, config, node, ending)
-    else:
-        _simulate(options, config, policy, node, ending)
+    with interrupted_by_signals():
+        if options.role in FLYING:
+            _fly(options, config, policy, node, ending)
+        elif options.role == "geometric_control":
+            _control(options, config, node, ending)
+        elif options.role == "clock":
+            _broadcast(options, config, node, ending)
+        else:
+            _simulate(options, config, policy, node, ending)
     return 0
 
 
@@ -189,7 +190,7 @@ def _fly(options: Options, config: Config, policy: NamedPolicy | None, node: Nod
     try:
         flown.spin(options.seconds or float("inf"))
     except KeyboardInterrupt:
-        flown.land("Ctrl-C; once more ends this at once")
+        flown.land("interrupted; once more ends this at once")
         with suppress(KeyboardInterrupt):
             while not flown.landed:
                 flown.spin_once(1.0)
