@@ -26,7 +26,7 @@ from multilift_marl.command import (
     title,
 )
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, list_configs, load_config
+from multilift_marl.config.load import build_config, choose_config, list_configs, load_config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError
 from multilift_marl.evaluation.metrics import format_reasons, format_table, make_report, write_report
@@ -126,7 +126,7 @@ def _build(options: Options, overrides: dict[str, Any]) -> tuple[Config, dict[st
     baseline = None if chosen in (None, "none") else find_policy(chosen, "baseline", ["none"])
     team = _find_team(options, overrides)
     limit_torch_threads()
-    config = build_config(team.config.model_dump(), {"env.num_threads": 0} | overrides)
+    config = choose_config(None, team.config, {"env.num_threads": 0} | overrides)
     team.check(config)
     if baseline is not None:
         baseline.check(config, "baseline")

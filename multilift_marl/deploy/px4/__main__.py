@@ -19,7 +19,7 @@ from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
 from multilift_marl.agents.policy import find_policy
 from multilift_marl.command import CommandOptions, limit_torch_threads, make_folder, run_command, split_options, title
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.load import choose_config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, FlightError, warn_once
 from multilift_marl.evaluation.metrics import format_table, make_report, write_report
@@ -100,7 +100,7 @@ def _fly(values: dict[str, Any]) -> int:
         raise ConfigError("with policy=none others fly the team, by topics; set live=true")
     if options.start == "topic" and not options.live:
         raise ConfigError("with start=topic the flight waits for orders by topics; set live=true")
-    config = check_config(_find_config(options, None if policy is None else policy.config, overrides))
+    config = check_config(choose_config(options.config, None if policy is None else policy.config, overrides))
     if policy is not None:
         policy.check(config, "policy")
         _warn_of_loops(options.policy, policy.config)
@@ -261,12 +261,6 @@ def _record(flight: Flight, bind: Maker, options: Options) -> FlightResult:
         result = flight.fly(bind, record)
     print(f"wrote {options.bag}")
     return result
-
-
-def _find_config(options: Options, own: Config | None, overrides: dict[str, Any]) -> Config:
-    if options.config is None and own is not None:
-        return build_config(own.model_dump(), overrides)
-    return load_config(options.config or "hover", overrides)
 
 
 def _keep_logs(folder: Path | None, out: Path) -> None:

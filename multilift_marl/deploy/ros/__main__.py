@@ -16,7 +16,7 @@ from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
 from multilift_marl.agents.policy import NamedPolicy, find_policy
 from multilift_marl.command import CommandOptions, limit_torch_threads, run_command, split_options
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.load import choose_config
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError
 from multilift_marl.policies.mpc import ENOUGH
@@ -130,10 +130,7 @@ def _run(values: dict[str, Any]) -> int:
     name = options.policy or ("mpc" if options.role == "mpc_planner" else "formation")
     policy = None if name == "none" else find_policy(name, others=["none"])
     overrides |= {"env.num_envs": 1, "env.num_threads": 1}
-    if options.config is None and policy is not None and policy.config is not None:
-        config = build_config(policy.config.model_dump(), overrides)
-    else:
-        config = load_config(options.config or "hover", overrides)
+    config = choose_config(options.config, None if policy is None else policy.config, overrides)
     if policy is not None and options.role in ("simulation", *FLYING):
         policy.check(config, "policy")
     limit_torch_threads()
