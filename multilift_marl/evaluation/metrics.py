@@ -208,8 +208,17 @@ def make_report(
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
-    """Write what `make_report` returned to `path`, metrics.json by custom."""
-    path.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    """Write what `make_report` returned to `path`, metrics.json by custom; null for what is not finite."""
+    path.write_text(json.dumps(_finite(report), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _finite(value: Any) -> Any:
+    """Return a report with None for numbers that are not finite: one drone has no distance from others."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def format_table(report: dict[str, Any], name: str = "policy") -> str:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -238,7 +239,8 @@ def describe_phases(phases: Sequence[Phase]) -> str:
     """Return the extremes of all parts of a flight as a table."""
     lines = [f"{'phase':<20} {'s':>6} {'separation m':>13} {'tension N':>10} {'tilt deg':>9}"]
     for name, seconds, separation, tension, tilt in phases:
-        lines.append(f"{name:<20} {seconds:>6.1f} {separation:>13.2f} {tension:>10.1f} {tilt:>9.1f}")
+        apart = f"{separation:.2f}" if isfinite(separation) else "-"
+        lines.append(f"{name:<20} {seconds:>6.1f} {apart:>13} {tension:>10.1f} {tilt:>9.1f}")
     return "\n".join(lines)
 
 
