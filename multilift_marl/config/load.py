@@ -9,9 +9,9 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from multilift_marl.config.aliases import stored_names
+from multilift_marl.config.aliases import stored_names, without_arrays
 from multilift_marl.config.config import Config
-from multilift_marl.config.precedence import give_way, merge, system_part
+from multilift_marl.config.precedence import give_way, is_empty, merge, system_part
 from multilift_marl.errors import ConfigError, UnknownKeywordError, called_elsewhere, nearest, reason, shorten
 from multilift_marl.plugins import describe_unregistered, identify, import_modules, load_entry_points, named, refused
 from multilift_marl.schema.files import as_mapping, change_files, is_yaml
@@ -99,7 +99,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    merged, overrides = merge({}, values), stored_names(overrides or {})
+    merged, overrides = merge({}, without_arrays(values)), stored_names(overrides or {})
     free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
     for dotted, value in overrides.items():
         _note_named(dotted, value)
@@ -110,7 +110,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
             node = node.get(part, {})
             if not isinstance(node, Mapping):
                 raise ConfigError(f"{dotted}: '{part}' is a value, not a section")
-        if dotted in free and value == {}:
+        if dotted in free and is_empty(value):
             node.pop(key, None)
         for part in reversed(sections):
             change = {part: change}

@@ -21,7 +21,9 @@ def give_way(values: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, A
     if not isinstance(train, Mapping):
         return dict(values)
     names = [
-        name for name, value in leaves(asked) if name.partition(".")[0] != "train" and (value != {} or name in _FREE)
+        name
+        for name, value in leaves(asked)
+        if name.partition(".")[0] != "train" and (name in _FREE or not is_empty(value))
     ]
     kept = dict(train)
     if isinstance(overrides := kept.get("overrides"), Mapping):
@@ -36,6 +38,11 @@ def give_way(values: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, A
             for stage in stages
         ]
     return {**values, "train": kept}
+
+
+def is_empty(value: Any) -> bool:
+    """Return whether a value is a mapping of nothing."""
+    return isinstance(value, Mapping) and not value
 
 
 def without(overrides: Mapping[str, Any], asked: list[str]) -> dict[str, Any]:
