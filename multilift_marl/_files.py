@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import tempfile
 import threading
@@ -47,3 +48,13 @@ def check_writable(folder: Path) -> None:
     while not os.path.lexists(place) and place != place.parent:
         place = place.parent
     tempfile.TemporaryFile(dir=place).close()
+
+
+def make_run_folder(runs: Path, stem: str) -> Path:
+    """Return a new folder of this name, or of the next one that is free; no other process has it."""
+    for again in itertools.count(1):
+        folder = runs / (stem if again == 1 else f"{stem}-{again}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            break
+    return folder

@@ -13,13 +13,12 @@ from typing import Any, NoReturn
 import torch
 from tqdm import tqdm
 
-from multilift_marl._files import check_writable
+from multilift_marl._files import check_writable, make_run_folder
 from multilift_marl.agents.checkpoint import (
     clear_leftovers,
     copy_content,
     load_checkpoint,
     lock_run,
-    make_run_folder,
     making_run,
     save_checkpoint,
     unlock_run,

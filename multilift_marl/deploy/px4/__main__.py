@@ -18,7 +18,15 @@ from pydantic import Field
 
 from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
 from multilift_marl.agents.policy import find_policy
-from multilift_marl.command import CommandOptions, limit_torch_threads, make_folder, run_command, split_options, title
+from multilift_marl.command import (
+    CommandOptions,
+    check_needs,
+    limit_torch_threads,
+    make_out,
+    run_command,
+    split_options,
+    title,
+)
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import choose_config
 from multilift_marl.envs.core import MultiliftVec
@@ -42,6 +50,13 @@ With live=true the flight is on ROS 2 topics, see docs/ros.md; with policy=none 
 allow_network=true. Any configuration key changes the environment: env.num_drones=6."""
 OURS = "geometric controller"
 SLOW_LOOP = 2.5  # [rad/s] of position, up to which a policy may know what drones under PX4 are like
+
+
+_NEEDS = {
+    "domain": "live=true", "sync": "live=true", "allow_network": "live=true", "patience": "policy=none",
+    "names": "live=true or bag=<folder>", "ros": "live=true or bag=<folder>",
+}  # fmt: skip
+"""What keys of the command mean nothing without."""
 
 
 class Options(CommandOptions):
@@ -96,6 +111,7 @@ def _fly(values: dict[str, Any]) -> int:
     from multilift_marl.deploy.px4.launch import find_px4
 
     options, overrides = split_options(Options, values)
+    check_needs(options, _NEEDS)
     policy = None if options.policy == "none" else find_policy(options.policy, others=["none"])
     if policy is None and not options.live:
         raise ConfigError("with policy=none others fly the team, by topics; set live=true")
@@ -128,7 +144,7 @@ def _fly(values: dict[str, Any]) -> int:
         if policy is not None:
             policy.bind(vec)  # refuses what does not fit, before anything starts
     name = f"px4-{title({'config': options.config or config.task})}-{Path(options.policy).stem}"
-    out = make_folder(Path(options.out) if options.out else Path("runs") / name / time.strftime("%Y%m%d-%H%M%S"))
+    out = make_out(options.out, Path("runs") / name)
 
     try:
         return _fly_and_report(config, None if policy is None else policy.bind, options, build, out)
