@@ -23,8 +23,7 @@ def write_whole(path: Path, content: bytes | memoryview, flush: bool = True) -> 
     Raises:
         OSError: it cannot be written.
     """
-    # In the same folder: a rename replaces a file at once within one file system only.
-    aside = path.with_name(f"{path.stem}-{os.getpid()}-{threading.get_ident()}.tmp")  # no other writer's
+    aside = name_aside(path)
     try:
         with open(aside, "wb") as file:
             file.write(content)
@@ -36,6 +35,14 @@ def write_whole(path: Path, content: bytes | memoryview, flush: bool = True) -> 
         with suppress(OSError):
             aside.unlink(missing_ok=True)
         raise
+
+
+def name_aside(path: Path, suffix: str = ".tmp") -> Path:
+    """Return where to write what is renamed to `path` when it is whole: a name of no other writer.
+
+    In the same folder, for a rename replaces a file at once within one file system only.
+    """
+    return path.with_name(f"{path.stem}-{os.getpid()}-{threading.get_ident()}{suffix}")
 
 
 def check_writable(folder: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from multilift_marl._files import write_whole
 from multilift_marl.config.config import Config
 from multilift_marl.evaluation.shortfalls import explain, format_explanation, is_shortfall
 from multilift_marl.mdp.failures import CAUSES
@@ -209,7 +210,7 @@ def make_report(
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
     """Write what `make_report` returned to `path`, metrics.json by custom; null for what is not finite."""
-    path.write_text(json.dumps(_finite(report), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_whole(path, f"{json.dumps(_finite(report), indent=2, allow_nan=False)}\n".encode())
 
 
 def _finite(value: Any) -> Any:
