@@ -6,6 +6,7 @@ import itertools
 import os
 import tempfile
 import threading
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,17 +24,25 @@ def write_whole(path: Path, content: bytes | memoryview, flush: bool = True) -> 
     Raises:
         OSError: it cannot be written.
     """
-    aside = name_aside(path)
+    write_together({path: content}, flush)
+
+
+def write_together(contents: Mapping[Path, bytes | memoryview], flush: bool = True) -> None:
+    """Do as `write_whole` with files of which none is renamed before all are written; they are in this order."""
+    asides = {path: name_aside(path) for path in contents}
     try:
-        with open(aside, "wb") as file:
-            file.write(content)
-            if flush:
-                file.flush()
-                os.fsync(file.fileno())
-        os.replace(aside, path)
+        for path, content in contents.items():
+            with open(asides[path], "wb") as file:
+                file.write(content)
+                if flush:
+                    file.flush()
+                    os.fsync(file.fileno())
+        for path, aside in asides.items():
+            os.replace(aside, path)
     except BaseException:
-        with suppress(OSError):
-            aside.unlink(missing_ok=True)
+        for aside in asides.values():
+            with suppress(OSError):
+                aside.unlink(missing_ok=True)
         raise
 
 
@@ -42,7 +51,7 @@ def name_aside(path: Path, suffix: str = ".tmp") -> Path:
 
     In the same folder, for a rename replaces a file at once within one file system only.
     """
-    return path.with_name(f"{path.stem}-{os.getpid()}-{threading.get_ident()}{suffix}")
+    return path.with_name(f"{path.name}-{os.getpid()}-{threading.get_ident()}{suffix}")
 
 
 def check_writable(folder: Path) -> None:

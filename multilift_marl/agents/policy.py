@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from multilift_marl.agents.contract import AGAIN, Network, open_network, read_fields
+from multilift_marl.agents.contract import AGAIN, Network, check_same_export, open_network, read_fields
 from multilift_marl.agents.meanings import changed_meanings, spell
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
@@ -235,7 +235,9 @@ class ExportedPolicy(TrainedPolicy):
         memory = 0 if needed.network.memory is None else needed.network.memory.size
         if memory != (gru := self.config.train.gru):
             raise CheckpointError(f"{path} has a memory of {memory} numbers, its contract train.gru={gru}; {AGAIN}")
-        self._network = Network(open_network(path), needed, str(path))
+        session = open_network(path)  # which says what is wrong with a file that is damaged
+        check_same_export(path, needed)
+        self._network = Network(session, needed, str(path))
 
     def _act(self, observation: np.ndarray, memory: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
         action, *after = self._network.run(observation, *(() if memory is None else (memory,)))
