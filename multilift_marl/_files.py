@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import tempfile
 import threading
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,19 +24,34 @@ def write_whole(path: Path, content: bytes | memoryview, flush: bool = True) -> 
     Raises:
         OSError: it cannot be written.
     """
-    # In the same folder: a rename replaces a file at once within one file system only.
-    aside = path.with_name(f"{path.stem}-{os.getpid()}-{threading.get_ident()}.tmp")  # no other writer's
+    write_together({path: content}, flush)
+
+
+def write_together(contents: Mapping[Path, bytes | memoryview], flush: bool = True) -> None:
+    """Do as `write_whole` with files of which none is renamed before all are written; they are in this order."""
+    asides = {path: name_aside(path) for path in contents}
     try:
-        with open(aside, "wb") as file:
-            file.write(content)
-            if flush:
-                file.flush()
-                os.fsync(file.fileno())
-        os.replace(aside, path)
+        for path, content in contents.items():
+            with open(asides[path], "wb") as file:
+                file.write(content)
+                if flush:
+                    file.flush()
+                    os.fsync(file.fileno())
+        for path, aside in asides.items():
+            os.replace(aside, path)
     except BaseException:
-        with suppress(OSError):
-            aside.unlink(missing_ok=True)
+        for aside in asides.values():
+            with suppress(OSError):
+                aside.unlink(missing_ok=True)
         raise
+
+
+def name_aside(path: Path, suffix: str = ".tmp") -> Path:
+    """Return where to write what is renamed to `path` when it is whole: a name of no other writer.
+
+    In the same folder, for a rename replaces a file at once within one file system only.
+    """
+    return path.with_name(f"{path.name}-{os.getpid()}-{threading.get_ident()}{suffix}")
 
 
 def check_writable(folder: Path) -> None:
@@ -47,3 +64,13 @@ def check_writable(folder: Path) -> None:
     while not os.path.lexists(place) and place != place.parent:
         place = place.parent
     tempfile.TemporaryFile(dir=place).close()
+
+
+def make_run_folder(runs: Path, stem: str) -> Path:
+    """Return a new folder of this name, or of the next one that is free; no other process has it."""
+    for again in itertools.count(1):
+        folder = runs / (stem if again == 1 else f"{stem}-{again}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            break
+    return folder

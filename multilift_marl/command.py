@@ -8,6 +8,7 @@ import os
 import shlex
 import subprocess
 import sys
+import time
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -17,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._files import check_writable
+from multilift_marl._files import check_writable, make_run_folder
 from multilift_marl._interrupt import end_quiet_import
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import check_names, explain, load_config, parse_overrides
@@ -200,6 +201,24 @@ def split_options(options: type[Options], values: Mapping[str, Any]) -> tuple[Op
     return validate(options, own), {key: value for key, value in values.items() if key not in own}
 
 
+def check_needs(options: CommandOptions, needs: Mapping[str, str]) -> None:
+    """Refuse, by a ConfigError, keys that are given without what they mean something with.
+
+    Args:
+        options: of a command.
+        needs: by key what it needs, as arguments: "video=true", "bag=<folder> or live=true".
+    """
+    for key in sorted(options.model_fields_set & needs.keys()):
+        if not any(_is_given(options, need) for need in needs[key].split(" or ")):
+            raise ConfigError(f"{key} means nothing without {needs[key]}; leave {key} out, or add that")
+
+
+def _is_given(options: CommandOptions, need: str) -> bool:
+    key, _, wanted = need.partition("=")
+    value = getattr(options, key)
+    return bool(value) if wanted.startswith("<") else str(value).lower() == wanted
+
+
 def limit_torch_threads() -> None:
     """Let torch, where it has been imported, use one thread: for networks this small, more only wait for each other."""
     if torch := sys.modules.get("torch"):
@@ -216,6 +235,13 @@ def make_folder(folder: Path, option: str = "out=<folder>") -> Path:
             f"cannot write into {shorten(folder)} ({reason(error)}); give another folder by {option}"
         ) from error
     return folder
+
+
+def make_out(out: str | None, parent: Path, stem: str = "") -> Path:
+    """Return the folder `out`; where that is None, a new one of this process in `parent`, by stem and time."""
+    if out is not None:
+        return make_folder(Path(out))
+    return make_run_folder(make_folder(parent), stem + time.strftime("%Y%m%d-%H%M%S"))
 
 
 def _explain_configuration(values: dict[str, Any], own: Iterable[str], key: str) -> str:

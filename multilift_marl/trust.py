@@ -13,6 +13,8 @@ from multilift_marl import plugins
 from multilift_marl.errors import ConfigError, shorten
 
 _OWN_CLUSTERS = ("auto", "local", "")  # values of `train.ray` by which a file chooses none
+_PLAIN = (str, int, float, bool, type(None))  # types of values that a stored configuration holds
+_MOST_DEPTH = 30
 _trusted: ContextVar[bool] = ContextVar("trusted", default=False)
 
 
@@ -40,9 +42,13 @@ def review(values: Any, source: object) -> None:
         source: the file that it comes from, for messages.
 
     Raises:
-        ConfigError: a module that may not run.
+        ConfigError: a module that may not run, or a value of a type that is not known here, see `find_foreign`.
     """
-    if not isinstance(values, Mapping):
+    if foreign := find_foreign(values):
+        raise ConfigError(
+            f"{shorten(str(source), 300)} is no configuration ({foreign}); keep to text, numbers, lists and sections"
+        )
+    if not isinstance(values, dict):
         return
     train = values.get("train")
     train = train if isinstance(train, Mapping) else {}
@@ -70,6 +76,31 @@ def review(values: Any, source: object) -> None:
                 f"{shorten(str(source), 300)} has {shorten(key, 300)}, which was not joined: what workers there return "
                 f"may be anybody's code; name it yourself by {shorten(key, 300)}, or give trust=true"
             )
+
+
+def find_foreign(values: Any, name: str = "config", depth: int = 0) -> str:
+    """Return what a stored configuration holds that none of this package does, "" if nothing.
+
+    Validation would take more than is reviewed: a set for a list, bytes for text.
+
+    Args:
+        values: the configuration, nested; of any content.
+        name: its key, for the answer.
+        depth: of that in the configuration.
+    """
+    kind = type(values)
+    if kind in _PLAIN:
+        return ""
+    if kind not in (dict, list, tuple):
+        return f"{name} is of type {kind.__name__}"
+    if depth > _MOST_DEPTH:
+        return f"config is nested more than {_MOST_DEPTH} deep"
+    for key, value in values.items() if kind is dict else enumerate(values):
+        if kind is dict and type(key) is not str:
+            return f"{name} has the key {shorten(repr(key))}, which is no text"
+        if found := find_foreign(value, f"{name}.{key}", depth + 1):
+            return found
+    return ""
 
 
 def name_cluster(address: str) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-import itertools
 import os
 import re
 import zipfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -174,16 +173,6 @@ def making_run(runs: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise ConfigError(f"cannot make a run in {runs}/ ({reason(error)}); train in another folder") from error
-
-
-def make_run_folder(runs: Path, stem: str) -> Path:
-    """Return a new folder of this name, or of the next one that is free."""
-    for again in itertools.count(1):
-        folder = runs / (stem if again == 1 else f"{stem}-{again}")
-        with suppress(FileExistsError):
-            folder.mkdir()
-            break
-    return folder
 
 
 def lock_run(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from pathlib import Path
@@ -37,6 +38,8 @@ class _Memory(_Part):
 
 
 class _Network(_Part):
+    sha256: str | None = None
+    """Of the file; contracts of earlier versions do not state it."""
     input: str
     output: str
     memory: _Memory | None = None
@@ -92,6 +95,15 @@ def open_network(path: Path) -> Any:
                 "upgrade onnxruntime, or export with an older opset: python -m multilift_marl.export run=<run> opset=18"
             ) from error
         raise CheckpointError(f"{path} is truncated or no ONNX network; export the policy again") from error
+
+
+def check_same_export(path: Path, contract: Contract) -> None:
+    """Refuse, by a CheckpointError, a network that is not the one that a contract describes."""
+    stated = contract.network.sha256
+    if stated is not None and hashlib.sha256(path.read_bytes()).hexdigest() != stated:
+        raise CheckpointError(
+            f"{path} and {path.with_suffix('.json').name} beside it are of different exports; {AGAIN}"
+        )
 
 
 class Network:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import warnings
@@ -18,6 +19,7 @@ import onnxscript  # noqa: F401 (torch's exporter works by it; so a missing one 
 import torch
 from torch import nn
 
+from multilift_marl._files import write_together
 from multilift_marl.agents.contract import CONTRACT_FORMAT
 from multilift_marl.agents.logging import package_versions
 from multilift_marl.agents.networks import Actor, Normalizer
@@ -89,9 +91,10 @@ def export_policy(policy: TrainedPolicy, folder: str | Path, opset: int | None =
     difference = _compare(policy, model)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    onnx.save(model, str(folder / NETWORK))
+    serialized = model.SerializeToString()
     network = {
         "file": NETWORK,
+        "sha256": hashlib.sha256(serialized).hexdigest(),
         "input": "observation",
         "output": "action",
         "memory": {"input": "memory", "output": "next_memory", "size": gru} if gru else None,
@@ -100,7 +103,8 @@ def export_policy(policy: TrainedPolicy, folder: str | Path, opset: int | None =
         "largest_difference": difference,
     }
     contract = {"network": network} | contract
-    (folder / CONTRACT).write_text(json.dumps(contract, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = f"{json.dumps(contract, indent=1, ensure_ascii=False)}\n".encode()
+    write_together({folder / NETWORK: serialized, folder / CONTRACT: text})
     return contract
 
 

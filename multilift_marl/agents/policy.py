@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from multilift_marl.agents.contract import AGAIN, Network, open_network, read_contract, read_fields
+from multilift_marl.agents.contract import AGAIN, Network, check_same_export, open_network, read_contract, read_fields
 from multilift_marl.agents.meanings import changed_meanings, spell
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
@@ -19,7 +19,7 @@ from multilift_marl.errors import CheckpointError, ConfigError, nearest, pip_ins
 from multilift_marl.plugins import identify, named
 from multilift_marl.policies.baselines import SCRIPTED, check_interface, make_scripted
 from multilift_marl.policies.policy import Policy
-from multilift_marl.trust import review, trusting
+from multilift_marl.trust import find_foreign, review, trusting
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -233,7 +233,9 @@ class ExportedPolicy(TrainedPolicy):
         memory = 0 if needed.network.memory is None else needed.network.memory.size
         if memory != (gru := self.config.train.gru):
             raise CheckpointError(f"{path} has a memory of {memory} numbers, its contract train.gru={gru}; {AGAIN}")
-        self._network = Network(open_network(path), needed, str(path))
+        session = open_network(path)  # which says what is wrong with a file that is damaged
+        check_same_export(path, needed)
+        self._network = Network(session, needed, str(path))
 
     def _act(self, observation: np.ndarray, memory: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
         action, *after = self._network.run(observation, *(() if memory is None else (memory,)))
@@ -373,6 +375,8 @@ def check_policy(content: dict[str, Any], source: str) -> None:
     for key in ("observation_names", "action_names"):
         if not all(isinstance(name, str) for name in content[key]):
             raise CheckpointError(f"{source} holds no policy ('{key}' must be words); {cure}")
+    if foreign := find_foreign(content["config"]):
+        raise CheckpointError(f"{source} holds no policy ({foreign}); {cure}")
 
 
 def shipped_policies() -> list[str]:

@@ -13,13 +13,12 @@ from typing import Any, NoReturn
 import torch
 from tqdm import tqdm
 
-from multilift_marl._files import check_writable
+from multilift_marl._files import check_writable, make_run_folder, write_whole
 from multilift_marl.agents.checkpoint import (
     clear_leftovers,
     copy_content,
     load_checkpoint,
     lock_run,
-    make_run_folder,
     making_run,
     save_checkpoint,
     saved_iteration,
@@ -392,5 +391,5 @@ def resume_run(folder: Path, overrides: dict[str, Any]) -> Trainer:
     review(content["config"], path)
     config = build_config(give_way(content["config"], overrides), overrides)
     trainer = Trainer(config, folder, content)
-    (folder / "config.yaml").write_text(dump_config(config), encoding="utf-8")
+    write_whole(folder / "config.yaml", dump_config(config).encode())
     return trainer

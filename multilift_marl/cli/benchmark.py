@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
@@ -23,9 +22,10 @@ from multilift_marl.agents.policy import NamedPolicy, Script, find_policy, load_
 from multilift_marl.cli.evaluate import fly
 from multilift_marl.command import (
     CommandOptions,
+    check_needs,
     join_command,
     limit_torch_threads,
-    make_folder,
+    make_out,
     run_command,
     split_options,
 )
@@ -87,6 +87,7 @@ def _benchmark(values: dict[str, Any], alone: bool) -> int:
     import multilift_marl.evaluation.plots  # noqa: F401 (which needs matplotlib: before any work)
 
     options, given = split_options(Options, values)
+    check_needs(options, {"ray": "workers=<number>"})
     with ending_at_once() if alone else nullcontext():
         suite = load_suite(options.suite)
         policy, brought = _find(options, given)
@@ -94,8 +95,7 @@ def _benchmark(values: dict[str, Any], alone: bool) -> int:
         name = str(options.policy)
         contenders, refused = _check(suite, name, policy, brought)
         label = policy.folder.name if policy.config and name == "latest" else Path(name.rpartition(":")[2]).stem
-        new = Path("runs") / "benchmark" / f"{label}-{suite.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-        out = Path(options.out) if options.out else new
+        out = make_out(options.out, Path("runs") / "benchmark", f"{label}-{suite.name}-")
         head = {
             "benchmark": suite.title,
             "suite": suite.name,
@@ -106,7 +106,6 @@ def _benchmark(values: dict[str, Any], alone: bool) -> int:
             "policy": {"name": name, "sha256": _digest(_source(policy, name)), "brings": brought},
         }
         card = _begin(out / "card.json", head, refused)
-        make_folder(out)
     print(f"{card['benchmark']}, suite {suite.name}: {name}, {episodes} episodes of each task")
     try:
         with interrupted_by_signals(), ExitStack() as stack:

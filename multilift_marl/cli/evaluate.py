@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
@@ -18,15 +17,16 @@ from multilift_marl.agents.policy import NamedPolicy, find_policy, load_policy, 
 from multilift_marl.command import (
     UNTRAINED,
     CommandOptions,
+    check_needs,
     limit_torch_threads,
-    make_folder,
+    make_out,
     run_command,
     spell_command,
     split_options,
     title,
 )
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, list_configs, load_config
+from multilift_marl.config.load import build_config, choose_config, list_configs, load_config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, RenderingError
 from multilift_marl.evaluation.metrics import format_reasons, format_table, make_report, write_report
@@ -47,6 +47,13 @@ formation_redistributed and payload_geometric; hold_velocity, hold_acceleration,
 hold_ctbr, hold_ctbm and hold_rotor with these action interfaces. task=<other> keeps the configuration's vehicles,
 payload, cables and control, see python train.py --help.
 Any configuration key changes the environment: env.num_drones=6, payload.mass=1.7, randomization.payload_force=0."""
+
+
+_NEEDS = {
+    "camera": "video=true", "trail": "video=true", "names": "bag=<folder>", "ros": "bag=<folder>",
+    "ray": "workers=<number>",
+}  # fmt: skip
+"""What keys of the command mean nothing without."""
 
 
 class Options(CommandOptions):
@@ -97,7 +104,7 @@ def _evaluate(values: dict[str, Any], alone: bool) -> int:
     options, overrides = split_options(Options, values)
     with ending_at_once() if alone else nullcontext():
         config, makers, team, options = _build(options, overrides)
-    out = make_folder(Path(options.out) if options.out else team.folder / "eval" / time.strftime("%Y%m%d-%H%M%S"))
+    out = make_out(options.out, team.folder / "eval")
 
     with ExitStack() as files:
         writer = None
@@ -121,12 +128,13 @@ def _evaluate(values: dict[str, Any], alone: bool) -> int:
 
 def _build(options: Options, overrides: dict[str, Any]) -> tuple[Config, dict[str, Any], _Team, Options]:
     """Return environment, makers of all policies by name, the team, and the options with their baseline."""
+    check_needs(options, _NEEDS)
     _check_source(options)
     chosen = options.baseline
     baseline = None if chosen in (None, "none") else find_policy(chosen, "baseline", ["none"])
     team = _find_team(options, overrides)
     limit_torch_threads()
-    config = build_config(team.config.model_dump(), {"env.num_threads": 0} | overrides)
+    config = choose_config(None, team.config, {"env.num_threads": 0} | overrides)
     team.check(config)
     if baseline is not None:
         baseline.check(config, "baseline")

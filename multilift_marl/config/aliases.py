@@ -1,9 +1,14 @@
-"""Keys that have two names: `train.base_policy` is `train.residual`, by which it is stored."""
+"""Values as they are stored: lists for NumPy's arrays; by one name where a key has two.
+
+`train.base_policy` is `train.residual`, by which it is stored.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from multilift_marl.errors import ConfigError
 
@@ -11,20 +16,29 @@ _ALIASES = {"train.base_policy": "train.residual"}
 
 
 def stored_names(values: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Return configuration values, nested, by dotted names or both, with every key by the name that is stored.
+    """Return configuration values, nested, by dotted names or both, by the names that are stored, without arrays.
 
     Call it before `review`, which looks for the stored names.
 
     Raises:
         ConfigError: a key is given by both of its names.
     """
-    renamed = dict(values)
+    renamed = without_arrays(values)
     for alias, key in _ALIASES.items():
         section, name, stored = *alias.split("."), key.rpartition(".")[2]
         if isinstance(nested := renamed.get(section), Mapping):
             renamed[section] = _rename(nested, name, stored, alias, key)
         renamed = _rename(renamed, alias, key, alias, key)
     return renamed
+
+
+def without_arrays(value: Any) -> Any:
+    """Return a value, or nested values, in which NumPy's arrays are lists, and its numbers Python's."""
+    if isinstance(value, Mapping):
+        return {key: without_arrays(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_arrays(each) for each in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def _rename(values: Mapping[Any, Any], name: str, stored: str, alias: str, key: str) -> dict[Any, Any]:

@@ -9,9 +9,9 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from multilift_marl.config.aliases import stored_names
+from multilift_marl.config.aliases import stored_names, without_arrays
 from multilift_marl.config.config import Config
-from multilift_marl.config.precedence import give_way, leaves, without
+from multilift_marl.config.precedence import give_way, is_empty, merge, system_part
 from multilift_marl.errors import ConfigError, UnknownKeywordError, called_elsewhere, nearest, reason, shorten
 from multilift_marl.plugins import describe_unregistered, identify, import_modules, load_entry_points, named, refused
 from multilift_marl.schema.files import as_mapping, change_files, is_yaml
@@ -24,7 +24,6 @@ _MOST_SECTIONS = 5  # of a key's name; what is deeper is unknown anyway
 _PACKAGE = Path(__file__).resolve().parents[1]
 CONFIGS: dict[str, Path | Mapping[str, Any]] = {}
 """Configurations of one's own by name, see `register_config`."""
-_SYSTEM = ("sim", "vehicle", "payload", "cable", "control", "wind")  # what a rig keeps in another task, beside its size
 
 
 def config_dir() -> Path:
@@ -85,8 +84,7 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
     with trusting(trust):
         values = _read(name)
         if (task := overrides.get("task", values.get("task"))) != values.get("task"):
-            system = _system_part(values)
-            values = _merge(give_way(_read_preset(task), system), system)
+            values = _set_task(task, system_part(values))
     return build_config(give_way(values, overrides), overrides, where=str(name))
 
 
@@ -101,7 +99,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    merged, overrides = _merge({}, values), stored_names(overrides or {})
+    merged, overrides = merge({}, without_arrays(values)), stored_names(overrides or {})
     free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
     for dotted, value in overrides.items():
         _note_named(dotted, value)
@@ -112,14 +110,32 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
             node = node.get(part, {})
             if not isinstance(node, Mapping):
                 raise ConfigError(f"{dotted}: '{part}' is a value, not a section")
-        if dotted in free and value == {}:
+        if dotted in free and is_empty(value):
             node.pop(key, None)
         for part in reversed(sections):
             change = {part: change}
-        merged = _merge(merged, change)
+        merged = merge(merged, change)
     if "import" in merged:
         merged["import"] = _import_all(values.get("import"), overrides.get("import"))
     return validate(Config, merged, where=where)
+
+
+def choose_config(name: str | Path | None, own: Config | None, overrides: Mapping[str, Any]) -> Config:
+    """Return what a policy is to fly in: the configuration `name`, its `own` where that is None, or hover.
+
+    With another `task` than its own, it brings its system as `load_config` does, and how it observes.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    if name is not None or own is None:
+        return load_config("hover" if name is None else name, overrides)
+    values = own.model_dump()
+    if (task := overrides.get("task", own.task)) != own.task:
+        import_modules(overrides.get("import"))  # they may bring the task
+        observed = {key: values["env"][key] for key in ("history", "units")}
+        values = _set_task(task, merge(system_part(values), {"env": observed}))
+    return build_config(values, overrides)
 
 
 def resolve_config(
@@ -308,8 +324,8 @@ def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> 
             raise ConfigError(f"{above[-1]} is based on {name}, which is based on it; take one of the two bases out")
         part = _read(folder / name if is_yaml(name) else name, above)
         task = own.get("task", merged.get("task", part.get("task")))
-        merged = _merge(merged, part if part.get("task", task) == task else _system_part(part))
-    return _merge(give_way(merged, own), own)
+        merged = merge(merged, part if part.get("task", task) == task else system_part(part))
+    return merge(give_way(merged, own), own)
 
 
 def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
@@ -332,12 +348,9 @@ def _read_preset(task: Any) -> dict[str, Any]:
     return _read(task) if known else {}
 
 
-def _system_part(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a configuration says of the system, whatever its task."""
-    part = {key: values[key] for key in (*_SYSTEM, "import") if key in values}
-    if isinstance(env := values.get("env"), Mapping) and "num_drones" in env:
-        part["env"] = {"num_drones": env["num_drones"]}
-    return part
+def _set_task(task: Any, system: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the configuration of a task with a system over it."""
+    return merge(give_way(_read_preset(task), system), system)
 
 
 def _locate(values: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -375,24 +388,3 @@ def _note_named(key: str, value: Any) -> None:
         refused.pop(value, None)
     elif key == "train.ray" and isinstance(value, str):
         name_cluster(value)
-
-
-def _is_number(value: Any) -> bool:
-    return not isinstance(value, Mapping) and value is not None
-
-
-def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` with `changes`, section by section; of a reward term a bare number is the weight alone."""
-    merged = dict(base)
-    for key, value in changes.items():
-        if key == "reward" and isinstance(value, Mapping):
-            value = {term: {"weight": own} if _is_number(own) else own for term, own in value.items()}
-        known = merged.get(key)
-        if str(key).startswith("reward.") and isinstance(known, Mapping) and _is_number(value):  # in train.overrides
-            value = {"weight": value}
-        if key == "overrides" and isinstance(known, Mapping) and isinstance(value, Mapping):
-            known = without(known, [name for name, _ in leaves(value)])  # however each of them is written
-        merged[key] = (
-            _merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
-        )
-    return merged

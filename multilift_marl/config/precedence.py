@@ -1,10 +1,11 @@
-"""What is asked for goes before what a recipe changes in training alone (`train.overrides`, `.rigs`, `.stages`)."""
+"""What goes over what: values of a configuration over others, and over what it changes in training alone."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+_SYSTEM = ("sim", "vehicle", "payload", "cable", "control", "wind")  # what a rig keeps in another task, beside its size
 _FREE = ("reward", "task_options")
 """Sections of free names: an empty mapping asks for none of them, where elsewhere it asks for nothing."""
 
@@ -20,7 +21,9 @@ def give_way(values: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, A
     if not isinstance(train, Mapping):
         return dict(values)
     names = [
-        name for name, value in leaves(asked) if name.partition(".")[0] != "train" and (value != {} or name in _FREE)
+        name
+        for name, value in leaves(asked)
+        if name.partition(".")[0] != "train" and (name in _FREE or not is_empty(value))
     ]
     kept = dict(train)
     if isinstance(overrides := kept.get("overrides"), Mapping):
@@ -35,6 +38,11 @@ def give_way(values: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, A
             for stage in stages
         ]
     return {**values, "train": kept}
+
+
+def is_empty(value: Any) -> bool:
+    """Return whether a value is a mapping of nothing."""
+    return isinstance(value, Mapping) and not value
 
 
 def without(overrides: Mapping[str, Any], asked: list[str]) -> dict[str, Any]:
@@ -63,3 +71,30 @@ def leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
             yield f"{name}.weight", value
         else:
             yield name, value
+
+
+def system_part(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a configuration says of the system, whatever its task."""
+    part = {key: values[key] for key in (*_SYSTEM, "import") if key in values}
+    if isinstance(env := values.get("env"), Mapping) and "num_drones" in env:
+        part["env"] = {"num_drones": env["num_drones"]}
+    return part
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, Mapping) and value is not None
+
+
+def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with `changes`, section by section; of a reward term a bare number is the weight alone."""
+    merged = dict(base)
+    for key, value in changes.items():
+        if key == "reward" and isinstance(value, Mapping):
+            value = {term: {"weight": own} if _is_number(own) else own for term, own in value.items()}
+        known = merged.get(key)
+        if str(key).startswith("reward.") and isinstance(known, Mapping) and _is_number(value):  # in train.overrides
+            value = {"weight": value}
+        if key == "overrides" and isinstance(known, Mapping) and isinstance(value, Mapping):
+            known = without(known, [name for name, _ in leaves(value)])  # however each of them is written
+        merged[key] = merge(known if isinstance(known, Mapping) else {}, value) if isinstance(value, Mapping) else value
+    return merged

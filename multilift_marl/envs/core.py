@@ -16,7 +16,7 @@ from multilift_marl.envs.episodes import Episodes
 from multilift_marl.envs.history import History
 from multilift_marl.envs.options import Rows, check_mask, check_seed
 from multilift_marl.envs.pipeline import Pipeline, StageContext, describe_stages, join_pipelines
-from multilift_marl.envs.refusals import check_action, refuse_action, refuse_step
+from multilift_marl.envs.refusals import check_action, ending_all, refuse_action, refuse_step
 from multilift_marl.envs.step_kernels import TAKEN, Outcome, end_step, take_actions
 from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import bind
@@ -143,8 +143,8 @@ class MultiliftVec:
         self.episodes[mask] += 1
         try:
             self._start(mask, fixed)
-        except ValueError:
-            # A reset that is refused skips no episode.
+        except BaseException:
+            # A reset that is refused or interrupted skips no episode.
             (self.seeds[:], self.episodes[:]), self._ended[mask] = before, True
             raise
         return self.current()
@@ -176,10 +176,11 @@ class MultiliftVec:
         # Those that were never reset are left out, so that they are refused below.
         begin = self._ended & (self.episodes >= 0) if restart and self._ended.any() else None
         self._set_action(action, self._ended if begin is None else self._ended & ~begin)
-        if self.commander is not None:
-            self._commands[:] = self.commander.command(self.task.action)
-        for run in self._parts:  # one, unless the task has NumPy functions
-            run()
+        with ending_all(self._ended):
+            if self.commander is not None:
+                self._commands[:] = self.commander.command(self.task.action)
+            for run in self._parts:  # one, unless the task has NumPy functions
+                run()
         # Before the step is counted: one in which the simulation diverged has no reward.
         self.world.check_warnings()
         out_of_time, bad = self._end_step()

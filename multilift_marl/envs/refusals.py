@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 import numpy as np
@@ -10,6 +11,16 @@ import numpy as np
 from multilift_marl.envs.step_kernels import ENDED, Outcome
 from multilift_marl.errors import ConfigError
 from multilift_marl.mdp.failures import FIRST_OWN
+
+
+@contextmanager
+def ending_all(ended: np.ndarray) -> Iterator[None]:
+    """Mark all environments (E,) as ended where a step is interrupted, by Ctrl-C say: they are between two states."""
+    try:
+        yield
+    except BaseException:
+        ended[:] = True
+        raise
 
 
 def check_action(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -15,6 +15,7 @@ from multilift_marl.config.config import Config
 from multilift_marl.config.load import resolve_config
 from multilift_marl.envs.core import TRAINING, MultiliftVec
 from multilift_marl.envs.wrapper_utils import check_open, seed_afresh
+from multilift_marl.errors import UnknownKeywordError, nearest
 
 _CPU = torch.device("cpu")
 
@@ -72,18 +73,24 @@ class MultiliftEnv(EnvBase):
         self._resumed = False
         self._terminated = torch.zeros(e, 1, dtype=torch.bool)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, seed: int | None = None,
+        options: dict[str, Any] | None = None, **others: Any,
+    ) -> TensorDict:  # fmt: skip
+        """Start episodes; `seed` and `options` as the core's `reset` takes them."""
         check_open(self.is_closed)
+        for name in others:
+            raise UnknownKeywordError(f"reset takes no '{name}'{nearest(name, ('seed', 'options'))}")
         mask = tensordict.get("_reset", None) if tensordict is not None else None
-        if mask is None and self._resumed:
+        if mask is None and self._resumed and seed is None and options is None:
             self._resumed = False  # the restored episodes go on
             observation, info = self.vec.current()
         else:
             if mask is None and self._memory is not None:
                 self._memory = torch.zeros_like(self._memory)
-            seed, self._seed, self._resumed = self._seed, None, False
+            seed, self._seed, self._resumed = self._seed if seed is None else seed, None, False
             seed_afresh(self.vec)
-            observation, info = self.vec.reset(seed, None if mask is None else mask.reshape(-1).numpy())
+            observation, info = self.vec.reset(seed, None if mask is None else mask.reshape(-1).numpy(), options)
         ended = torch.from_numpy(self.vec.ended).unsqueeze(-1)  # of environments that this reset leaves alone
         flags = [torch.from_numpy(info[key]).unsqueeze(-1) for key in ("success", "failure", "diverged")]
         package = self._package(observation, [ended & self._terminated, ended & ~self._terminated, *flags])

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from multilift_marl._files import write_whole
 from multilift_marl.config.config import Config
 from multilift_marl.evaluation.shortfalls import explain, format_explanation, is_shortfall
 from multilift_marl.mdp.failures import CAUSES
@@ -214,8 +215,17 @@ def make_report(
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
-    """Write what `make_report` returned to `path`, metrics.json by custom."""
-    path.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    """Write what `make_report` returned to `path`, metrics.json by custom; null for what is not finite."""
+    write_whole(path, f"{json.dumps(_finite(report), indent=2, allow_nan=False)}\n".encode())
+
+
+def _finite(value: Any) -> Any:
+    """Return a report with None for numbers that are not finite: one drone has no distance from others."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def format_table(report: dict[str, Any], name: str = "policy") -> str:

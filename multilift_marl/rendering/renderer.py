@@ -8,12 +8,14 @@ import os
 import sys
 import weakref
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from multilift_marl._files import name_aside
 from multilift_marl.errors import RenderingError, pip_install
 from multilift_marl.rendering.cameras import Environments
 from multilift_marl.rendering.scene import Stage
@@ -116,7 +118,9 @@ def free_contexts(gl: Any, context: mujoco.MjrContext) -> None:
 
 
 class VideoWriter:
-    """Writes an mp4 (H.264, yuv420p) that browsers and slides play, frame by frame.
+    """Writes an mp4 (H.264, yuv420p) that browsers and slides play, frame by frame; a context.
+
+    The file is there when it is whole: written aside, renamed by `close`, deleted where its context ends by an error.
 
     Args:
         path: of the file; its folder is made.
@@ -132,8 +136,10 @@ class VideoWriter:
             import imageio.v3 as iio
         except ImportError as error:
             raise RenderingError(f"writing {path} needs {error.name}: {pip_install('train')}") from error
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        self._file = iio.imopen(path, "w", plugin="pyav")
+        self._path = Path(path)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._aside = name_aside(self._path, f".tmp{self._path.suffix}")
+        self._file = iio.imopen(self._aside, "w", plugin="pyav")
         self._file.init_video_stream("libx264", fps=float(fps), pixel_format="yuv420p")
 
     def append(self, frame: np.ndarray) -> None:
@@ -142,13 +148,23 @@ class VideoWriter:
 
     def close(self) -> None:
         """Finish the file."""
-        self._file.close()
+        try:
+            self._file.close()
+            if self._aside.exists():  # not yet renamed
+                self._aside.replace(self._path)
+        finally:
+            self._aside.unlink(missing_ok=True)
 
     def __enter__(self) -> VideoWriter:
         return self
 
-    def __exit__(self, *_: Any) -> None:
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
+        if kind is None:
+            self.close()
+            return
+        with suppress(Exception):  # the error that has come is the one to hear of
+            self._file.close()
+        self._aside.unlink(missing_ok=True)
 
 
 def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +38,7 @@ from multilift_marl.sim.saved import check_saved, fingerprint
 from multilift_marl.sim.scene import build_model
 from multilift_marl.sim.state import Air, EpisodeStats, HiddenLoads, SimData, SystemState, hover_drone
 from multilift_marl.sim.state_io import Rows, find_warnings, make_rows
+from multilift_marl.sim.threads import Threads
 
 _log = logging.getLogger("multilift_marl.mujoco")
 REST_HEIGHT = 1.5  # [m] of the payload after World.reset
@@ -135,7 +134,7 @@ class World:
         self.nodes: Nodes | None = self.cables.nodes
         self._data = SimData(self.state, self.stats, self.diverged)
         self.shards = self._make_shards(num_threads or cpu_count())
-        self._pool: tuple[int, ThreadPoolExecutor] | None = None  # with its process
+        self._threads = Threads()
         self.reset()
 
     def reset(self, mask: np.ndarray | None = None) -> SystemState:
@@ -211,19 +210,8 @@ class World:
                 self._sync_broken(shard)
 
     def run(self, work: Callable[[Shard], None]) -> None:
-        """Call `work` for every shard, each on a thread of its own."""
-        if len(self.shards) == 1:
-            return work(self.shards[0])
-        # The main thread takes the first shard itself: one thread fewer, and none at all for one shard.
-        if self._pool is None or self._pool[0] != os.getpid():  # threads do not survive a fork
-            self._pool = os.getpid(), ThreadPoolExecutor(len(self.shards) - 1, thread_name_prefix="multilift")
-        others = [self._pool[1].submit(work, shard) for shard in self.shards[1:]]
-        try:
-            work(self.shards[0])
-        finally:
-            # Also where the first shard has failed: no shard may still run when the caller goes on.
-            for other in others:
-                other.result()
+        """Call `work` for every shard, each on a thread of its own; see `Threads.run`."""
+        self._threads.run(work, self.shards)
 
     def set_parameters(self, mask: np.ndarray, **values: np.ndarray) -> None:
         """Give the environments in `mask` (E,) their own true parameters.

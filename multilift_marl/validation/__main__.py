@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from multilift_marl._files import write_whole
 from multilift_marl._interrupt import end_quiet_import
 from multilift_marl.command import make_folder
-from multilift_marl.errors import ConfigError, nearest, pip_install
+from multilift_marl.errors import ConfigError, nearest, pip_install, reason
 from multilift_marl.validation import air, bodies, cables, conservation, flight, symmetry
 from multilift_marl.validation.document import write_document
 from multilift_marl.validation.experiment import Experiment, Result
@@ -81,27 +82,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 results[name] = EXPERIMENTS[name](given.fast)
         except KeyboardInterrupt:
             interrupted = True
-    rows = write(results, given.out)
-    print(format_table(rows))
+    rows = [row.as_dict() for result in results.values() for row in result.rows]
     failed = sum(not row["pass"] for row in rows)
-    print(f"\n{len(rows) - failed} of {len(rows)} passed; wrote {given.out / 'validation.json'} and plots")
+    # Printed before they are written, which may fail.
+    print(f"{format_table(rows)}\n\n{len(rows) - failed} of {len(rows)} passed", flush=True)
+    try:
+        print(f"wrote {write(results, rows, given.out)} and plots")
+        if given.document is not None and not interrupted:
+            write_document(given.document, results, given.out)
+    except OSError as error:
+        place = error.filename or given.out
+        print(f"error: cannot write {place} ({reason(error)}); make room, or use another folder", file=sys.stderr)
+        return 2
     if interrupted:
         print(f"interrupted: {len(results)} experiments were complete", file=sys.stderr)
         return 130
-    if given.document is not None:
-        write_document(given.document, results, given.out)
     return 1 if failed else 0
 
 
-def write(results: dict[str, Result], out: Path) -> list[dict[str, Any]]:
-    """Write validation.json and the plots into a folder, and return the rows."""
-    rows = [row.as_dict() for result in results.values() for row in result.rows]
+def write(results: dict[str, Result], rows: list[dict[str, Any]], out: Path) -> Path:
+    """Write rows and plots into a folder; return the file of the rows.
+
+    That is validation.json, unless these are of some experiments only and there is one already.
+    """
+    path = out / "validation.json"
+    if results.keys() != EXPERIMENTS.keys() and path.exists():
+        path = out / "validation_partial.json"
     text = json.dumps(rows, indent=1, ensure_ascii=False, allow_nan=False)
-    (out / "validation.json").write_text(text + "\n", encoding="utf-8")
+    write_whole(path, f"{text}\n".encode())
     for result in results.values():
         for plot in result.plots:
             plot.save(out)
-    return rows
+    return path
 
 
 def format_table(rows: list[dict[str, Any]]) -> str:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from multilift_marl._files import write_whole
 from multilift_marl.validation.experiment import Result
 
 MARKER = "<!-- results -->\n"
@@ -207,7 +209,7 @@ def write_document(path: Path, results: dict[str, Result], out: Path) -> None:
     rows = _record(data / f"{path.stem}.csv", COLUMNS, rows, results)
     plots = _record(data / f"{path.stem}_plots.csv", PLOT_COLUMNS, plots, results)
     head = path.read_text(encoding="utf-8").partition(MARKER)[0]
-    path.write_text(head + MARKER + "\n" + format_summary(rows, plots, path.stem), encoding="utf-8")
+    write_whole(path, f"{head}{MARKER}\n{format_summary(rows, plots, path.stem)}".encode())
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -225,10 +227,11 @@ def _record(
     order = list(SUMMARIES)
     kept = [row for row in read_csv(path) if row["only"] not in results]
     every = sorted(kept + rows, key=lambda row: order.index(row["only"]))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(every)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(every)
+    write_whole(path, text.getvalue().encode())
     return every
 
 

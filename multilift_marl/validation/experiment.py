@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from multilift_marl._files import write_whole
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import load_config
 
@@ -103,9 +104,10 @@ class Plot:
             if axes is self.panels[0] or set(labels) - set(self.panels[0].get_legend_handles_labels()[1]):
                 beside: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)} if len(labels) > 3 else {}
                 axes.legend(frameon=False, fontsize=9, **beside)
-        raw = io.BytesIO()
+        raw, small = io.BytesIO(), io.BytesIO()
         self.figure.savefig(raw, dpi=_DOTS_PER_INCH, format="png")
-        Image.open(raw).convert("RGB").quantize(_PALETTE).save(folder / f"{self.name}.png", optimize=True)
+        Image.open(raw).convert("RGB").quantize(_PALETTE).save(small, format="png", optimize=True)
+        write_whole(folder / f"{self.name}.png", small.getvalue(), flush=False)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from multilift_marl._interrupt import Watch, ending_at_once, leave
 from multilift_marl.agents.policy import NamedPolicy, find_policy, load_policy
-from multilift_marl.command import run_command, split_options
+from multilift_marl.command import check_needs, run_command, split_options
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.deploy.sitl.view import ViewOptions
@@ -75,6 +75,7 @@ def make_session(values: dict[str, Any]) -> tuple[Session | LiveSession | DraftS
         FlightError: a flight cannot be heard, as DDS does not start.
     """
     options, overrides = split_options(Options, values)
+    check_needs(options, dict.fromkeys(("allow_network", "domain", "names", "ros"), "live=true"))
     learned: dict[str, NamedPolicy] = {}
     if options.run is not None:
         learned["run"] = load_policy(options.run)

@@ -1,5 +1,6 @@
 """Exported policies: the policy's actions for any team, a contract that the simulation keeps, clear errors."""
 
+import hashlib
 import json
 import os
 import subprocess
@@ -125,6 +126,7 @@ def test_files_say_nothing_of_the_machine_they_were_made_on(tmp_path):
     contract = export_policy(policy(), tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.json", "policy.onnx"]
     assert json.loads((tmp_path / "policy.json").read_text()) == json.loads(json.dumps(contract))
+    assert contract["network"]["sha256"] == hashlib.sha256((tmp_path / "policy.onnx").read_bytes()).hexdigest()
     for path in tmp_path.iterdir():
         for word in ("networks.py", str(ROOT), str(Path.home()) + os.sep):
             assert word.encode() not in path.read_bytes(), path.name

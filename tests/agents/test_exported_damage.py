@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import multilift_marl as ml
+from multilift_marl._files import write_together
 from multilift_marl.agents.contract import CONTRACT_FORMAT
 from multilift_marl.agents.policy import ExportedPolicy
 from multilift_marl.cli.evaluate import main as evaluate
@@ -174,6 +177,34 @@ def test_a_network_that_is_wrong_is_one_sentence(case, tmp_path):
     with pytest.raises(CheckpointError, match=words) as error:
         ml.load_policy(write(tmp_path, model))
     assert "\n" not in str(error.value) and str(error.value).startswith(str(tmp_path))
+
+
+def test_a_network_of_another_export_than_its_contract_is_refused(tmp_path):
+    digest = hashlib.sha256(network()).hexdigest()
+    described = contract(**{"network.sha256": digest})
+    assert ExportedPolicy(write(tmp_path, network(), described)).config.task == "hover"
+    path = write(tmp_path, network(weight=2 * WEIGHT), described)
+    with pytest.raises(CheckpointError) as caught:
+        ml.load_policy(path)
+    message = f"{path} and policy.json beside it are of different exports; export the policy again"
+    assert str(caught.value).startswith(message)
+
+
+def test_files_that_belong_together_are_renamed_when_all_are_written(tmp_path, monkeypatch):
+    network_file, contract_file = tmp_path / "policy.onnx", tmp_path / "policy.json"
+    write_together({network_file: b"old", contract_file: b"old"})
+    fsync, calls = os.fsync, []
+
+    def fail(file):
+        calls.append(file)
+        if len(calls) == 2:
+            raise OSError("no space left")
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="no space left"):
+        write_together({network_file: b"new", contract_file: b"new"})
+    assert network_file.read_bytes() == contract_file.read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_network_that_fails_in_flight_is_one_sentence(tmp_path, capsys):

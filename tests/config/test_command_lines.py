@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import os
 import random
+from pathlib import Path
 
 import pytest
 
+from multilift_marl import command
 from multilift_marl.agents import export as exporting
 from multilift_marl.agents import trainer
-from multilift_marl.cli import evaluate, export, train
+from multilift_marl.cli import benchmark, evaluate, export, train
 from multilift_marl.config.config import Config
+from multilift_marl.deploy.px4 import __main__ as px4
 from multilift_marl.errors import ConfigError
 from multilift_marl.viewer import __main__ as view
 
@@ -90,3 +93,45 @@ def test_any_command_line_is_answered_in_one_sentence(name, nothing_flies, capsy
         assert sum(each.startswith("error: ") for each in told) == 1, (line, told)
         accepted += [line] if ACCEPTED in told[-1] else []
     assert accepted[0] == [sane]
+
+
+@pytest.mark.parametrize(
+    ("main", "line", "key", "need"),
+    [
+        (evaluate.main, ["policy=formation", "camera=top"], "camera", "video=true"),
+        (evaluate.main, ["policy=formation", "trail=1"], "trail", "video=true"),
+        (evaluate.main, ["policy=formation", "names=report"], "names", "bag=<folder>"),
+        (evaluate.main, ["policy=formation", "ros=humble"], "ros", "bag=<folder>"),
+        (evaluate.main, ["policy=formation", "ray=auto"], "ray", "workers=<number>"),
+        (benchmark.main, ["policy=formation", "ray=auto"], "ray", "workers=<number>"),
+        (px4.main, ["domain=7"], "domain", "live=true"),
+        (px4.main, ["sync=false"], "sync", "live=true"),
+        (px4.main, ["allow_network=true"], "allow_network", "live=true"),
+        (px4.main, ["live=true", "patience=0.2"], "patience", "policy=none"),
+        (px4.main, ["names=report"], "names", "live=true or bag=<folder>"),
+        (view.main, ["domain=7"], "domain", "live=true"),
+        (view.main, ["names=report"], "names", "live=true"),
+        (view.main, ["ros=humble"], "ros", "live=true"),
+        (view.main, ["allow_network=true"], "allow_network", "live=true"),
+    ],
+)
+def test_keys_that_mean_nothing_are_refused(main, line, key, need, nothing_flies, capsys):
+    assert main(line) == 2
+    words = f"error: {key} means nothing without {need}; leave {key} out, or add that\n"
+    assert capsys.readouterr().err.endswith(words)
+
+
+def test_processes_of_one_second_have_folders_of_their_own(monkeypatch, tmp_path):
+    monkeypatch.setattr(command.time, "strftime", lambda form: "20261201-120000")
+    found = [command.make_out(None, tmp_path / "eval", "hover-") for _ in range(3)]
+    assert [folder.name for folder in found] == [f"hover-20261201-120000{end}" for end in ("", "-2", "-3")]
+    assert all(folder.is_dir() for folder in found)
+    assert command.make_out(str(tmp_path / "own"), tmp_path) == command.make_out(str(tmp_path / "own"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "file", ["cli/evaluate.py", "cli/benchmark.py", "deploy/px4/__main__.py", "deploy/sitl/pipeline.py"]
+)
+def test_commands_name_no_folder_by_the_time_themselves(file):
+    text = (Path(command.__file__).parent / file).read_text()
+    assert "make_out(" in text and "strftime" not in text

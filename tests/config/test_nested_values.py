@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from conftest import refusal
 
-from multilift_marl.config.load import load_config
+import multilift_marl as ml
+from multilift_marl.config.load import build_config, dump_config, load_config
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.values import Float, Section
 
@@ -60,3 +62,39 @@ def test_a_wrong_number_of_a_gap_is_quoted(gap, wrong):
 )
 def test_an_option_without_a_default_is_asked_for(values, place):
     assert refusal(validate, Options, values, "task_options") == f"task_options.{place} is missing; give it a value"
+
+
+SQUARE = [[0.2, 0.2, 0.0], [-0.2, 0.2, 0.0], [-0.2, -0.2, 0.0], [0.2, -0.2, 0.0]]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"payload.anchors": SQUARE},
+        {"payload": {"anchors": SQUARE}},
+        {"train.overrides": {"payload.anchors": SQUARE}},
+        {"train.rigs": [{"payload": {"anchors": SQUARE}}]},
+        {"task_options": {"start_tilt": 10.0}},
+        {"env.num_drones": 4, "payload.mass": 1.25},
+    ],
+)
+def test_arrays_are_taken_as_lists_are(values):
+    def as_arrays(part):
+        if isinstance(part, dict):
+            return {key: as_arrays(each) for key, each in part.items()}
+        if isinstance(part, list) and isinstance(part[0], dict):
+            return [as_arrays(each) for each in part]
+        return np.array(part) if isinstance(part, list) else np.array([part])[0]
+
+    arrays, config = as_arrays(values), load_config("hover", values)
+    for found in (load_config("hover", arrays), build_config(config.model_dump(), arrays)):
+        assert found == config and dump_config(found) == dump_config(config)
+    if "train.overrides" not in values and "train.rigs" not in values:
+        assert ml.make_vec("hover", num_envs=1, **arrays).config.payload == config.payload
+
+
+def test_a_list_that_holds_an_array_and_values_that_hold_one_are_taken():
+    rows = [np.array(row) for row in SQUARE]
+    assert load_config("hover", {"payload.anchors": rows}) == load_config("hover", {"payload.anchors": SQUARE})
+    assert build_config({"payload": {"anchors": np.array(SQUARE)}}) == build_config({"payload": {"anchors": SQUARE}})
+    assert "payload.anchors" in refusal(load_config, "hover", {"payload.anchors": np.zeros((4, 2))})

@@ -3,10 +3,13 @@
 import json
 
 import pytest
-from conftest import refusal
+from conftest import EXAMPLES, refusal
 
+from multilift_marl.agents.policy import load_policy
+from multilift_marl.cli.evaluate import Options, _build
 from multilift_marl.cli.evaluate import main as evaluate
-from multilift_marl.config.load import load_config
+from multilift_marl.command import split_options
+from multilift_marl.config.load import build_config, choose_config, load_config
 
 RECIPES = [("rigs/falcon3", "pose", "pose_falcon3"), ("rigs/crazyflie2", "recover", "recover_crazymarl")]
 
@@ -61,3 +64,18 @@ def test_bases_that_cannot_be_are_refused(tmp_path, content, complaint):
     (tmp_path / "own.yaml").write_text(content)
     (tmp_path / "third.yaml").write_text("base: own.yaml\n")
     assert complaint in refusal(load_config, tmp_path / "own.yaml")
+
+
+@pytest.mark.parametrize("policy", ["hover", "hover_ctbr"])
+def test_a_trained_policy_brings_its_system_into_another_task(registries, policy):
+    own = load_policy(policy).config
+    values = {"import": str(EXAMPLES / "new_task.py"), "task": "lift", "env.num_threads": 0}
+    flown, recipe = choose_config(None, own, values), load_config(policy, values)
+    for section in ("env", "randomization", "task_options", "reward", "train", "payload", "cable", "control"):
+        assert getattr(flown, section) == getattr(recipe, section), section
+    assert flown.task_options["start_radius"] == 0.1 and flown.env.episode_seconds == 6.0
+    evaluated = _build(*split_options(Options, {"run": policy, "baseline": "none", **values}))[0]
+    assert evaluated == flown
+    assert choose_config(None, own, {"task": own.task}) == own
+    longer = build_config(own.model_dump(), {"env.history": 3, "env.policy_hz": 25})
+    assert choose_config(None, longer, {"task": "track"}).env.history == 3  # what its network takes

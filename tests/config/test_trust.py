@@ -18,6 +18,7 @@ from multilift_marl.cli.train import main as train
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.deploy.ros.__main__ import main as ros
 from multilift_marl.errors import CheckpointError, ConfigError
+from multilift_marl.trust import review
 from multilift_marl.viewer.__main__ import make_session
 
 SHIPPED = Path(plugins.__file__).parent / "policies" / "hover.pt"
@@ -315,3 +316,39 @@ def test_the_policy_of_a_stranger_runs_nothing_in_a_process_of_its_own(stranger)
     )
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "which was not run" in done.stderr
     assert not (stranger / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    "key, make_value",
+    [
+        ("import", lambda code: {code}),
+        ("import", lambda code: [code.encode()]),
+        ("import", lambda code: code.encode()),
+        ("train.residual", lambda code: f"{code}:Zero".encode()),
+        ("train.ray", lambda code: b"10.1.2.3:6379"),
+        ("train.overrides", lambda code: {b"import": code}),
+        ("train.rigs", lambda code: [{"import": {code}}]),
+        ("train.dagger.teacher", lambda code: f"{code}:Zero".encode()),
+    ],
+)
+def test_what_no_configuration_holds_is_refused_before_anything_runs(stranger, key, make_value):
+    policy = save_policy(stranger, {key: make_value(str(stranger / "helper.py"))})
+    with pytest.raises(CheckpointError) as caught:
+        config = ml.load_policy(policy).config
+        build_config(config.model_dump(), {"env.num_envs": 1})  # as commands do
+    assert str(caught.value).startswith(f"{policy} holds no policy (config.{key}")
+    assert not (stranger / "ran").exists()
+
+
+def test_review_refuses_what_it_does_not_know():
+    endless: dict = {}
+    endless["reward"] = endless
+    for values, words in (
+        ({"import": {"a.py"}}, "config.import is of type set"),
+        ({"train": {"ray": b"host:1"}}, "config.train.ray is of type bytes"),
+        ({"train": {b"ray": "host:1"}}, "config.train has the key b'ray', which is no text"),
+        ({"import": [type("Text", (str,), {})("a.py")]}, "config.import.0 is of type Text"),
+        (endless, "config is nested more than 30 deep"),
+    ):
+        assert words in refusal(review, values, "a.pt")
+    review({"payload": {"mass": 1.0, "shape": None, "anchors": ((0, 1),)}, "sim": {"contact": True}}, "a.pt")

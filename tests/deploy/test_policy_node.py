@@ -24,6 +24,7 @@ pytest.importorskip("cyclonedds")
 from ros_wire import Wire
 
 from multilift_marl.deploy.ros import __main__ as command
+from multilift_marl.deploy.ros import policy_node
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.live import LiveFlight
 from multilift_marl.deploy.ros.messages import NAMES, ODOMETRY, POSE, Topic, pose_stamped, setpoint_topics
@@ -244,3 +245,21 @@ def test_two_processes_fly_a_team_in_real_time(names):
     assert "flying: all is heard" in output and "set-points followed odometry by" in output
     errors = [np.linalg.norm(read_pose(m.pose.pose)[0] - read_pose(targets[-1].pose)[0]) for m in heard[-50:]]
     assert np.mean(errors) < 0.05, output + simulation.stdout.read()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_whatever_asks_the_command_to_end_the_team_lands(monkeypatch, capsys, number):
+    landed = []
+
+    def spin_once(node, seconds):
+        if not landed:
+            signal.raise_signal(number)
+
+    def land(node, why):
+        landed.append(why)
+        node.mode = policy_node.READY  # as if on the ground
+
+    monkeypatch.setattr(PolicyNode, "spin_once", spin_once)
+    monkeypatch.setattr(PolicyNode, "land", land)
+    assert command.main(["role=policy", "policy=formation", "env.num_drones=2", f"domain={DOMAIN}", "seconds=60"]) == 0
+    assert landed == ["interrupted; once more ends this at once"] and "flew 0 steps" in capsys.readouterr().out

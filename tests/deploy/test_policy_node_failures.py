@@ -315,6 +315,43 @@ def test_a_policy_that_fails_ends_in_landing(monkeypatch):
     assert bench.node.mode == LANDING and "the policy has failed (ValueError: action of drone_0" in bench.said[-1]
 
 
+def fail(*_, **__):
+    raise ZeroDivisionError("of the task's own")
+
+
+@pytest.mark.parametrize("part", ["observe", "advance"])
+def test_a_task_whose_own_functions_fail_ends_in_landing(monkeypatch, part):
+    bench = Bench(monkeypatch, names="report" if part == "advance" else "multilift")
+    bench.fly()
+    monkeypatch.setattr(bench.node.team, part, fail)
+    bench.pass_by()
+    assert bench.node.mode == LANDING
+    assert bench.said[-1] == "landing: the task has failed (ZeroDivisionError: of the task's own)"
+    bench.pass_by()
+
+
+def test_a_task_that_fails_when_it_begins_anew_ends_in_landing(monkeypatch):
+    bench = Bench(monkeypatch)
+    bench.fly()
+    held = bench.places()
+    monkeypatch.setattr(bench.node.team, "begin", fail)
+    bench.vec.world.state.drone_position[0] += 3.0
+    bench.vec.world.state.payload_position[0] += 3.0
+    for _ in range(60):
+        bench.pass_by()
+    assert "landing: the task has failed (ZeroDivisionError: of the task's own)" in bench.said
+    assert (bench.places()[:, 2] < held[:, 2]).all()
+
+
+def test_what_fails_before_the_flight_is_a_reason_to_wait(monkeypatch):
+    bench = Bench(monkeypatch)
+    monkeypatch.setattr(bench.node.team, "begin", fail)
+    for _ in range(150):
+        bench.pass_by()
+    assert bench.node.mode == WAITING
+    assert bench.said[-1] == "waiting: the task has failed (ZeroDivisionError: of the task's own)"
+
+
 def test_it_begins_and_ends_when_it_is_told(monkeypatch):
     bench = Bench(monkeypatch, start="topic")
     for _ in range(50):

@@ -187,9 +187,11 @@ def test_others_fly_autopilots_by_topics_that_they_hear_live():
 
 
 @pytest.mark.slow
-def test_the_command_reports_a_flight_that_ends_on_its_way_back(tmp_path, monkeypatch, capsys):
-    """With a phase that has no step."""
-    config = config_of("hover", **{"randomization.payload_force": 0.0, "env.episode_seconds": 1.0})
+@pytest.mark.parametrize("drones, mass", [(2, 0.7), (1, 0.2)])
+def test_the_command_reports_a_flight_that_ends_on_its_way_back(drones, mass, tmp_path, monkeypatch, capsys):
+    """With a phase that has no step; of one drone, no other is at any distance."""
+    rig = {"env.num_drones": drones, "payload.mass": mass}
+    config = config_of("hover", **rig, **{"randomization.payload_force": 0.0, "env.episode_seconds": 1.0})
     fakes = make_fakes(config.system)
     go, settings = Flight._go, Settings(first=FIRST, timeout=20.0, suite=EXACT)
 
@@ -212,7 +214,8 @@ def test_the_command_reports_a_flight_that_ends_on_its_way_back(tmp_path, monkey
     assert "the flight ended early: PX4 7 has ended" in printed.err
     assert [phase["name"] for phase in report["px4"]["phases"]] == ["take-off", "the way to the task", "hover"]
     assert "steps_without_setpoint" not in report["px4"] and report["baselines"]
-    assert (tmp_path / "errors.png").is_file()
+    assert all((phase["separation"] is None) == (drones == 1) for phase in report["px4"]["phases"])
+    assert "inf" not in printed.out and (tmp_path / "errors.png").is_file()
 
 
 @pytest.mark.slow

@@ -154,6 +154,18 @@ def test_a_bag_is_never_overwritten(tmp_path):
         BagWriter(tmp_path / "bag", vec)
 
 
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_a_bag_that_is_not_finished_is_none(tmp_path, error):
+    vec = ml.make_vec("hover", num_envs=1, num_threads=1)
+    with pytest.raises(error), BagWriter(tmp_path / "bag", vec):
+        raise error
+    assert not list(tmp_path.iterdir())
+    with BagWriter(tmp_path / "bag", vec):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["bag"]
+    assert sorted(path.name for path in (tmp_path / "bag").iterdir()) == ["bag.mcap", "metadata.yaml"]
+
+
 def test_the_command_writes_one(tmp_path, capsys):
     arguments = ["policy=formation", "config=hover", "episodes=1", "baseline=none", "env.episode_seconds=0.5"]
     assert evaluate.main([*arguments, f"out={tmp_path / 'out'}", f"bag={tmp_path / 'bag'}", "ros=humble"]) == 0

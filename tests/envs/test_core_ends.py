@@ -75,6 +75,49 @@ def test_an_ended_environment_cannot_be_stepped(task, cables):
     vec.step(zeros(vec))
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
+def test_environments_whose_step_was_interrupted_must_be_reset(monkeypatch, error):
+    vec, twin = make("hover", num_envs=2), make("hover", num_envs=2)
+
+    def interrupt():
+        raise error
+
+    for each in (vec, twin):
+        each.reset(seed=3)
+        each.step(zeros(each))
+    with monkeypatch.context() as patch:
+        patch.setattr(vec, "_parts", [*vec._parts, interrupt])
+        with pytest.raises(error):
+            vec.step(zeros(vec))
+    with pytest.raises(RuntimeError, match="environment 0 has ended"):
+        vec.step(zeros(vec))
+    np.testing.assert_array_equal(vec.reset()[0], twin.reset()[0])  # the next episodes
+
+
+def test_environments_whose_reset_was_interrupted_must_be_reset_again(monkeypatch):
+    vec, twin = make("hover", num_envs=2), make("hover", num_envs=2)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    vec.reset(seed=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(vec, "_start", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            vec.reset(seed=3)
+    with pytest.raises(RuntimeError, match="environment 0 has ended"):
+        vec.step(zeros(vec))
+    np.testing.assert_array_equal(vec.reset(seed=3)[0], twin.reset(seed=3)[0])
+
+
+def test_a_refused_action_ends_nothing():
+    vec = make("hover", num_envs=2)
+    vec.reset()
+    with pytest.raises(ValueError, match="not finite"):
+        vec.step(np.full_like(zeros(vec), np.nan))
+    vec.step(zeros(vec))
+
+
 # Divergence
 
 

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 import multilift_marl as ml
+from multilift_marl.envs.core import MultiliftVec
 
 
 def test_specs_hold(task, num_drones, cables):
@@ -108,3 +110,19 @@ def test_restored_environment_goes_on_bit_for_bit():
         (one, carried), (two, again) = env.step_and_maybe_reset(carried), other.step_and_maybe_reset(again)
         assert torch.equal(one["next", "agents", "observation"], two["next", "agents", "observation"])
         assert torch.equal(one["next", "agents", "reward"], two["next", "agents", "reward"])
+
+
+def test_reset_takes_the_cores_seed_and_options_and_nothing_else():
+    config = ml.load_config("hover", {"env.num_envs": 2})
+    env, vec = ml.torchrl_env(config), MultiliftVec(config)
+    options = {"randomization": {"payload_mass": 0.9}}
+    expected = vec.reset(7, options=options)[0]
+    np.testing.assert_array_equal(env.reset(seed=7, options=options)["agents", "observation"], expected)
+    mask = np.array([True, False])
+    expected = vec.reset(8, mask)[0]
+    partly = env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]), seed=8)
+    np.testing.assert_array_equal(partly["agents", "observation"][0], expected[0])
+    with pytest.raises(TypeError, match="reset takes no 'sed'; did you mean 'seed'"):
+        env.reset(sed=7)
+    with pytest.raises(ValueError, match="seed must be a whole number"):
+        env.reset(seed=-1)

@@ -13,7 +13,7 @@ from conftest import make, make_system, same, slow
 
 import multilift_marl as ml
 from multilift_marl.errors import RenderingError, pip_install
-from multilift_marl.rendering import CAMERAS, Renderer, renderer, write_video
+from multilift_marl.rendering import CAMERAS, Renderer, VideoWriter, renderer, write_video
 from multilift_marl.sim.scene import build_model
 
 needs_gl = pytest.mark.skipif(
@@ -240,6 +240,27 @@ def test_a_video_that_cannot_be_written_says_why(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(RenderingError, match=re.escape(f"needs av: {pip_install('train')}")):
         write_video(tmp_path / "none.mp4", [np.zeros((2, 2, 3), np.uint8)], 25)
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_a_video_that_is_not_finished_leaves_what_was_there(tmp_path, error):
+    pytest.importorskip("av")
+    path, frame = tmp_path / "episode_0.mp4", np.zeros((90, 160, 3), np.uint8)
+    path.write_bytes(b"an older one, whole")
+
+    def frames():
+        yield from [frame] * 3
+        assert path.read_bytes() == b"an older one, whole"
+        raise error
+
+    with pytest.raises(error):
+        write_video(path, frames(), 25)
+    assert path.read_bytes() == b"an older one, whole" and list(tmp_path.iterdir()) == [path]
+    video = VideoWriter(path, 25)
+    video.append(frame)
+    video.close()
+    video.close()
+    assert path.stat().st_size > 100 and list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("num_drones, steps", [(1, 1), (8, 50)])

@@ -7,7 +7,7 @@ import pytest
 from conftest import make, same
 
 from multilift_marl.config.load import load_config
-from multilift_marl.deploy.ros.policy_node import check_flyable
+from multilift_marl.deploy.ros.checks import check_flyable
 from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError
 from multilift_marl.policies.baselines import fitting_scripts, make_scripted

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import copy
 import logging
+import signal
+import sys
+import threading
+import time
 from pathlib import Path
 
 import mujoco
@@ -47,6 +51,40 @@ def test_the_number_of_threads_changes_no_bit(num_drones, num_threads):
     for world in (one, many):
         disturb(world)
     assert same(fly(one), fly(many))
+
+
+class Slow:
+    """Work of shards: some fail at once, the others take a while."""
+
+    def __init__(self, world: World, failing: int, error: type[BaseException] = ZeroDivisionError):
+        self.world, self.failing, self.error, self.done = world, failing, error, []
+
+    def __call__(self, shard) -> None:
+        number = self.world.shards.index(shard)
+        if number == self.failing:
+            raise self.error
+        time.sleep(0.2 * number)
+        self.done.append(number)
+
+
+@pytest.mark.parametrize("failing", [0, 1])
+def test_no_thread_runs_on_when_one_has_failed(failing):
+    world = World(make_system(2), 4, 4)
+    work = Slow(world, failing)
+    with pytest.raises(ZeroDivisionError):
+        world.run(work)
+    assert sorted(work.done) == [number for number in range(4) if number != failing]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_no_thread_runs_on_after_an_interrupt():
+    world = World(make_system(2), 4, 4)
+    work = Slow(world, -1)
+    timer = threading.Timer(0.1, signal.pthread_kill, (threading.get_ident(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        world.run(work)
+    assert sorted(work.done) == [0, 1, 2, 3]
 
 
 def test_an_environment_does_not_feel_its_neighbours():

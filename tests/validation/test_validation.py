@@ -1,7 +1,9 @@
 """The validation module: its experiments pass, its command writes what it promises, and it notices wrong physics."""
 
+import errno
 import functools
 import json
+import os
 import re
 from pathlib import Path
 
@@ -163,6 +165,39 @@ def test_interrupted_run_keeps_what_was_computed(tmp_path, monkeypatch, capsys):
     assert main(["--fast", "--out", str(tmp_path)]) == 130
     assert len(json.loads((tmp_path / "validation.json").read_text())) == 3
     assert "interrupted: 1 experiments were complete" in capsys.readouterr().err
+
+
+def test_results_that_cannot_be_written_are_printed_all_the_same(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(os, "replace", fail)
+    assert main(["--fast", "--only", "motor_lag", "--out", str(tmp_path)]) == 2
+    shown = capsys.readouterr()
+    assert "| motor lag, 4 ms |" in shown.out and "3 of 3 passed" in shown.out and "wrote" not in shown.out
+    told = f"error: cannot write {tmp_path} (No space left on device); make room, or use another folder\n"
+    assert shown.err.endswith(told) and not list(tmp_path.iterdir())
+
+
+def fail(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("partly", ["only", "interrupted"])
+def test_partial_results_leave_complete_ones(tmp_path, monkeypatch, capsys, partly):
+    def interrupt(fast):
+        raise KeyboardInterrupt
+
+    few = {"motor_lag": EXPERIMENTS["motor_lag"], "spin": EXPERIMENTS["motor_lag"]}
+    monkeypatch.setattr(command, "EXPERIMENTS", few)
+    main(["--fast", "--out", str(tmp_path)])
+    whole = (tmp_path / "validation.json").read_bytes()
+    if partly == "interrupted":
+        monkeypatch.setitem(few, "spin", interrupt)
+    main(["--fast", "--out", str(tmp_path), *(["--only", "motor_lag"] if partly == "only" else [])])
+    assert (tmp_path / "validation.json").read_bytes() == whole
+    partial = tmp_path / "validation_partial.json"
+    assert len(json.loads(partial.read_text())) == 3 and f"wrote {partial} and plots" in capsys.readouterr().out
+    if partly == "only":
+        main(["--fast", "--out", str(tmp_path)])
+        assert len(json.loads((tmp_path / "validation.json").read_text())) == 6
 
 
 def test_unknown_experiment_names_the_nearest(capsys):

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,9 +18,17 @@ from pydantic import Field
 
 from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
 from multilift_marl.agents.policy import find_policy
-from multilift_marl.command import CommandOptions, limit_torch_threads, make_folder, run_command, split_options, title
+from multilift_marl.command import (
+    CommandOptions,
+    check_needs,
+    limit_torch_threads,
+    make_out,
+    run_command,
+    split_options,
+    title,
+)
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.load import choose_config
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.errors import ConfigError, FlightError, warn_once
 from multilift_marl.evaluation.metrics import format_table, make_report, write_report
@@ -41,6 +50,13 @@ With live=true the flight is on ROS 2 topics, see docs/ros.md; with policy=none 
 allow_network=true. Any configuration key changes the environment: env.num_drones=6."""
 OURS = "geometric controller"
 SLOW_LOOP = 2.5  # [rad/s] of position, up to which a policy may know what drones under PX4 are like
+
+
+_NEEDS = {
+    "domain": "live=true", "sync": "live=true", "allow_network": "live=true", "patience": "policy=none",
+    "names": "live=true or bag=<folder>", "ros": "live=true or bag=<folder>",
+}  # fmt: skip
+"""What keys of the command mean nothing without."""
 
 
 class Options(CommandOptions):
@@ -95,12 +111,13 @@ def _fly(values: dict[str, Any]) -> int:
     from multilift_marl.deploy.px4.launch import find_px4
 
     options, overrides = split_options(Options, values)
+    check_needs(options, _NEEDS)
     policy = None if options.policy == "none" else find_policy(options.policy, others=["none"])
     if policy is None and not options.live:
         raise ConfigError("with policy=none others fly the team, by topics; set live=true")
     if options.start == "topic" and not options.live:
         raise ConfigError("with start=topic the flight waits for orders by topics; set live=true")
-    config = check_config(_find_config(options, None if policy is None else policy.config, overrides))
+    config = check_config(choose_config(options.config, None if policy is None else policy.config, overrides))
     if policy is not None:
         policy.check(config, "policy")
         _warn_of_loops(options.policy, policy.config)
@@ -127,7 +144,7 @@ def _fly(values: dict[str, Any]) -> int:
         if policy is not None:
             policy.bind(vec)  # refuses what does not fit, before anything starts
     name = f"px4-{title({'config': options.config or config.task})}-{Path(options.policy).stem}"
-    out = make_folder(Path(options.out) if options.out else Path("runs") / name / time.strftime("%Y%m%d-%H%M%S"))
+    out = make_out(options.out, Path("runs") / name)
 
     try:
         return _fly_and_report(config, None if policy is None else policy.bind, options, build, out)
@@ -238,7 +255,8 @@ def describe_phases(phases: Sequence[Phase]) -> str:
     """Return the extremes of all parts of a flight as a table."""
     lines = [f"{'phase':<20} {'s':>6} {'separation m':>13} {'tension N':>10} {'tilt deg':>9}"]
     for name, seconds, separation, tension, tilt in phases:
-        lines.append(f"{name:<20} {seconds:>6.1f} {separation:>13.2f} {tension:>10.1f} {tilt:>9.1f}")
+        apart = f"{separation:.2f}" if isfinite(separation) else "-"
+        lines.append(f"{name:<20} {seconds:>6.1f} {apart:>13} {tension:>10.1f} {tilt:>9.1f}")
     return "\n".join(lines)
 
 
@@ -261,12 +279,6 @@ def _record(flight: Flight, bind: Maker, options: Options) -> FlightResult:
         result = flight.fly(bind, record)
     print(f"wrote {options.bag}")
     return result
-
-
-def _find_config(options: Options, own: Config | None, overrides: dict[str, Any]) -> Config:
-    if options.config is None and own is not None:
-        return build_config(own.model_dump(), overrides)
-    return load_config(options.config or "hover", overrides)
 
 
 def _keep_logs(folder: Path | None, out: Path) -> None:

@@ -12,7 +12,7 @@ from multilift_marl.sim.world import World
 
 
 class Phase(NamedTuple):
-    """Extremes of a part of the flight; without a step the separation is infinite."""
+    """Extremes of a part of the flight; without a step, or of one drone, the separation is infinite."""
 
     name: str
     seconds: float

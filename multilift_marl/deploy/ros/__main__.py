@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from multilift_marl._interrupt import ending_at_once
+from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
 from multilift_marl.agents.policy import NamedPolicy, find_policy
 from multilift_marl.command import CommandOptions, limit_torch_threads, run_command, split_options
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.load import choose_config
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
 from multilift_marl.errors import ConfigError
 from multilift_marl.policies.mpc import ENOUGH
@@ -130,23 +130,21 @@ def _run(values: dict[str, Any]) -> int:
     name = options.policy or ("mpc" if options.role == "mpc_planner" else "formation")
     policy = None if name == "none" else find_policy(name, others=["none"])
     overrides |= {"env.num_envs": 1, "env.num_threads": 1}
-    if options.config is None and policy is not None and policy.config is not None:
-        config = build_config(policy.config.model_dump(), overrides)
-    else:
-        config = load_config(options.config or "hover", overrides)
+    config = choose_config(options.config, None if policy is None else policy.config, overrides)
     if policy is not None and options.role in ("simulation", *FLYING):
         policy.check(config, "policy")
     limit_torch_threads()
     node = Node(DISTRIBUTIONS[options.ros][0], options.domain, options.allow_network)
     ending = f"{describe_reach(options.domain, options.allow_network, options.ros)} (Ctrl-C ends it)"
-    if options.role in FLYING:
-        _fly(options, config, policy, node, ending)
-    elif options.role == "geometric_control":
-        _control(options, config, node, ending)
-    elif options.role == "clock":
-        _broadcast(options, config, node, ending)
-    else:
-        _simulate(options, config, policy, node, ending)
+    with interrupted_by_signals():
+        if options.role in FLYING:
+            _fly(options, config, policy, node, ending)
+        elif options.role == "geometric_control":
+            _control(options, config, node, ending)
+        elif options.role == "clock":
+            _broadcast(options, config, node, ending)
+        else:
+            _simulate(options, config, policy, node, ending)
     return 0
 
 
@@ -189,7 +187,7 @@ def _fly(options: Options, config: Config, policy: NamedPolicy | None, node: Nod
     try:
         flown.spin(options.seconds or float("inf"))
     except KeyboardInterrupt:
-        flown.land("Ctrl-C; once more ends this at once")
+        flown.land("interrupted; once more ends this at once")
         with suppress(KeyboardInterrupt):
             while not flown.landed:
                 flown.spin_once(1.0)

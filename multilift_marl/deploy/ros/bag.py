@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import TracebackType
 
@@ -10,7 +11,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores
 
-from multilift_marl._files import check_writable
+from multilift_marl._files import check_writable, name_aside
 from multilift_marl.deploy.ros.messages import FlightMessages, Topic
 from multilift_marl.deploy.ros.types import typestore
 from multilift_marl.envs.core import MultiliftVec
@@ -28,6 +29,8 @@ DISTRIBUTIONS = {
 class BagWriter:
     """Writes a flight of environment 0, its start at once; a context that closes the bag.
 
+    The bag is there when it is whole: written aside, renamed at the end, deleted where its context ends by an error.
+
     Args:
         folder: of the bag, which must not be there yet.
         vec: the environments, after a reset.
@@ -43,19 +46,28 @@ class BagWriter:
         self._store = typestore(types)
         self._messages = FlightMessages(vec, self._store, names)
         check_free(folder)
+        self._folder, self._aside = folder, name_aside(folder)
         try:
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = Writer(folder, version=version, storage_plugin=storage)  # type: ignore[arg-type]
-            self._writer.open()
+            self._open(version, storage)
+            self.write(0.0)
         except OSError as error:
+            shutil.rmtree(self._aside, ignore_errors=True)
             raise ConfigError(f"cannot write bag={folder} ({reason(error)}); give another folder") from error
+        except BaseException:
+            shutil.rmtree(self._aside, ignore_errors=True)
+            raise
+
+    def _open(self, version: int, storage: StoragePlugin) -> None:
+        """Begin a bag by its own name, which its files have too, in a folder aside."""
+        self._aside.mkdir(parents=True)
+        self._writer = Writer(self._aside / self._folder.name, version=version, storage_plugin=storage)  # type: ignore[arg-type]
+        self._writer.open()
         self._connections = {
             topic.name: self._writer.add_connection(
                 topic.name, topic.kind, typestore=self._store, offered_qos_profiles=[_qos(topic)]
             )
             for topic in self._messages.topics()
         }
-        self.write(0.0)
 
     def write(self, seconds: float) -> None:
         """Write the state as it is, at a time since the start [s]."""
@@ -70,7 +82,12 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._writer.close()
+        try:
+            self._writer.close()
+            if kind is None:
+                (self._aside / self._folder.name).rename(self._folder)
+        finally:
+            shutil.rmtree(self._aside, ignore_errors=True)
 
 
 def check_free(folder: Path) -> None:

@@ -9,13 +9,14 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from multilift_marl.config.config import Config
 from multilift_marl.control.autopilot import LoadFeedforward
 from multilift_marl.deploy.ros.bodies import Bodies, Source
+from multilift_marl.deploy.ros.checks import PX4, check_flyable
 from multilift_marl.deploy.ros.crazyswarm import ServerOdometry, full_state
 from multilift_marl.deploy.ros.dds import Node
 from multilift_marl.deploy.ros.failsafe import HOLD_AFTER, LAND_AFTER, sink
@@ -48,11 +49,9 @@ from multilift_marl.deploy.ros.types import (
     trajectory_setpoint,
 )
 from multilift_marl.envs.measured import APART, MeasuredTeam
-from multilift_marl.errors import ConfigError
 from multilift_marl.mdp.failures import MAX_DISTANCE
 from multilift_marl.policies.policy import Policy
 
-PX4 = "px4"
 AT_ONCE, TOPIC, STAGE = "at_once", "topic", "stage"
 WAITING, READY, FLYING, HOLDING, LANDING = "waiting", "ready", "flying", "holding", "landing"
 _LEAP, _LEAP_ACCELERATION = 0.1, 20.0  # [m], [m/s²]: what is farther off than these was put elsewhere
@@ -61,6 +60,7 @@ _SAME = 1e-9  # [m], and of a rotation's numbers, by which targets differ only i
 _REMIND = 2.0  # [s] between words about what is waited for
 _REMEMBERED = 1_000_000  # steps of which the latency is known
 Say = Callable[[str], None]
+_Result = TypeVar("_Result")
 
 
 class PolicyNode:
@@ -270,7 +270,7 @@ class PolicyNode:
             # elsewhere.
             if 0 < self._leaps < _LEAPS:
                 return
-        observation = self._begin() if self._before is None or self._leaps else self._observe()
+        observation = self._attempt("task", self._begin if self._before is None or self._leaps else self._observe)
         if observation is not None and self._fly(observation):
             self._before, self._flown = (positions, velocities, stamp), self._woken
             self._leaps, self._why = 0, ""
@@ -321,19 +321,27 @@ class PolicyNode:
 
     def _fly(self, observation: np.ndarray) -> bool:
         """Let the policy act, and publish what it wants; return whether it could."""
-        try:
-            reference = self.team.command(self._policy.act(observation))
-        except Exception as error:  # a policy of others may fail in any way, and drones are in the air
-            self.land(f"the policy has failed ({type(error).__name__}: {error})")
+        reference = self._attempt("policy", lambda: self.team.command(self._policy.act(observation)))
+        if reference is None:
             return False
         # Receivers of poses smooth them and get the command; others get our smoothed reference with its derivatives.
         if self._names.setpoints == POSE:
             self._publish(reference.command[0], reference.command_yaw[0])
             return True
-        self.team.advance()
+        if self._attempt("task", self.team.advance) is None:
+            return False
         motion = reference.velocity[0], reference.acceleration[0], reference.yaw_rate[0], reference.jerk[0]
         self._publish(reference.position[0], reference.yaw[0], *motion)
         return True
+
+    def _attempt(self, what: str, call: Callable[[], _Result]) -> _Result | None:
+        """Return what code of others does; where it fails, in whatever way, None, and drones in the air land."""
+        try:
+            return call()
+        except Exception as error:
+            self._why = f"the {what} has failed ({type(error).__name__}: {error})"
+            self.land(self._why)
+            return None
 
     def _hold(self, now: float) -> None:
         """Publish the last places once more, a policy step after the last time; lower ones while it lands."""
@@ -381,20 +389,3 @@ class PolicyNode:
         if mode != self.mode:
             self._say(f"{mode}: {why}")
             self.mode = mode
-
-
-def check_flyable(config: Config, names: str = "multilift", receiver: str = PX4) -> None:
-    """Refuse, by a ConfigError, what the node cannot fly."""
-    able = ("reference",) if NAMES[names].setpoints == POSE else ("reference", "full_state")
-    if config.control.action not in able:
-        raise ConfigError(
-            f"set-points of names={names} are those of control.action={' or '.join(able)}, not of "
-            f"{config.control.action}; take a policy of that"
-        )
-    if receiver != PX4 and not NAMES[names].is_report:
-        raise ConfigError(f"receiver={receiver} takes set-points of PX4; set names=report")
-    if config.env.sensing == "onboard":
-        raise ConfigError("this node cannot fly policies of env.sensing=onboard: nobody measures the cables' tension")
-    if (task := config.task) in ("loss", "regroup"):
-        what = "whose motors have stopped" if task == "loss" else "whose cables are attached"
-        raise ConfigError(f"this node cannot fly config={task}: nobody measures {what}")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from multilift_marl.command import CommandOptions, make_folder, spell_arguments, split_options
+from multilift_marl.command import CommandOptions, make_out, spell_arguments, split_options
 from multilift_marl.config.load import check_names, load_config
 from multilift_marl.deploy.px4.__main__ import Options as FlightOptions
 from multilift_marl.deploy.ros.__main__ import OF_ROLES, USUAL, check_role
@@ -60,10 +59,11 @@ def prepare_commands(values: Mapping[str, Any]) -> tuple[dict[str, list[str]], P
         ConfigError: see `read_options` and `list_commands`, or the folder cannot be written to.
     """
     options = read_options(values)
-    out = Path(options.out or f"runs/sitl-{time.strftime('%Y%m%d-%H%M%S')}").expanduser()
+    given = None if options.out is None else str(Path(options.out).expanduser())
     with trusting(options.trust):
-        commands = list_commands(options, out)
-    return commands, make_folder(out)
+        list_commands(options, Path(given or "runs"))  # refuses what is wrong, before there is a folder
+        out = make_out(given, Path("runs"), "sitl-")
+        return list_commands(options, out), out
 
 
 def read_options(values: Mapping[str, Any]) -> Options:
