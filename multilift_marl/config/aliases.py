@@ -10,20 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from multilift_marl.errors import ConfigError
+from multilift_marl.errors import ConfigError, shorten
 
 _ALIASES = {"train.base_policy": "train.residual"}
 
 
 def stored_names(values: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Return configuration values, nested, by dotted names or both, by the names that are stored, without arrays.
+    """Return configuration values, nested, by dotted names or both, by the names that are stored, see `plain_values`.
 
     Call it before `review`, which looks for the stored names.
 
     Raises:
-        ConfigError: a key is given by both of its names.
+        ConfigError: a key is given by both of its names, or see `plain_values`.
     """
-    renamed = without_arrays(values)
+    renamed = plain_values(values)
     for alias, key in _ALIASES.items():
         section, name, stored = *alias.split("."), key.rpartition(".")[2]
         if isinstance(nested := renamed.get(section), Mapping):
@@ -32,12 +32,19 @@ def stored_names(values: Mapping[Any, Any]) -> dict[Any, Any]:
     return renamed
 
 
-def without_arrays(value: Any) -> Any:
-    """Return a value, or nested values, in which NumPy's arrays are lists, and its numbers Python's."""
+def plain_values(value: Any) -> Any:
+    """Return a value, or nested values, in which NumPy's arrays are lists, and its numbers Python's.
+
+    Raises:
+        ConfigError: bytes or a set, which validation would take for text and for a list in any order.
+    """
+    if isinstance(value, bytes | bytearray | set | frozenset):
+        kind = "text" if isinstance(value, bytes | bytearray) else "a list"
+        raise ConfigError(f"a configuration holds no {type(value).__name__}: give {kind}, not {shorten(repr(value))}")
     if isinstance(value, Mapping):
-        return {key: without_arrays(each) for key, each in value.items()}
+        return {key: plain_values(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [without_arrays(each) for each in value]
+        return [plain_values(each) for each in value]
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 

@@ -9,7 +9,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-from multilift_marl.config.aliases import stored_names, without_arrays
+from multilift_marl.config.aliases import plain_values, stored_names
 from multilift_marl.config.config import Config
 from multilift_marl.config.precedence import give_way, is_empty, merge, system_part
 from multilift_marl.errors import ConfigError, UnknownKeywordError, called_elsewhere, nearest, reason, shorten
@@ -99,7 +99,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    merged, overrides = merge({}, without_arrays(values)), stored_names(overrides or {})
+    merged, overrides = merge({}, plain_values(values)), stored_names(overrides or {})
     free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
     for dotted, value in overrides.items():
         _note_named(dotted, value)

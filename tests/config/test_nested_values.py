@@ -98,3 +98,13 @@ def test_a_list_that_holds_an_array_and_values_that_hold_one_are_taken():
     assert load_config("hover", {"payload.anchors": rows}) == load_config("hover", {"payload.anchors": SQUARE})
     assert build_config({"payload": {"anchors": np.array(SQUARE)}}) == build_config({"payload": {"anchors": SQUARE}})
     assert "payload.anchors" in refusal(load_config, "hover", {"payload.anchors": np.zeros((4, 2))})
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"import": {"mine.py"}}, {"train.residual": b"mine.py:Zero"}, {"payload": {"anchors": {(0.1, 0.1, 0.0)}}}],
+)
+def test_bytes_and_sets_are_no_values(values):
+    assert "a configuration holds no " in refusal(load_config, "hover", values)
+    nested = {"train": {"residual": values["train.residual"]}} if "train.residual" in values else values
+    assert "a configuration holds no " in refusal(build_config, nested)
