@@ -131,8 +131,7 @@ class MultiliftVec:
 
         Raises:
             ConfigError: no start is free of failure.
-            ValueError: a mask of wrong shape or type, a negative seed, an unknown option or one that cannot be; after
-                the last, environments in the mask must be reset again.
+            ValueError: a mask, a seed or an option that cannot be; the environments in the mask must be reset again.
         """
         mask = np.ones(self.num_envs, bool) if mask is None else check_mask(mask, self.num_envs)
         check_seed(seed)
