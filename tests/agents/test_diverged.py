@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -10,27 +11,33 @@ from conftest import make_trainer, refusal, slow
 
 import multilift_marl as ml
 from multilift_marl.agents.checkpoint import load_checkpoint
-from multilift_marl.agents.trainer import Trainer
+from multilift_marl.agents.trainer import Trainer, resume_run
 from multilift_marl.cli.train import main as train
 
 FAR = 1e39  # a step of Adam leaves the range of single precision
 PPO = {
     "env.num_envs": 4, "env.num_threads": 1, "train.horizon": 16, "train.hidden": [8], "train.warmup": 0,
-    "eval.episodes": 2, "eval.every": 1000, "train.checkpoint_every": 1, "env.episode_seconds": 1.0,
+    "eval.episodes": 2, "eval.every": 1000, "env.episode_seconds": 1.0,
     "train.frames": 20 * 64,
 }  # fmt: skip
 DAGGER = PPO | {"train.algorithm": "dagger", "train.dagger.teacher": "payload_geometric", "train.overrides": {}}
 DIFFMPC = {"train.horizon": 45, "train.overrides": {}, "train.hidden": [8], "env.num_drones": 3, "env.num_envs": 2}
 
 
-def test_a_training_that_diverges_is_a_sentence_and_keeps_its_last_sound_state(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("every", [1, 1000])
+def test_a_training_that_diverges_is_a_sentence_and_keeps_its_last_sound_state(tmp_path, monkeypatch, capsys, every):
     monkeypatch.chdir(tmp_path)
-    assert train(["config=hover", *(f"{key}={value}" for key, value in PPO.items()), "train.learning_rate=100"]) == 2
+    keys = PPO | {"train.checkpoint_every": every, "train.learning_rate": 100}
+    assert train(["config=hover", *(f"{key}={value}" for key, value in keys.items())]) == 2
     shown = capsys.readouterr().err.splitlines()[-1]
-    assert shown.startswith("error: training diverged in iteration ") and "lower train.learning_rate" in shown
-    (last,) = tmp_path.glob("runs/*/checkpoints/last.pt")
+    assert "lower train.learning_rate" in shown
+    iteration = int(re.match(r"error: training diverged in iteration (\d+): ", shown)[1])
+    (path,) = tmp_path.glob("runs/*/checkpoints/last.pt")
+    last = load_checkpoint(path)
+    assert last["iteration"] == iteration - 1
     for network in ("actor", "critic"):
-        assert all(torch.isfinite(each).all() for each in load_checkpoint(last)[network].values())
+        assert all(torch.isfinite(each).all() for each in last[network].values())
+    assert resume_run(path.parents[1], {}).iteration == iteration - 1
 
 
 @pytest.mark.parametrize(
