@@ -155,14 +155,19 @@ def test_a_bag_is_never_overwritten(tmp_path):
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_bag_that_is_not_finished_is_none(tmp_path, error):
+def test_a_bag_that_is_not_finished_is_kept_apart(tmp_path, error):
     vec = ml.make_vec("hover", num_envs=1, num_threads=1)
-    with pytest.raises(error), BagWriter(tmp_path / "bag", vec):
-        raise error
-    assert not list(tmp_path.iterdir())
+    for steps in (2, 1):
+        with pytest.raises(error), BagWriter(tmp_path / "bag", vec) as bag:
+            for k in range(steps):
+                bag.write(0.02 * (k + 1))
+            raise error
+        assert [path.name for path in tmp_path.iterdir()] == ["bag_partial"]
+        times = [time for time, *_ in read(tmp_path / "bag_partial")["/payload/odom"]]
+        assert times == [20_000_000 * k for k in range(steps + 1)]
     with BagWriter(tmp_path / "bag", vec):
         pass
-    assert [path.name for path in tmp_path.iterdir()] == ["bag"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bag", "bag_partial"]
     assert sorted(path.name for path in (tmp_path / "bag").iterdir()) == ["bag.mcap", "metadata.yaml"]
 
 

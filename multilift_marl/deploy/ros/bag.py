@@ -29,7 +29,8 @@ DISTRIBUTIONS = {
 class BagWriter:
     """Writes a flight of environment 0, its start at once; a context that closes the bag.
 
-    The bag is there when it is whole: written aside, renamed at the end, deleted where its context ends by an error.
+    The bag is there when it is whole: written aside, renamed at the end. Where its context ends by an error, what was
+    recorded until then is in the folder of its name with `_partial`, in place of what an earlier flight left there.
 
     Args:
         folder: of the bag, which must not be there yet.
@@ -84,8 +85,11 @@ class BagWriter:
     ) -> None:
         try:
             self._writer.close()
-            if kind is None:
-                (self._aside / self._folder.name).rename(self._folder)
+            folder = self._folder
+            if kind is not None:
+                folder = folder.with_name(f"{folder.name}_partial")
+                shutil.rmtree(folder, ignore_errors=True)
+            (self._aside / self._folder.name).rename(folder)
         finally:
             shutil.rmtree(self._aside, ignore_errors=True)
 
