@@ -254,7 +254,7 @@ def test_an_evaluation_that_is_stopped_completes_its_bag(tmp_path, monkeypatch, 
     arguments = ["policy=formation", "config=hover", "episodes=1", "baseline=none", "env.episode_seconds=0.5"]
     monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments, f"out={tmp_path / 'o'}", f"bag={tmp_path / 'bag'}"])
     assert evaluate.main() == 130 and capsys.readouterr().err.endswith("stopped\n")
-    assert (tmp_path / "bag" / "metadata.yaml").is_file()
+    assert (tmp_path / "bag_partial" / "metadata.yaml").is_file() and not (tmp_path / "bag").exists()
 
 
 ALONE = """
