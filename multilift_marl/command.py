@@ -216,7 +216,9 @@ def check_needs(options: CommandOptions, needs: Mapping[str, str]) -> None:
 def _is_given(options: CommandOptions, need: str) -> bool:
     key, _, wanted = need.partition("=")
     value = getattr(options, key)
-    return bool(value) if wanted.startswith("<") else str(value).lower() == wanted
+    if wanted.startswith("<"):  # also if it is given as none: workers=0
+        return key in options.model_fields_set or bool(value)
+    return str(value).lower() == wanted
 
 
 def limit_torch_threads() -> None:
