@@ -60,9 +60,6 @@ class FullStateCommand:
             off, faster = own.drone_position - was, own.drone_velocity - moved
             position += np.where(np.isfinite(off), off, 0.0)  # a drone may know nothing for a moment
             velocity += np.where(np.isfinite(faster), faster, 0.0)
-        else:
-            later = self._hook_arms(thrust + vec.task.dt * rate)
-            velocity -= (later - self._hook_arms(thrust)) / vec.task.dt
         total = (gains.mass + gains.load_share)[:, None]
         rotors = thrust if vec.config.control.drag_feedforward else thrust + drag
         force = rotors - total * acceleration - gains.mass[:, None] * [0.0, 0.0, GRAVITY]

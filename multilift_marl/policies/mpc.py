@@ -314,15 +314,12 @@ class TeamMpc:
             rotation, rates = self._target_attitude()
         arm = np.einsum("eij,nj->eni", rotation, model.anchors)
         turning = np.einsum("eij,ej->ei", rotation, rates)
-        hooks = self._vec.world.system.hooks
-        hook = own.drone_position + np.einsum("enij,nj->eni", own.drone_rotation, hooks)
-        hook_velocity = own.drone_velocity + np.einsum(
-            "enij,enj->eni", own.drone_rotation, _cross(own.drone_body_rates, hooks)
-        )
+        hook = own.drone_position + np.einsum("enij,nj->eni", own.drone_rotation, self._vec.world.system.hooks)
         cable = hook - position[:, None] - arm
         length = np.linalg.norm(cable, axis=-1, keepdims=True)
         direction = cable / length
-        moved = hook_velocity - velocity[:, None] - _cross(turning[:, None], arm)
+        # By the drone's centre, not its hook: feedback of how fast a drone tilts would be unstable.
+        moved = own.drone_velocity - velocity[:, None] - _cross(turning[:, None], arm)
         swing = (moved - direction * (direction * moved).sum(-1, keepdims=True)) / length
         air = np.einsum("enji,enj->eni", own.drone_rotation, own.drone_velocity)
         drag = np.einsum("enij,enj->eni", own.drone_rotation, self._drag * air)
