@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import os
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # before numpy: the threads of its BLAS would wait for other workers' cores
+if "PYTEST_XDIST_WORKER" in os.environ:  # before numpy and torch: threads would wait for cores that other workers have
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # of learning, which takes two: asleep, not spinning
 
 import importlib.util
 import signal

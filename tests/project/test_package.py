@@ -2,6 +2,7 @@
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -264,6 +265,15 @@ def run(command, folder, monkeypatch):
         bench = load_script("bench/start")
         monkeypatch.setattr(bench, "STEP", bench.IMPORT)
         bench.main(arguments)
+        return
+    if script.startswith(("bench/", "results/")):
+        monkeypatch.chdir(folder)
+        monkeypatch.syspath_prepend(str((ROOT / script).parent))
+        monkeypatch.setattr(sys, "argv", [script, *arguments])
+        try:
+            runpy.run_path(str(ROOT / script), run_name="__main__")
+        except SystemExit as end:
+            assert not end.code, f"{command}: {end.code}"
         return
     line = [sys.executable, *([str(ROOT / script)] if script.endswith(".py") else ["-m", script]), *arguments]
     done = subprocess.run(line, cwd=folder, capture_output=True, text=True)
