@@ -89,7 +89,7 @@ FLIGHTS: dict[str, Flight] = {
         "track_realistic_fast",
         {},
         "track_realistic_fast",
-        "figure-eight, 5 m/s, 8 m/s², realistic without rotor wash",
+        "figure-eight, 5 m/s, 8 m/s², realistic",
         scripts=FOLLOWING,
     ),
     "track_follow_2_2": Flight(
