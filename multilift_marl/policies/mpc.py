@@ -95,7 +95,7 @@ class TeamMpc:
         self.planner = self._make_planner()
         teams = len(self.planner.plans.states)
         self._dt = vec.task.dt
-        exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
+        self._exact = exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
         cameras, onboard = config.env.sensing in CAMERAS, config.env.sensing in ("onboard", "blind")
         noise = settings.estimate_noise or (0.5 if exact else 2.0 if onboard else 1.0)
         self._estimator = None
@@ -201,7 +201,8 @@ class TeamMpc:
             self._observer.fresh[self._fresh] = True
             states = self._observer.update(states, self._dt, loads).copy()
         if self._estimator is not None:
-            self._estimator.update(states, self._dt, ~unknown)
+            seen, known = self._for_estimator(states, ~unknown)
+            self._estimator.update(seen, self._dt, known)
         unknown |= self._forget_unsound(states, loads, forces)
         following = ~(self._fresh | unknown) if self._feedback < 1.0 else np.zeros(len(states), bool)
         if following.any():
@@ -249,6 +250,10 @@ class TeamMpc:
             action = np.where(without[..., None], self._without_plan.act(observation), action)
             self._fresh |= lost  # its next plan begins where the team is then
         return action
+
+    def _for_estimator(self, states: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the states (E, 12 + 7 N) that forces are estimated by, in turn, and which are known (E,)."""
+        return states, known
 
     def _of_drones(self, vectors: np.ndarray) -> np.ndarray:
         """Return what plans (E, 3 N) have for each drone (E, N, 3)."""

@@ -35,6 +35,7 @@ class DistributedMpc(TeamMpc):
                 "policy=mpc"
             )
         super().__init__(vec, preview)
+        self._lately, self._known = np.zeros_like(self.planner.plans.states[:, 0]), np.zeros(len(self._fresh), bool)
 
     def _make_planner(self) -> DistributedPlanner:
         vec, env = self._vec, self._vec.config.env
@@ -54,7 +55,8 @@ class DistributedMpc(TeamMpc):
     def arrays(self) -> dict[str, np.ndarray]:
         """See `TeamMpc.arrays`; plans and messages of teams, drones of one after another."""
         post = self.planner.post._asdict()
-        return super().arrays() | {f"Post.{name}": array for name, array in post.items()}
+        lately = {"lately": self._lately, "known": self._known}
+        return super().arrays() | lately | {f"Post.{name}": array for name, array in post.items()}
 
     def metrics(self) -> dict[str, np.ndarray]:
         """See `TeamMpc.metrics`: means over the drones."""
@@ -70,6 +72,23 @@ class DistributedMpc(TeamMpc):
     def _of_drones(self, vectors: np.ndarray) -> np.ndarray:
         e, n = self._vec.num_envs, self._vec.num_drones
         return vectors.reshape(e, n, n, 3)[:, np.arange(n), np.arange(n)]
+
+    def _for_estimator(self, states: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `TeamMpc._for_estimator`: exact states of all drones a step ago, as they have told each other since.
+
+        Noisy ones estimate worse than where the others meant to be.
+        """
+        if not self._exact:
+            return states, known
+        n, numbers = self._vec.num_drones, np.arange(states.shape[1])
+        teams = states.reshape(-1, n, states.shape[1])
+        shared = teams[:, 0].copy()
+        for own, others in enumerate(others_of(n)):
+            is_own = ~np.isin(numbers, others)
+            shared[:, is_own] = teams[:, own, is_own]
+        before = self._lately.copy(), self._known & ~self._fresh
+        self._lately[:], self._known[:] = np.repeat(shared, n, axis=0), known
+        return before
 
     def _measure(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `TeamMpc._measure`, (E N, ...): as each drone knows the payload, and plans of the others."""

@@ -176,7 +176,10 @@ class TrainConfig(Section):
         description="environments to train in first, each {overrides, until: {frames, success}}; None: its own alone",
     )
     threads: Int = Field(
-        2, ge=1, le=1024, description="threads of the update, 1 beside other work; weights are bit-equal for the same number"
+        2,
+        ge=1,
+        le=1024,
+        description="threads of the update, 1 beside other work; weights are bit-equal for the same number",
     )
     checkpoint_every: Int = Field(25, ge=1, description="iterations between checkpoints")
     logger: Literal["tensorboard", "wandb", "csv"] = Field(

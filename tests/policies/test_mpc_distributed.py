@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from conftest import make, refusal
 
@@ -28,6 +29,32 @@ def test_paths_are_kept_to_within_half_a_millimetre(drones):
     most = 2e-3 if drones == 2 else 5e-4
     assert not result["failure_cause"].any() and (result["payload_rmse_m"] < most).all()
     assert not result["planner_failed"].any()
+
+
+@pytest.mark.parametrize("drones", [3, 6])
+def test_fast_paths_are_kept_nearly_as_by_one_planner_of_all(drones):
+    fast = {"env.num_drones": drones, "task_options.speed": 5.0, "task_options.acceleration": 8.0, "planner.sweeps": 5}
+    apart, central = (fly(policy, "track", fast, 2, 8.0) for policy in ("mpc_distributed", "mpc"))
+    assert not apart["failure_cause"].any()
+    assert apart["payload_rmse_m"].mean() < 1.5 * central["payload_rmse_m"].mean() < 4.5e-3
+
+
+def test_forces_are_estimated_by_where_all_drones_were():
+    """By the others' plans alone, what they fail to do would pass for a force on the payload."""
+    vec = make("track", 2, 3, **BY_RATES)
+    observation, _ = vec.reset(seed=1)
+    policy, central = (make_scripted(name, vec) for name in ("mpc_distributed", "mpc"))
+    update, given, true = policy._estimator.update, [], []
+    policy._estimator.update = lambda *seen: given.append([each.copy() for each in (seen[0], seen[2])]) or update(*seen)
+    for _ in range(6):
+        true.append(central._measure()[0])
+        observation, *_ = vec.step(policy.act(observation))
+    assert not given[0][1].any()
+    cables = np.r_[6:12, 18:24]
+    for (states, known), before in zip(given[1:], true, strict=False):
+        assert known.all()
+        np.testing.assert_array_equal(states[:, cables], before.repeat(3, axis=0)[:, cables])
+    assert np.ptp([each[0, cables] for each in true], axis=0).min() > 0
 
 
 def test_unknown_masses_and_forces_are_held():
