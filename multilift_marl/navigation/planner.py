@@ -26,7 +26,7 @@ from multilift_marl.navigation.team_clearance import (
 from multilift_marl.navigation.timing import SAMPLES, sample_curve, time_route
 from multilift_marl.planning.route import NoRoute, Route, RouteReport
 from multilift_marl.rig.system import System
-from multilift_marl.sim.obstacles import Obstacles
+from multilift_marl.sim.obstacles import Obstacles, half_extents
 
 FINENESS = 1.0, 0.6, 0.45  # of the lattice, tried in turn, and ...
 MOVING = 2  # ... of a moving team, which cannot wait, as many and a tenth of the states
@@ -97,6 +97,7 @@ def find_route(
 
     Raises:
         NoRoute: start or goal is too close to an obstacle or too low, or no way is found.
+        ConfigError: the space is too large for a search.
     """
     begun = thread_time()
     start = np.array(start if departure is None else departure[0, :4], dtype=float)
@@ -188,7 +189,7 @@ def measure_route(
 
 def _space(start: np.ndarray, goal: np.ndarray, scene: Scene, body: TeamBody, settings: RouteSettings) -> np.ndarray:
     """Return the lowest and the highest position of the payload, (2, 3) [m]."""
-    far = np.linalg.norm(scene.size, axis=1, keepdims=True) if len(scene.kind) else np.zeros((0, 1))
+    far = half_extents(scene.kind, scene.size, scene.rotation)
     points = np.vstack([start[:3], goal[:3], scene.position - far, scene.position + far])
     low, high = points.min(axis=0) - settings.room, points.max(axis=0) + settings.room
     low = low if settings.low is None else np.array(settings.low, dtype=float)

@@ -7,11 +7,12 @@ to the goal, which costs more where it is close to obstacles.
 
 from __future__ import annotations
 
-from math import cos, pi, sin, sqrt
+from math import cos, pi, prod, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
+from multilift_marl.errors import ConfigError
 from multilift_marl.kernels.jit import kernel
 from multilift_marl.navigation.formation_shapes import FormationShapes
 from multilift_marl.navigation.team_clearance import (
@@ -26,6 +27,7 @@ from multilift_marl.navigation.team_clearance import (
 from multilift_marl.sim.obstacle_distance import local_distance
 
 YAWS = 16  # of the lattice
+MOST = 200_000_000  # states of a lattice: 4 GB, of which few are ever touched
 GREED = 1.3  # [-] weight of the heuristic: the way found costs at most so many times the least
 CAUTION = 2.0  # [-] cost of a metre beside obstacles, and ...
 SQUEEZE = 0.3  # ... of one in the narrowest shape, over one in the open
@@ -136,9 +138,18 @@ def search_route(
         start, shape: (4,) its first state's pose, the choice of its shape.
         body, scene: the team and the obstacles.
         most: states to expand.
+
+    Raises:
+        ConfigError: more states than `MOST`.
     """
-    cells = int(lattice.counts.prod())
+    cells = prod(lattice.counts.tolist())
     states = cells * YAWS * len(lattice.arms)
+    if states > MOST:
+        low, high = (np.round(end, 2).tolist() for end in (lattice.low, lattice.low + lattice.step * lattice.counts))
+        raise ConfigError(
+            f"the payload's space from {low} to {high} m has {states:.2g} states of a search for a route, more than "
+            f"{MOST:.0e}; bound it closer to the way, by task_options.low and task_options.high"
+        )
     work = SearchWork(
         status=np.zeros(states, np.uint8),
         cost=np.empty(states),

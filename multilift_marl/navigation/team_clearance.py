@@ -15,7 +15,7 @@ from multilift_marl.kernels.jit import inlined, kernel
 from multilift_marl.math3d import add, dot, matmul, mul, norm, put, row, scale, sub, tmul, transpose, turn, unit
 from multilift_marl.rig.system import System
 from multilift_marl.sim.obstacle_distance import local_distance
-from multilift_marl.sim.obstacles import HULL, NONE, SPHERE, Obstacles
+from multilift_marl.sim.obstacles import HULL, NONE, SPHERE, Obstacles, half_extents
 
 TOLERANCE = 1e-3  # [m] of distances, which are too small rather than too large
 _ITERATIONS = 16
@@ -78,9 +78,8 @@ def make_scene(obstacles: Obstacles, env: int) -> Scene:
 def hangs_over(scene: Scene, height: float) -> bool:
     """Return whether there is room beneath an obstacle: it is wholly above a height [m], or slanted, or a mesh."""
     upwards = np.abs(scene.rotation[:, 2])
-    ball = scene.kind == SPHERE
-    half = np.where(ball, scene.size[:, 0], (upwards * scene.size).sum(axis=1))  # of the box about it
-    slanted = ~ball & (upwards.max(axis=1) < 1.0 - 1e-6)
+    half = half_extents(scene.kind, scene.size, scene.rotation)[:, 2]
+    slanted = (scene.kind != SPHERE) & (upwards.max(axis=1) < 1.0 - 1e-6)
     return bool(((scene.position[:, 2] - half > height) | slanted | (scene.kind == HULL)).any())
 
 

@@ -15,13 +15,13 @@ import numpy as np
 
 from multilift_marl.errors import ConfigError
 from multilift_marl.math3d import heading
+from multilift_marl.policies.repelled import OVER
 from multilift_marl.policies.slot_offsets import offset_actions
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
 
 AHEAD = 0.2  # [m] before the drone, beyond which a point is ahead
-OVER = 0.9  # sine of the elevation of points that are not there
 BESIDE = 0.6  # of the half formation: drawn in no further
 
 

@@ -1,7 +1,7 @@
 """A potential field by each drone's own senses, `policy=formation_repelled`: slots moved away from what is near.
 
-Each drone moves its slot against the nearest points of obstacles that it observes, within a distance and in proportion
-to how much nearer they are. Numbers: most successes on training maps of `navigate_senses`
+Each drone moves its slot against the nearest points of obstacles that it observes beside it, within a distance and in
+proportion to how much nearer they are. Numbers: most successes on training maps of `navigate_senses`
 (`results/tune_rules.py`).
 """
 
@@ -17,6 +17,8 @@ from multilift_marl.policies.slot_offsets import offset_actions
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
+
+OVER = 0.9  # sine of the elevation above which points are over the drone, as those are that are not there
 
 
 class FormationRepelled:
@@ -59,8 +61,8 @@ class FormationRepelled:
         points = view.obstacle_readings.reshape(e, n, -1, 3)
         level = points[..., :2]
         far = np.maximum(np.linalg.norm(level, axis=-1), 1e-3)
-        high = np.abs(points[..., 2]) > self.DISTANCE  # those that are not there are straight above
-        push = np.where(high, 0.0, self.GAIN * np.maximum(self.DISTANCE - far, 0.0))
+        over = np.abs(points[..., 2]) > np.minimum(OVER * np.linalg.norm(points, axis=-1), self.DISTANCE)
+        push = np.where(over, 0.0, self.GAIN * np.maximum(self.DISTANCE - far, 0.0))
         away = -(level / far[..., None] * push[..., None]).sum(axis=2)
         rotation = view.estimated.drone_rotation
         yaw = np.array([[heading(tuple(each.ravel())) for each in team] for team in rotation])

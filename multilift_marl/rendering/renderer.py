@@ -70,10 +70,10 @@ class Renderer:
         if not 0 <= env < self._vec.num_envs:
             raise IndexError(f"there is no environment {env}, only 0 to {self._vec.num_envs - 1}")
         self._stage.update(env)
-        self._gl.make_current()
         pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
-        mujoco.mjr_render(self._rect, self.scene, self._context)
-        mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
+        with self._gl.as_current():  # and no longer: a window, of another library, could not draw in this thread
+            mujoco.mjr_render(self._rect, self.scene, self._context)
+            mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def close(self) -> None:
@@ -101,12 +101,12 @@ def make_contexts(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
     size = model.vis.global_
     try:
         gl = importlib.import_module(f"mujoco.{kind}").GLContext(size.offwidth, size.offheight)
-        gl.make_current()
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        with gl.as_current():
+            context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
     except Exception as error:  # the kinds raise different errors: import, attribute, OpenGL and runtime errors
         cure = f"unset MUJOCO_GL={asked}" if asked else f"run '{_INSTALL}'"
         raise RenderingError(f"drawing by {kind} does not work ({' '.join(str(error).split())}); {cure}") from error
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
     return gl, context
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -34,15 +36,19 @@ class Window:
         stage: what is shown.
 
     Raises:
-        RenderingError: there is no display to open a window on.
+        RenderingError: there is no display to open a window on, or none that has OpenGL.
     """
 
     def __init__(self, vec: Environments, camera: str = "side"):
         self._vec = vec
         self.stage = Stage(vec, camera, _WIDTH / _HEIGHT, _TRAIL)
         self._glfw, self._window = _open(vec.task.name)
-        self._glfw.make_context_current(self._window)
-        self._context = mujoco.MjrContext(self.stage.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        try:
+            with self._current():
+                self._context = mujoco.MjrContext(self.stage.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except mujoco.FatalError as error:
+            self._glfw.destroy_window(self._window)
+            raise RenderingError(f"OpenGL cannot draw on this display ({error}); {_CURE}") from error
         self._due = time.perf_counter()
         self._turned = [0.0, 0.0]
         self._zoom = 1.0
@@ -61,11 +67,11 @@ class Window:
             return
         if self._glfw.window_should_close(self._window):
             return self.close()
-        self._glfw.make_context_current(self._window)
         self.stage.update(env, self._move_camera)
         width, height = self._glfw.get_framebuffer_size(self._window)
-        mujoco.mjr_render(mujoco.MjrRect(0, 0, width, height), self.stage.scene, self._context)
-        self._glfw.swap_buffers(self._window)
+        with self._current():
+            mujoco.mjr_render(mujoco.MjrRect(0, 0, width, height), self.stage.scene, self._context)
+            self._glfw.swap_buffers(self._window)
         self._glfw.poll_events()
         self._due = max(self._due + self._vec.task.dt, time.perf_counter() - self._vec.task.dt)
         time.sleep(max(0.0, self._due - time.perf_counter()))
@@ -73,10 +79,19 @@ class Window:
     def close(self) -> None:
         """Close the window."""
         if self._window is not None:
-            self._glfw.make_context_current(self._window)
-            self._context.free()
+            with self._current():
+                self._context.free()
             self._glfw.destroy_window(self._window)
             self._window = None
+
+    @contextmanager
+    def _current(self) -> Iterator[None]:
+        """Let this thread draw in the window; afterwards others, of other libraries too, can draw in it again."""
+        self._glfw.make_context_current(self._window)
+        try:
+            yield
+        finally:
+            self._glfw.make_context_current(None)
 
     def _move_camera(self, camera: mujoco.MjvCamera) -> None:
         """Turn and zoom by what the mouse has done."""

@@ -159,6 +159,15 @@ def check_obstacles(saved: Mapping[str, np.ndarray], obstacles: Obstacles, scene
             )
 
 
+def half_extents(kind: np.ndarray, size: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return half the extents along the world's axes (M, 3) [m] of obstacles, or of the boxes that enclose them.
+
+    Args:
+        kind, size, rotation: of M obstacles, see `Obstacles`.
+    """
+    return np.where(kind[:, None] == SPHERE, size, np.einsum("mij,mj->mi", np.abs(rotation), size))
+
+
 def clear_obstacles(env: int, obstacles: Obstacles, first: int = 0) -> None:
     """Make the rows of one environment from `first` on free."""
     obstacles.kind[env, first:] = NONE

@@ -44,7 +44,7 @@ from multilift_marl.planning.maps import (
 from multilift_marl.rig.obstacles import NONE
 from multilift_marl.rig.system import System
 from multilift_marl.schema.values import Between, Counts, Float, Int, Section, Span, Vector
-from multilift_marl.sim.obstacles import Obstacles
+from multilift_marl.sim.obstacles import Obstacles, half_extents
 from multilift_marl.tasks.base import Kernels, Task
 from multilift_marl.tasks.target_checks import check_way, warn_of_time
 
@@ -224,8 +224,7 @@ def given_map(option: NavigateOptions, system: System, obstacles: Obstacles) -> 
         raise ConfigError("task_options.level=given needs task_options.start and task_options.goal, x, y, z [m] each")
     start, goal = np.array(option.start), np.array(option.goal)
     used = obstacles.kind[0] != NONE
-    # Spheres about them, whatever way they are turned.
-    far = np.linalg.norm(obstacles.size[0, used], axis=1, keepdims=True)
+    far = half_extents(obstacles.kind[0, used], obstacles.size[0, used], obstacles.rotation[0, used])
     if np.linalg.norm(goal - start) < APART:
         raise ConfigError(
             f"task_options.start and goal are less than {APART:g} m apart, and there is no way between them; move one"

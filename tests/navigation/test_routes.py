@@ -217,3 +217,18 @@ def test_what_has_no_route_is_refused_in_a_sentence(rows, goal, words):
     with pytest.raises(NoRoute, match=words) as refused:
         find_route(make_system(4), placed(rows), 0, START, np.array(goal), replace(ROOM, most=20_000))
     assert isinstance(refused.value, ConfigError) and "\n" not in str(refused.value)
+
+
+def test_long_walls_widen_the_space_along_themselves_alone():
+    walls = placed([(BOX, (50.0, 0.05, 1.5), (0.0, side * 2.0, 1.5), 0.0) for side in (-1.0, 1.0)])
+    settings = RouteSettings()
+    body = planner.make_body(make_system(4), *planner.make_shapes(make_system(4))[:2])
+    low, high = planner._space(START, GOAL, make_scene(walls, 0), body, settings)
+    assert low[:2] == pytest.approx([-52.0, -4.05]) and high == pytest.approx([52.0, 4.05, 5.0])
+
+
+def test_a_space_that_is_too_large_for_a_search_is_refused_with_its_cure():
+    far = placed([(SPHERE, (0.3, 0.3, 0.3), (300.0, 300.0, 30.0), 0.0)])
+    with pytest.raises(ConfigError, match=r"states of a search for a route, more than 2e\+08; bound it") as refused:
+        find_route(make_system(4), far, 0, START, GOAL)
+    assert not isinstance(refused.value, NoRoute)

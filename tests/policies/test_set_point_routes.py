@@ -79,6 +79,17 @@ def test_slots_are_pushed_away_from_what_their_own_drones_observe():
     assert (np.linalg.norm(moved, axis=1) > 0.05).sum() == 2
 
 
+def test_nothing_is_pushed_by_what_hangs_over_it_or_lies_below():
+    """Noise alone says on which side a ceiling's nearest point is."""
+    vec = make([])
+    policy = make_scripted("formation_repelled", vec)
+    observation, _ = vec.reset(seed=0)
+    points = vec.task.view.obstacle_readings.reshape(1, vec.num_drones, -1, 3)
+    points[0, :, 0] = [(0.02, -0.03, 0.9), (0.3, 0.2, -1.0), (0.1, 0.0, 0.1), (0.6, 0.0, 0.9)]
+    moved = np.linalg.norm(policy.act(observation)[0, :, :3], axis=-1) * vec.config.control.max_offset
+    assert moved == pytest.approx([0.0, 0.0, policy.GAIN * (policy.DISTANCE - 0.1), policy.GAIN * 0.7], abs=1e-6)
+
+
 def test_without_nearest_points_nothing_is_pushed():
     with pytest.raises(ConfigError, match="needs the nearest points"):
         make_scripted("formation_repelled", make([], **{"env.obstacle_sensing": "ranges", "train.observe": None}))

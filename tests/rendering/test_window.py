@@ -37,6 +37,30 @@ env.close()
 """
 
 
+# Pictures by EGL and a window by GLX, in turn in one thread, the first of either kind.
+BOTH = """
+import numpy as np
+from multilift_marl.envs import multilift_v0
+
+def make(mode):
+    env = multilift_v0.parallel_env(render_mode=mode, **{"env.num_threads": 1})
+    env.reset(seed=0)
+    return env
+
+pictures = make("rgb_array") if "pictures" == %r else None
+first = None if pictures is None else pictures.render()
+shown = make("human")
+shown.step({agent: np.zeros(4) for agent in shown.agents})
+pictures = pictures or make("rgb_array")
+first = pictures.render() if first is None else first
+shown.step({agent: np.zeros(4) for agent in shown.agents})
+print("the same", np.abs(pictures.render().astype(int) - first).max() < 4, first.std() > 5)
+shown.close()
+print("afterwards", np.abs(pictures.render().astype(int) - first).max() < 4)
+pictures.close()
+"""
+
+
 def without_display(**more):
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR")
     return {key: value for key, value in os.environ.items() if key not in hidden} | more
@@ -61,10 +85,35 @@ def test_both_single_team_apis_offer_it():
         assert api.metadata["render_modes"] == ["rgb_array", "human"]
 
 
+def on_screen(code, screen="1280x720x24"):
+    command = ["xvfb-run", "-a", "-s", f"-screen 0 {screen}", sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, env=without_display())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("xvfb-run"), reason="no virtual display on this machine")
+@pytest.mark.parametrize("first", ["pictures", "window"])
+def test_a_window_and_pictures_can_be_drawn_in_turn(first):
+    done = on_screen(BOTH % first)
+    assert done.stdout.splitlines() == ["the same True True", "afterwards True"], done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("xvfb-run"), reason="no virtual display on this machine")
+def test_a_display_without_opengl_is_refused_in_a_sentence():
+    code = (
+        "from multilift_marl.envs import multilift_v0\n"
+        "from multilift_marl.errors import RenderingError\n"
+        "try:\n    multilift_v0.parallel_env(render_mode='human').reset(seed=0)\n"
+        "except RenderingError as error:\n    print(error)\n"
+    )
+    done = on_screen(code, "1280x720x24 -extension GLX")
+    assert "; use render_mode" in done.stdout and done.stdout.count("\n") == 1, done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("xvfb-run"), reason="no virtual display on this machine")
 def test_a_window_shows_every_step():
-    command = ["xvfb-run", "-a", "-s", "-screen 0 1280x720x24", sys.executable, "-c", WATCH]
-    done = subprocess.run(command, capture_output=True, text=True, env=without_display())
+    done = on_screen(WATCH)
     expected = ["in step with the clock True", "drawn True True", "turned True", "closed True True"]
     assert done.stdout.splitlines() == expected, done.stderr

@@ -9,7 +9,7 @@ from multilift_marl.rig.obstacles import BOX, CYLINDER, SPHERE, resolve_scenery
 from multilift_marl.schema.scene import SceneConfig
 from multilift_marl.sim import World
 from multilift_marl.sim.obstacle_bodies import box_distance
-from multilift_marl.sim.obstacles import place_obstacle
+from multilift_marl.sim.obstacles import half_extents, place_obstacle
 
 TOP = 0.6
 
@@ -198,3 +198,14 @@ def test_moving_obstacles_start_anew_with_an_episode():
     vec.reset(seed=3)
     assert np.array_equal(vec.world.state.payload_position, first)
     assert (vec.world.obstacles.position[:, 0, 0] == 9.0).all() and (vec.task.min_clearance > 0.5).all()
+
+
+def test_half_extents_of_turned_boxes_and_cylinders_and_of_balls():
+    c, s = np.cos(0.6), np.sin(0.6)
+    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    lying = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    sizes = np.array([[0.5, 0.2, 1.0], [0.3, 0.3, 2.0], [0.4, 0.4, 0.4]])
+    found = half_extents(np.array([BOX, CYLINDER, SPHERE]), sizes, np.array([turned, lying, turned]))
+    box = [0.5 * c + 0.2 * s, 0.5 * s + 0.2 * c, 1.0]
+    np.testing.assert_allclose(found, [box, [0.3, 2.0, 0.3], [0.4, 0.4, 0.4]], atol=1e-12)
+    assert half_extents(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0, 3)

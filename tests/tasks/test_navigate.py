@@ -233,9 +233,8 @@ def test_a_given_map_is_the_scene_with_its_start_and_goal():
     own = vec.task.own
     assert (own.start == [-3, 0, 1.5]).all() and (own.goal == [3, 1, 1.6]).all()
     assert (vec.world.obstacles.kind == [[CYLINDER]]).all()
-    far = np.linalg.norm([0.2, 0.2, 2.0])
-    np.testing.assert_allclose(own.low[0], [-5, -far - 2, 2 - far - 2])
-    np.testing.assert_allclose(own.high[0], [5, far + 2, 2 + far + 2])
+    np.testing.assert_allclose(own.low[0], [-5, -0.2 - 2, 0 - 2])
+    np.testing.assert_allclose(own.high[0], [5, 1 + 2, 4 + 2])
     vec = make("navigate", num_envs=1, **GIVEN, **{"task_options.low": [-4, -1, 1], "task_options.high": [4, 2, 2]})
     vec.reset(seed=0)
     assert vec.task.own.low[0].tolist() == [-4, -1, 1] and vec.task.own.high[0].tolist() == [4, 2, 2]
