@@ -171,7 +171,8 @@ def jacobi(team: Team, start: np.ndarray, sweeps: int) -> np.ndarray:
     """Return what each drone plans to do (K, 3 N) after so many sweeps of the package's planner."""
     n, config = team.n, team.config
     links = Links(~np.eye(n, dtype=bool), 0, 0.0, np.inf)
-    planner = DistributedPlanner(config.system, config.planner.model_copy(update={"sweeps": sweeps}), 1, None, links)
+    settings = config.planner.model_copy(update={"sweeps": sweeps})
+    planner = DistributedPlanner(config.system, settings, 1, None, links, exact=True)
     shape = (n, *planner.times.shape)
     held = np.tile([0.0, 0.0, 2.0], (*shape, 1)), np.tile(np.eye(3), (*shape, 1, 1))
     plans = planner.plan(np.tile(team.rest + start, (n, 1)), *held, 0.0, np.zeros((n, shape[1], 12)))

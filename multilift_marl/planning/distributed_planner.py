@@ -2,8 +2,8 @@
 
 Drone n's problem holds the payload and its own cable and thrust; those of the others are as they said last. It is that
 of `riccati.py` for a team of one, whose payload feels the others' pulls, and their inertia along their cables. In a
-sweep each drone moves by 1/N to its own optimum (damped Jacobi iteration: a mean of N plans), says so, and then rolls
-the payload alone under what it knows of all.
+sweep each drone moves some way to its own optimum, says so, and then rolls the payload alone under what it knows of all
+(Jacobi's iteration; `sweep_shares` has the ways).
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ from multilift_marl.sensing.communication import Links
 from multilift_marl.sim.obstacles import Obstacles
 
 OWN = 19  # numbers of a drone's problem: payload 12, its cable 4, its thrust vector 3
-MOMENTUM = 0.4  # of a sweep's change, that the next one adds
+SLOWEST = 0.8  # see `sweep_shares`
+MOMENTUM = 0.4
 
 
 class ApartWork(NamedTuple):
@@ -89,17 +90,20 @@ class DistributedPlanner(TeamPlanner):
     Args:
         system, settings, num_envs, obstacles: see `TeamPlanner`.
         links: who hears whom; without delay after each sweep, else once in a policy step.
+        exact: whether plans are made from exact states, see `sweep_shares`.
 
     Attributes:
         weights: (E N, ...) TeamWeights, live; of each plan those of the payload and of the drone that has it count.
     """
 
     def __init__(
-        self, system: System, settings: PlannerConfig, num_envs: int, obstacles: Obstacles | None, links: Links
-    ):
+        self, system: System, settings: PlannerConfig, num_envs: int, obstacles: Obstacles | None, links: Links,
+        exact: bool = False,
+    ):  # fmt: skip
         n, steps = system.num_drones, settings.steps
         super().__init__(system, settings, n * num_envs, obstacles)
-        self.links, self.sweeps = links, settings.sweeps if links.delay == 0 else 1
+        self.links = links
+        self.shares = sweep_shares(settings.sweeps if links.delay == 0 else 1, n, exact)
         shape = num_envs, links.delay + 1, n, steps + 1, SAID
         self.post = Post(
             np.zeros(num_envs, np.uint64), np.zeros(num_envs, np.int64), np.zeros(shape), np.zeros((*shape[:3], 7)),
@@ -121,7 +125,7 @@ class DistributedPlanner(TeamPlanner):
         """See `TeamPlanner.plan`, with E N plans."""
         loads = self._agree(self._unloaded if loads is None else loads)
         given = self._given(states, positions, rotations, offsets, loads, shapes)
-        settings = elapsed, self.settings.step, self.sweeps
+        settings = elapsed, self.settings.step, self.shares
         team = self._flat, self.objective, self.weights, self.around
         plan_apart(given, settings, team, (self.links, self.post), self.plans, self._work, self._apart)
         return self.plans
@@ -142,6 +146,27 @@ class DistributedPlanner(TeamPlanner):
         post.sent_loads[np.arange(len(now)), now] = own
         total = own + (post.loads * post.has_loads[..., None]).sum(axis=2)
         return (total / (1 + post.has_loads.sum(axis=2))[..., None]).reshape(-1, 7)
+
+
+def sweep_shares(sweeps: int, n: int, exact: bool) -> np.ndarray:
+    """Return how far each of some sweeps of N drones moves (S, 2): a share of the way, and of the last sweep's change.
+
+    All move at once, each as if the others stayed: by whole steps what they want of the payload together is done N
+    times over, what they want against each other once or less. From exact states, Chebyshev's iteration, which leaves
+    least of all that is done `SLOWEST` to N times (Saad, Iterative methods for sparse linear systems, 2003, algorithm
+    12.1). Noise moves plans in ways that it keeps: from other states, 1/N of the way, to the mean, and some momentum.
+    """
+    shares = np.tile([1.0 / n, MOMENTUM], (sweeps, 1))
+    shares[0, 1] = 0.0
+    if exact and sweeps > 1:
+        middle, half = (n + SLOWEST) / 2, (n - SLOWEST) / 2
+        left = half / middle
+        shares[0, 0] = 1.0 / middle
+        for share in shares[1:]:
+            after = 1.0 / (2.0 * middle / half - left)
+            share[:] = 2.0 * after / half, after * left
+            left = after
+    return shares
 
 
 @kernel
@@ -255,14 +280,14 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
     """See `DistributedPlanner.plan`.
 
     Args:
-        given, settings, team: see `plan_teams`, with the number of sweeps in place of iterations, and TeamWeights
-            after the objective.
+        given, settings, team: see `plan_teams`, with `sweep_shares` in place of iterations, and TeamWeights after the
+            objective.
         radio: Links, Post.
         plans: Plans, overwritten.
         work: PlannerWork.
         apart: ApartWork.
     """
-    elapsed, h, sweeps = settings
+    elapsed, h, shares = settings
     flat, objective, weights, around = team
     links, post = radio
     count = flat.model.anchors.shape[0]
@@ -284,7 +309,7 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
         # Momentum is of the sweeps of one policy step.
         apart.change[:] = 0.0
         apart.input_change[:] = 0.0
-        for sweep in range(sweeps):
+        for sweep in range(shares.shape[0]):
             for n in range(count):
                 t = first + n
                 states, inputs = plans.states[t], plans.inputs[t]
@@ -295,8 +320,7 @@ def plan_apart(given, settings, team, radio, plans, work, apart):
                 own = weigh(t, weights, objective)
                 problem = Problem(apart.all_targets[n], apart.all_asked[n], h, flat.model, loads, own, here)
                 improve_own(n, states[0], states, inputs, problem, apart)
-                # All move at once, each as if the others stayed: a whole step of all would overshoot N times.
-                move_own(n, states, inputs, 1.0 / count, MOMENTUM * (sweep > 0), apart)
+                move_own(n, states, inputs, shares[sweep, 0], shares[sweep, 1], apart)
                 for k in range(states.shape[0]):
                     for i in range(SAID):
                         post.sent[e, now % kept, n, k, i] = states[k, said_at(i, n, q)]

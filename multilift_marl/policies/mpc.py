@@ -92,10 +92,10 @@ class TeamMpc:
                 "time; set control.disturbance=none, or planner.estimate=false"
             )
         self._vec, settings, self.preview = vec, config.planner, preview
+        self._exact = exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
         self.planner = self._make_planner()
         teams = len(self.planner.plans.states)
         self._dt = vec.task.dt
-        self._exact = exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
         cameras, onboard = config.env.sensing in CAMERAS, config.env.sensing in ("onboard", "blind")
         noise = settings.estimate_noise or (0.5 if exact else 2.0 if onboard else 1.0)
         self._estimator = None

@@ -43,7 +43,8 @@ class DistributedMpc(TeamMpc):
         links = Links(~np.eye(n, dtype=bool), 0, 0.0, np.inf)
         if env.communication != "none":
             links = make_links(env, np.arctan2(slots[:, 1], slots[:, 0]))
-        return DistributedPlanner(vec.world.system, vec.config.planner, vec.num_envs, vec.world.obstacles, links)
+        world, settings = vec.world, vec.config.planner
+        return DistributedPlanner(world.system, settings, vec.num_envs, world.obstacles, links, self._exact)
 
     def _time(self) -> np.ndarray:
         return np.repeat(self._vec.task.time, self._vec.num_drones)

@@ -10,7 +10,14 @@ import pytest
 from conftest import make_system
 
 import multilift_marl as ml
-from multilift_marl.planning.distributed_planner import DistributedPlanner, set_others, take_own
+from multilift_marl.planning.distributed_planner import (
+    MOMENTUM,
+    SLOWEST,
+    DistributedPlanner,
+    set_others,
+    sweep_shares,
+    take_own,
+)
 from multilift_marl.planning.flatness import FlatMotion, FlatWork, make_flat_team, set_flat_state, steady_shape
 from multilift_marl.planning.force_estimator import PAYLOAD, make_priors
 from multilift_marl.planning.plan_messages import believe, hear, said_at
@@ -101,17 +108,40 @@ def test_plans_come_near_the_central_one_and_agree():
     np.testing.assert_allclose(found.states[1:], found.states[:1].repeat(N - 1, axis=0), atol=1e-6)
 
 
-def test_sweeps_improve_plans():
+@pytest.mark.parametrize("exact", [False, True])
+def test_sweeps_improve_plans(exact):
     costs = []
     for sweeps in (1, 3, 10):
         settings = PlannerConfig(sweeps=sweeps)
-        apart = planner(settings)
+        apart = DistributedPlanner(make_system(N), settings, 1, None, links(), exact)
         _, start = at_rest(make_system(N))
         start[0] += 0.1
         positions, rotations, offsets = held(apart, N)
         found = apart.plan(np.tile(start, (N, 1)), positions, rotations, 0.0, offsets)
         costs.append(cost(apart, found.states[0], found.inputs[0]))
     assert costs[0] > costs[1] > costs[2]
+
+
+@pytest.mark.parametrize("drones", [2, 3, 8])
+@pytest.mark.parametrize("sweeps", [2, 3, 5, 12])
+def test_shares_of_sweeps_leave_what_chebyshevs_polynomial_does(sweeps, drones):
+    """Of an error that a whole step of all would undo `factor` times, from 1; of no fast one more than there was."""
+    shares = sweep_shares(sweeps, drones, exact=True)
+    assert shares.shape == (sweeps, 2) and shares[0, 1] == 0.0
+    middle, half = (drones + SLOWEST) / 2, (drones - SLOWEST) / 2
+    for factor in (0.0, 0.1, SLOWEST, 1.0, 0.7 * drones, drones):
+        left, change = 1.0, 0.0
+        for share, momentum in shares:
+            change = momentum * change - share * factor * left
+            left += change
+        of = np.polynomial.Chebyshev.basis(sweeps)
+        assert left == pytest.approx(of((middle - factor) / half) / of(middle / half), abs=1e-12)
+        assert abs(left) <= 1.0
+
+
+def test_from_noisy_states_and_in_a_single_sweep_drones_go_to_the_mean():
+    np.testing.assert_array_equal(sweep_shares(1, 4, exact=True), [[0.25, 0.0]])
+    np.testing.assert_array_equal(sweep_shares(3, 4, exact=False), [[0.25, 0.0], [0.25, MOMENTUM], [0.25, MOMENTUM]])
 
 
 def test_what_is_heard_late_is_moved_on():

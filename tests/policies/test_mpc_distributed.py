@@ -31,12 +31,12 @@ def test_paths_are_kept_to_within_half_a_millimetre(drones):
     assert not result["planner_failed"].any()
 
 
-@pytest.mark.parametrize("drones", [3, 6])
+@pytest.mark.parametrize("drones", [3, 6, 8])
 def test_fast_paths_are_kept_nearly_as_by_one_planner_of_all(drones):
     fast = {"env.num_drones": drones, "task_options.speed": 5.0, "task_options.acceleration": 8.0, "planner.sweeps": 5}
     apart, central = (fly(policy, "track", fast, 2, 8.0) for policy in ("mpc_distributed", "mpc"))
     assert not apart["failure_cause"].any()
-    assert apart["payload_rmse_m"].mean() < 1.5 * central["payload_rmse_m"].mean() < 4.5e-3
+    assert apart["payload_rmse_m"].mean() < 1.3 * central["payload_rmse_m"].mean() < 4e-3
 
 
 def test_forces_are_estimated_by_where_all_drones_were():
