@@ -51,13 +51,12 @@ class WeightedPlanner(TeamPlanner):
         loads: np.ndarray | None = None, shapes: np.ndarray | None = None,
     ) -> Plans:  # fmt: skip
         """See `TeamPlanner.plan`."""
-        loads = self._unloaded if loads is None else loads
-        given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
+        given = self._given(states, positions, rotations, offsets, loads, shapes)
         tape = self._none if self.tape is None else self.tape
         self._plan(given, elapsed, (self.slot, tape))
         if self.tape is not None:
             tape.states[:, self.slot], tape.inputs[:, self.slot] = states, self.plans.inputs[:, 0]
-            tape.loads[:, self.slot] = loads
+            tape.loads[:, self.slot] = given[1]
         return self.plans
 
     def _plan(self, given: tuple[Any, ...], elapsed: float, recorded: tuple[int, Tape]) -> None:

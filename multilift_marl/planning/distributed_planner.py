@@ -124,7 +124,7 @@ class DistributedPlanner(TeamPlanner):
     ) -> Plans:  # fmt: skip
         """See `TeamPlanner.plan`, with E N plans."""
         loads = self._agree(self._unloaded if loads is None else loads)
-        given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
+        given = self._given(states, positions, rotations, offsets, loads, shapes)
         settings = elapsed, self.settings.step, self.shares
         team = self._flat, self.objective, self.weights, self.around
         plan_apart(given, settings, team, (self.links, self.post), self.plans, self._work, self._apart)
@@ -145,7 +145,7 @@ class DistributedPlanner(TeamPlanner):
         now = np.where(begins, 0, post.steps) % post.sent.shape[1]
         post.sent_loads[np.arange(len(now)), now] = own
         total = own + (post.loads * post.has_loads[..., None]).sum(axis=2)
-        return np.ascontiguousarray((total / (1 + post.has_loads.sum(axis=2))[..., None]).reshape(-1, 7))
+        return (total / (1 + post.has_loads.sum(axis=2))[..., None]).reshape(-1, 7)
 
 
 def sweep_shares(sweeps: int, n: int, exact: bool) -> np.ndarray:

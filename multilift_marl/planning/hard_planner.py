@@ -94,8 +94,7 @@ class HardPlanner(TeamPlanner):
         loads: np.ndarray | None = None, shapes: np.ndarray | None = None,
     ) -> Plans:  # fmt: skip
         """Do as `TeamPlanner.plan`; how plans ended is in `hard.report`."""
-        loads = self._unloaded if loads is None else loads
-        given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
+        given = self._given(states, positions, rotations, offsets, loads, shapes)
         settings = elapsed, self.settings.step, self.settings.iterations or MOST_ITERATIONS, TOLERANCE
         team = self._flat, self.objective, self.limits, self.around
         solve_teams((0, len(states)), given, settings, team, self.plans, self.hard, self._newton)

@@ -83,7 +83,7 @@ def sample_spline(table: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Return the values of a spline and their first three derivatives at times (T,) [s], (4, T, D)."""
     t = np.asarray(t, float)
     found = np.empty((4, len(t), (table.shape[1] - 1) // 3))
-    _sample_pieces(table, t, found)
+    _sample_pieces(np.ascontiguousarray(table), t, found)
     return found
 
 

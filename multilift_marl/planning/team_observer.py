@@ -40,8 +40,8 @@ class TeamObserver:
 
     def update(self, measured: np.ndarray, dt: float, loads: np.ndarray) -> np.ndarray:
         """Return the states, live, by what is measured (E, 12 + 7 N) `dt` [s] after the last, under loads (E, 7)."""
-        own = self.states, self.fresh
-        _update(measured, dt, loads, own, self._model, self._gains, (self._work, self._after, self._rate, self._seen))
+        own, arrays = (self.states, self.fresh), (self._work, self._after, self._rate, self._seen)
+        _update(measured, dt, np.ascontiguousarray(loads), own, self._model, self._gains, arrays)
         return self.states
 
 

@@ -130,15 +130,26 @@ class TeamPlanner:
             loads: (E, 7) on the payload, see `team_model.accelerations`; None for none.
             shapes: (E, K + 1, 3, N, 3) the formation's nominal forces, see `flatness.set_flat_state`; None: as at rest.
         """
-        loads = self._unloaded if loads is None else loads
-        given = states, loads, (positions, rotations, self._steady if shapes is None else shapes, offsets)
+        given = self._given(states, positions, rotations, offsets, loads, shapes)
         settings = elapsed, self.settings.step, self.settings.iterations or 1
         plan_teams(given, settings, (self._flat, self.objective, self.around), self.plans, self._work)
         return self.plans
 
     def predict(self, states: np.ndarray, thrusts: np.ndarray, dt: float, loads: np.ndarray | None = None) -> None:
         """Move states (E, 12 + 7 N) on by the thrust vectors (T, E, 3 N) that were commanded, `dt` [s] apart."""
-        predict_states(states, thrusts, dt, self.model, self._unloaded if loads is None else loads, self._work)
+        loads = self._unloaded if loads is None else np.ascontiguousarray(loads)
+        predict_states(states, thrusts, dt, self.model, loads, self._work)
+
+    def _given(
+        self, states: np.ndarray, positions: np.ndarray, rotations: np.ndarray, offsets: np.ndarray,
+        loads: np.ndarray | None, shapes: np.ndarray | None,
+    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:  # fmt: skip
+        """Return what kernels take of `plan`, in one layout: for any other they would be compiled anew, a minute."""
+        loads = self._unloaded if loads is None else loads
+        shapes = self._steady if shapes is None else shapes
+        parts = states, loads, positions, rotations, shapes, offsets
+        states, loads, *targets = (np.require(part, float, ["C", "W"]) for part in parts)
+        return states, loads, tuple(targets)
 
 
 class PlannerWork(NamedTuple):

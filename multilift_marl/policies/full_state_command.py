@@ -89,7 +89,7 @@ class FullStateCommand:
         """Return positions of drones, velocities and accelerations of their hooks (E, N, 3) in states (E, 12 + 7 N)."""
         model, n = self._model, self._vec.num_drones
         count, q = len(states), 6 + 2 * n
-        write_tensions(states, model, loads, self._work, self._tension)
+        write_tensions(states, model, np.ascontiguousarray(loads), self._work, self._tension)
         rotation = rotations(states[:, 3:6])
         arm = np.einsum("eij,nj->eni", rotation, model.anchors)
         rates = np.einsum("eij,ej->ei", rotation, states[:, q + 3 : q + 6])
