@@ -60,14 +60,28 @@ def believe(m, said, later, states, inputs, h):
 
 
 @kernel
+def _is_sound(said):
+    """Return whether all that was said is finite."""
+    total = 0.0  # one number that is not makes the sum so
+    for k in range(said.shape[0]):
+        for i in range(SAID):
+            total += said[k, i]
+    return np.isfinite(total)
+
+
+@kernel
 def hear(e, slot, later, links, post, plans, h):
-    """Let the drones of team e believe what those have said whom they hear, `later` [steps] ago."""
+    """Let the drones of team e believe what those have said whom they hear, `later` [steps] ago.
+
+    A plan that was not finite is not believed: all that hear of it would fail in turn.
+    """
     said = post.sent[e, slot]
     count = said.shape[0]
     for n in range(count):
         for m in range(count):
             # A loss is drawn in any case: the draws of others stay the same.
-            if links.partners[n, m] and uniform(e, post) > links.loss and post.in_range[e, n, m]:
+            arrives = links.partners[n, m] and uniform(e, post) > links.loss and post.in_range[e, n, m]
+            if arrives and _is_sound(said[m]):
                 t = e * count + n
                 believe(m, said[m], later, plans.states[t], plans.inputs[t], h)
                 post.has_loads[e, n, m] = True

@@ -14,6 +14,7 @@ class LastPlan:
         plans: of `TeamPlanner`, for their shapes.
         step: length of a plan's steps [s].
         dt: policy step [s].
+        ahead: policy steps from when a plan is made until it begins.
 
     Attributes:
         age: (E,) time since the plan was made [s].
@@ -21,7 +22,8 @@ class LastPlan:
         steps, late, failed: (E,) policy steps of the episode, those with a late plan, those with one that failed.
     """
 
-    def __init__(self, plans: Plans, step: float, dt: float):
+    def __init__(self, plans: Plans, step: float, dt: float, ahead: int = 0):
+        self._begun = np.zeros((len(plans.states), ahead, plans.states.shape[2]))  # where plans under way begin
         self._states, self._inputs = np.zeros_like(plans.states), np.zeros_like(plans.inputs)
         self._step, self._dt = step, dt
         num_envs = len(self._states)
@@ -36,13 +38,21 @@ class LastPlan:
 
     def keep(self, plans: Plans, late: bool, failed: np.ndarray) -> None:
         """Take over the plans that came in time and did not fail (E,); all others grow older by a policy step."""
-        sound = ~failed & (not late)
+        sound, first = ~failed & (not late), np.isinf(self.without)
         self._states[sound], self._inputs[sound] = plans.states[sound], plans.inputs[sound]
         self.age = np.where(sound, 0.0, self.age + self._dt)
         self.without = np.where(sound, 0.0, self.without + self._dt)
         self.steps += 1.0
         self.late += late
         self.failed += failed
+        if self._begun.shape[1]:
+            self._begun[:, :-1] = self._begun[:, 1:]
+            self._begun[:, -1] = self.states()
+            self._begun[first] = self._begun[first, -1:]  # nothing was planned for so early
+
+    def next(self) -> np.ndarray:
+        """Return where the team was planned to be (E, 12 + 7 N) a policy step after plans were made last."""
+        return self._begun[:, 0].copy() if self._begun.shape[1] else self.states(self._dt)
 
     def states(self, later: float | np.ndarray = 0.0) -> np.ndarray:
         """Return the planned states (E, 12 + 7 N) `later` [s] from now, scalar or (E,); where a plan ends, its last."""
@@ -60,7 +70,7 @@ class LastPlan:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the live arrays, by name."""
-        names = "_states", "_inputs", "age", "without", "steps", "late", "failed"
+        names = "_states", "_inputs", "_begun", "age", "without", "steps", "late", "failed"
         return {name.lstrip("_"): getattr(self, name) for name in names}
 
     def metrics(self) -> dict[str, np.ndarray]:

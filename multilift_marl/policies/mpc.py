@@ -123,7 +123,7 @@ class TeamMpc:
         self._sent = np.zeros((under_way + 1, teams, 3 * n))
         self._starts = np.zeros((under_way + 1, teams, 12 + 7 * n))  # of the plans for now and later
         self._fresh, self._acted = np.ones(teams, bool), np.zeros(teams)
-        self._last = LastPlan(self.planner.plans, settings.step, self._dt)
+        self._last = LastPlan(self.planner.plans, settings.step, self._dt, under_way)
         self._without_plan = self._make_fallback()
         self._approach = Approach.zeros(teams)
         self._offsets = np.zeros((teams, settings.steps + 1, 12))
@@ -192,7 +192,7 @@ class TeamMpc:
         states, payload_rotation, drag = self._measure()
         unknown = ~np.isfinite(states).all(axis=1)
         if unknown.any():
-            states[unknown] = self._last.states(self._dt)[unknown]
+            states[unknown] = self._last.next()[unknown]
             payload_rotation[unknown] = np.eye(3)
             drag[~np.isfinite(drag).all(axis=(1, 2))] = 0.0
         loads, forces = self._unknown(self._fresh)
@@ -293,7 +293,7 @@ class TeamMpc:
         """Let estimates that are not finite begin anew from planned states; return whose they were (E,)."""
         lost = ~np.isfinite(np.hstack([states, loads, forces])).all(axis=1)
         if lost.any():
-            states[lost] = self._last.states(self._dt)[lost]
+            states[lost] = self._last.next()[lost]
             loads[lost], forces[lost] = 0.0, 0.0
             if self._estimator is not None:
                 self._estimator.estimate.fresh[lost] = True

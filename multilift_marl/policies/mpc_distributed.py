@@ -44,6 +44,9 @@ class DistributedMpc(TeamMpc):
         if env.communication != "none":
             links = make_links(env, np.arctan2(slots[:, 1], slots[:, 0]))
         world, settings = vec.world, vec.config.planner
+        if env.sensing in ("onboard", "blind"):
+            # By senses of their own drones disagree on the payload, the more so with each sweep, until they tilt over.
+            settings = settings.model_copy(update={"sweeps": 1})
         return DistributedPlanner(world.system, settings, vec.num_envs, world.obstacles, links, self._exact)
 
     def _time(self) -> np.ndarray:
@@ -95,12 +98,14 @@ class DistributedMpc(TeamMpc):
         """See `TeamMpc._measure`, (E N, ...): as each drone knows the payload, and plans of the others."""
         e, n = self._vec.num_envs, self._vec.num_drones
         self.planner.measure_ranges(self._vec.world.state.drone_position)
-        parts = [super(DistributedMpc, self)._measure_by(m) for m in range(n)]
+        # Where all is said at once, so is where each takes the payload to be: all know the mean.
+        knows = range(n) if self._vec.config.env.communication != "none" else [None] * n
+        parts = [super(DistributedMpc, self)._measure_by(m) for m in knows]
         states = np.stack([part[0] for part in parts], axis=1).reshape(e * n, -1)
         rotations = np.stack([part[1] for part in parts], axis=1).reshape(e * n, 3, 3)
         known = ~self._fresh
         if known.any():
-            planned, others = self._last.states(self._dt), others_of(n)
+            planned, others = self._last.next(), others_of(n)
             rows = np.flatnonzero(known)
             states[rows[:, None], others[rows % n]] = planned[rows[:, None], others[rows % n]]
         return states, rotations, parts[0][2]

@@ -144,6 +144,19 @@ def test_from_noisy_states_and_in_a_single_sweep_drones_go_to_the_mean():
     np.testing.assert_array_equal(sweep_shares(3, 4, exact=False), [[0.25, 0.0], [0.25, MOMENTUM], [0.25, MOMENTUM]])
 
 
+def test_a_plan_that_is_not_finite_is_not_believed():
+    """Nor is one that was sound before forgotten for it."""
+    apart = planner(delay=1)
+    _, start = at_rest(make_system(N))
+    positions, rotations, offsets = held(apart, N)
+    states = np.tile(start, (N, 1))
+    for step in range(6):
+        if step == 2:
+            apart.plans.states[0, :, 6] = np.nan  # the own cable of the first drone
+        failed = apart.plan(states, positions, rotations, 0.02, offsets).failed
+        assert failed.tolist() == [step == 2, False, False]
+
+
 def test_what_is_heard_late_is_moved_on():
     steps = 10
     times = STEP * np.arange(steps + 1)

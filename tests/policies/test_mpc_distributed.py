@@ -57,6 +57,19 @@ def test_forces_are_estimated_by_where_all_drones_were():
     assert np.ptp([each[0, cables] for each in true], axis=0).min() > 0
 
 
+@pytest.mark.parametrize("told", [{}, {"env.communication": "all", "env.communication_delay": 0}])
+def test_drones_with_senses_of_their_own_hold_the_payload_by_what_is_said_at_once(told):
+    result = fly("mpc_distributed", "hover", {"env.sensing": "onboard"} | told, seconds=8.0)
+    assert not result["failure_cause"].any() and (result["payload_position_error_m"] < 0.15).all()
+
+
+def test_where_the_others_are_is_not_where_their_plans_begin():
+    """With actions that come late plans begin later."""
+    late = {"randomization.action_delay": 4, "planner.delay": 0.08, "task_options.acceleration": 6.0}
+    result = fly("mpc_distributed", "track", late | {"task_options.speed": 3.0})
+    assert not result["failure_cause"].any() and (result["payload_rmse_m"] < 0.04).all()
+
+
 def test_unknown_masses_and_forces_are_held():
     result = fly("mpc_distributed", "hover", {}, seconds=8.0)
     assert result["success_rate"].all() and (result["payload_position_error_m"] < 0.003).all()

@@ -102,3 +102,19 @@ def test_a_plan_is_read_at_its_age_and_ends():
         assert last.without[0] == pytest.approx(0.25 * k)
     assert last.metrics()["planner_failed"][0] == pytest.approx(7 / 8)
     assert last.states(-0.25)[0, 0] == pytest.approx(9)
+
+
+def test_where_a_team_is_planned_to_be_next_is_where_the_plan_for_then_begins():
+    """Plans that begin two steps after they are made, by the numbers of those steps."""
+    shape = np.zeros((1, 4, 5))
+    plans = Plans(shape, shape[:, 1:, :3], shape, np.zeros(1, bool), np.zeros(1, bool))
+    last, good, bad = LastPlan(plans, 0.25, 0.25, 2), np.zeros(1, bool), np.ones(1, bool)
+    for step in range(5):
+        plans.states[:] = step + 2.0 + np.arange(4.0)[None, :, None]  # a state is the number of its step
+        last.keep(plans, False, good)
+        assert last.next()[0, 0] == max(step + 1.0, 2.0)  # the first plan tells of no earlier one
+    last.keep(plans, False, bad)
+    assert last.next()[0, 0] == 6.0
+    last.keep(plans, False, bad)
+    assert last.next()[0, 0] == 7.0  # where the last sound plan goes on
+    assert LastPlan(plans, 0.25, 0.25).next()[0, 0] == 0.0
