@@ -4,7 +4,7 @@ A test that takes `task` runs for every task, one that takes `num_drones` for ev
 configuration of a cable model, for both models. Of these, tasks that are not in `COMMON`, and for tasks other than
 `hover` all but two drones on massless cables, are marked `slow`; with the mark `few_tasks`, all but `hover`. Tests so
 marked are left out unless asked for by `-m slow`; each task has default tests of its own in `tests/tasks`. Not all
-combinations are flown, see `is_redundant`.
+combinations are flown, see `is_redundant`. Slow tests whose names begin as a line of `long.txt` are marked `long`, too.
 """
 
 from __future__ import annotations
@@ -64,6 +64,7 @@ NUM_DRONES = (1, 2, 6)
 CABLES = {"massless": {"cable.model": "massless"}, "chain": {"cable.model": "chain", "cable.segments": 3}}  # few: fast
 GRAVITY = 9.81
 EXAMPLES = Path(__file__).parents[1] / "examples"
+LONG = tuple(Path(__file__).with_name("long.txt").read_text(encoding="utf-8").splitlines())  # names begin so
 TIMESTEPS = (5e-4, 1e-3, 2e-3, 4e-3)
 OFF_CENTRE = [[0.25, 0.2, 0.08], [-0.3, 0.2, 0.08], [-0.3, -0.2, 0.08], [0.25, -0.2, 0.08]]
 INFO = {"success", "failure", "diverged", "failure_cause", "reward_terms", "randomization"}
@@ -131,6 +132,9 @@ def pytest_collection_modifyitems(config, items):
     config.hook.pytest_deselected(items=list(redundant))
     items[:] = [item for item in items if item not in redundant]
     for item in items:
+        if item.nodeid.removeprefix("tests/").startswith(LONG):
+            item.add_marker(pytest.mark.long)
+            item.add_marker(pytest.mark.slow)
         asked = asked_of(item)
         if "planner_weights" in [value for value in asked.values() if isinstance(value, str)]:
             # Its planner takes a minute to compile.

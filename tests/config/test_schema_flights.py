@@ -25,7 +25,7 @@ pytest.importorskip("hypothesis")  # of the dev extra
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-DRAWS = int(os.environ.get("FLIGHT_DRAWS", "100"))
+DRAWS = int(os.environ.get("FLIGHT_DRAWS", "40"))
 SECTIONS = ("env", "sim", "vehicle", "payload", "cable", "control", "randomization", "wind")
 SIZES = ("env.num_envs", "env.num_threads")  # cost memory and threads, and change nothing else
 FILES = ("payload.mesh",)

@@ -1,5 +1,6 @@
 """The package as users get it: the wheel, the base without torch, the documents."""
 
+import gc
 import os
 import re
 import runpy
@@ -266,6 +267,8 @@ def run(command, folder, monkeypatch):
         monkeypatch.setattr(bench, "STEP", bench.IMPORT)
         bench.main(arguments)
         return
+    if script == "bench/soak.py":  # seconds each time, of all that the tests' process holds
+        monkeypatch.setattr(gc, "collect", lambda: 0)
     if script.startswith(("bench/", "results/")):
         monkeypatch.chdir(folder)
         monkeypatch.syspath_prepend(str((ROOT / script).parent))
@@ -292,8 +295,14 @@ def of_documents():
     return train, sorted(follow, key=lambda command: ("resume" in command, "export " not in command, command)), alone
 
 
+def with_marks(commands):
+    """Return the commands as parameters, those that start a cluster or environments of others as long ones."""
+    apart = re.compile(r"workers=2|bench/(workers|peers)|ray_tune")
+    return [pytest.param(each, marks=[pytest.mark.long] if apart.search(each) else []) for each in commands]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("command", of_documents()[0])
+@pytest.mark.parametrize("command", with_marks(of_documents()[0]))
 def test_commands_that_train_run(command, tmp_path, monkeypatch, registries):
     (tmp_path / "results").symlink_to(ROOT / "results")  # whose scripts some recipes correct
     run(command, tmp_path, monkeypatch)
@@ -309,7 +318,7 @@ def test_commands_that_follow_a_training_run(tmp_path, monkeypatch, registries):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", of_documents()[2])
+@pytest.mark.parametrize("command", with_marks(of_documents()[2]))
 def test_commands_of_documents_run(command, tmp_path, monkeypatch, registries):
     (tmp_path / "results").symlink_to(ROOT / "results")
     monkeypatch.setattr(plots, "_save", lambda *arguments: None)  # most of the time; see test_evaluation.py
