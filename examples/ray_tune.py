@@ -16,7 +16,8 @@ from ray import tune
 from ray.tune.schedulers import ASHAScheduler
 from torch.nn.utils import parameters_to_vector
 
-from multilift_marl._ray import connect, disconnect
+from multilift_marl._ray import check_versions, connect, disconnect
+from multilift_marl._versions import find_versions
 from multilift_marl.agents.trainer import new_run
 from multilift_marl.config.load import load_config, parse_overrides
 
@@ -25,8 +26,9 @@ EVERY = 20  # iterations between evaluations, after each of which a trial may en
 DEFAULTS = {"train.learning_rate": "loguniform(3e-4, 3e-3)", "train.epochs": "choice(1, 2, 4)"}
 
 
-def fly_trial(values: dict[str, Any], recipe: str, iterations: int, folder: str) -> None:
-    """Train one candidate and report its evaluations."""
+def fly_trial(values: dict[str, Any], recipe: str, iterations: int, folder: str, versions: dict[str, str]) -> None:
+    """Train one candidate and report its evaluations; `versions` are those of the search."""
+    check_versions(versions)
     trainer = new_run(load_config(recipe, values), f"tune_{recipe}", Path(folder) / "runs")
     start = weights(trainer)
     last = min(iterations, trainer.iterations)  # train.frames may end it earlier
@@ -69,7 +71,9 @@ def train(iterations: int = 100, horizon: int = 64, trials: int = 8, arguments: 
     here, owns = Path.cwd(), connect("auto", 1, "ray")
     try:
         tuner = tune.Tuner(
-            tune.with_parameters(fly_trial, recipe=recipe, iterations=iterations, folder=str(here)),
+            tune.with_parameters(
+                fly_trial, recipe=recipe, iterations=iterations, folder=str(here), versions=find_versions()
+            ),
             param_space=space,
             tune_config=tune.TuneConfig(
                 metric="score", mode="max", num_samples=trials, scheduler=ASHAScheduler(grace_period=2)

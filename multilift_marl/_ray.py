@@ -20,6 +20,7 @@ from typing import Any
 
 from multilift_marl._interrupt import last_acts
 from multilift_marl._platform import STOPPING, cpu_count, handles_signals
+from multilift_marl._versions import find_versions
 from multilift_marl.errors import ConfigError, pip_install, reason
 
 _LOOPBACK = "127.0.0.1"
@@ -181,6 +182,28 @@ def enter_worker(folder: str, path: list[str]) -> None:
     if os.path.isdir(folder):
         os.chdir(folder)
     sys.path += [each for each in path if each not in sys.path]
+
+
+def check_versions(caller: dict[str, str]) -> None:
+    """Refuse, by a ConfigError in a process of Ray, versions that are not its caller's: results would differ."""
+    here = find_versions()
+    if here != caller:
+        own, others = (", ".join(" ".join(each) for each in found.items()) for found in (here, caller))
+        raise ConfigError(
+            f"the node {socket.gethostname()} of the cluster of Ray has {own}, but its caller has {others}; install "
+            "the same on every node (docs/ray.md)"
+        )
+
+
+def get(result: Any) -> Any:
+    """Return a result of Ray; what its process raised is raised as it would be here."""
+    import ray
+
+    try:
+        return ray.get(result)
+    except ray.exceptions.RayTaskError as error:
+        # Its own text is a traceback.
+        raise error.cause from error
 
 
 def wait(result: Any, check: Callable[[], None]) -> None:

@@ -37,7 +37,8 @@ from tables import write_tables
 
 from multilift_marl._files import write_whole
 from multilift_marl._platform import cpu_count
-from multilift_marl._ray import connect, disconnect
+from multilift_marl._ray import connect, disconnect, get
+from multilift_marl._versions import find_versions
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config, load_config
 from multilift_marl.envs.core import MultiliftVec
@@ -157,9 +158,9 @@ def spread_by_ray(function: Callable[[Any], str], jobs: list[Any], workers: int,
     try:
         while waiting or running:
             while waiting and len(running) < workers:
-                running.append(task.remote(waiting.pop(0), str(ROOT), str(HERE)))
+                running.append(task.remote(waiting.pop(0), str(ROOT), str(HERE), find_versions()))
             done, running = ray.wait(running)
-            yield ray.get(done[0])
+            yield get(done[0])
     finally:
         for each in running:  # an interrupted training saves its checkpoint
             ray.cancel(each)
@@ -169,12 +170,15 @@ def spread_by_ray(function: Callable[[Any], str], jobs: list[Any], workers: int,
             disconnect()
 
 
-def _call_here(content: bytes, root: str, scripts: str) -> str:
+def _call_here(content: bytes, root: str, scripts: str, versions: dict[str, str]) -> str:
     """Call a pickled function with its job, in a process of Ray, as if it were one of this script."""
     from ray import cloudpickle
 
+    from multilift_marl._ray import check_versions
+
     os.chdir(root)
     sys.path.insert(0, scripts)
+    check_versions(versions)
     function, job = cloudpickle.loads(content)
     return str(function(job))
 

@@ -133,12 +133,16 @@ class TrainedPolicy:
         """
         if reason := self.misfit_config(config):
             raise ConfigError(f"the policy of {self.source} {reason}")
-        if changed := changed_meanings(self.config, config):
-            own = " ".join(spell(key, self.config) for key in changed)
-            warn_once(
-                "agents", f"the policy of {self.source} was configured with {own}; the values here change what its "
-                "actions and observations mean",
-            )  # fmt: skip
+        if warning := self.warning(config):
+            warn_once("agents", f"the policy of {self.source} {warning}")
+
+    def warning(self, config: Config) -> str:
+        """Return of what `check` warns, as the rest of a sentence, "" if of nothing."""
+        changed = changed_meanings(self.config, config)
+        own = " ".join(spell(key, self.config) for key in changed)
+        return (
+            f"was configured with {own}; the values here change what its actions and observations mean" if own else ""
+        )
 
     def misfit_config(self, config: Config) -> str:
         """Return why the policy does not fit a configuration, as the rest of a sentence, "" if nothing tells so."""
@@ -255,6 +259,10 @@ class Script(NamedTuple):
     def check(self, config: Config, role: str = "") -> None:
         """Do as `TrainedPolicy.check`."""
         check_interface(self.name, config.control.action, role)
+
+    def warning(self, config: Config) -> str:
+        """Return nothing: its actions and observations are those of the environments."""
+        return ""
 
     def misfit(self, vec: MultiliftVec) -> str:
         """Return nothing: `bind` refuses what does not fit."""

@@ -19,6 +19,7 @@ from tensordict import TensorDict
 
 from multilift_marl import _ray
 from multilift_marl._platform import cpu_count
+from multilift_marl._versions import find_versions
 from multilift_marl.agents.mappo import StochasticPolicy, make_actor
 from multilift_marl.agents.networks import Actor
 from multilift_marl.agents.rollouts import Batches, Rollouts
@@ -99,10 +100,7 @@ class Workers:
                 raise ValueError(f"the saved state does not fit: '{key}' has no row for each of {total} environments")
         for k in range(len(self._workers)):
             rows = {key: tensor[self._bounds[k] : self._bounds[k + 1]].numpy() for key, tensor in saved.items()}
-            try:
-                self._ask(k, partial(_set_state, rows=rows))
-            except self._ray.exceptions.RayTaskError as error:
-                raise ValueError(str(error.cause)) from error
+            self._ask(k, partial(_set_state, rows=rows))
             self._states[k] = rows
 
     def close(self, at_once: bool = False) -> None:
@@ -130,7 +128,7 @@ class Workers:
             config.model_dump(), {"env.num_envs": end - first, "env.num_threads": threads}
         ).model_dump(mode="json")
         worker: Any = self._ray.remote(**_ray.ACTOR)(_Worker).remote(os.getcwd(), list(sys.path))
-        self._built[k] = worker.build.remote(values, first, total, self._purpose)
+        self._built[k] = worker.build.remote(values, first, total, self._purpose, find_versions())
         self._pulses[k] = _ray.Pulse("train.workers")
         return worker
 
@@ -163,16 +161,14 @@ class Workers:
         Raises:
             ConfigError: the cluster is lost, has no room for the worker, or cannot build its environments.
             Silent: the worker does not say that it is alive.
+            Exception: what the worker itself raised.
         """
         if self._built[k] is not None:
             _ray.wait(self._built[k], lambda: self._check(k))
-            try:
-                self._ray.get(self._built[k])
-            except self._ray.exceptions.RayTaskError as error:
-                raise error.cause from error
+            _ray.get(self._built[k])
             self._built[k] = None
         _ray.wait(result, lambda: self._check(k))
-        return self._ray.get(result)
+        return _ray.get(result)
 
     def _check(self, k: int) -> None:
         """Refuse a cluster that is lost, and a worker that has not been heard of for too long."""
@@ -198,7 +194,7 @@ class _Worker:
         """Return the number of this process, by a thread of its own: it runs."""
         return os.getpid()
 
-    def build(self, values: dict[str, Any], first: int, total: int, purpose: int) -> None:
+    def build(self, values: dict[str, Any], first: int, total: int, purpose: int, versions: dict[str, str]) -> None:
         """Make the environments.
 
         Args:
@@ -206,7 +202,12 @@ class _Worker:
             first: number of the first.
             total: environments of the training.
             purpose: of their seeds.
+            versions: of the learner.
+
+        Raises:
+            ConfigError: versions here are others.
         """
+        _ray.check_versions(versions)
         # Processes are the parallel part; threads of each would fight for the same cores.
         torch.set_num_threads(1)
         config = build_config(values, {})

@@ -11,13 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-import mujoco
 from pydantic import Field
 
 import multilift_marl as ml
 from multilift_marl import plugins
 from multilift_marl._files import write_whole
 from multilift_marl._interrupt import ending_at_once, interrupted_by_signals
+from multilift_marl._versions import find_versions
 from multilift_marl.agents.policy import NamedPolicy, Script, find_policy, load_policy
 from multilift_marl.cli.evaluate import fly
 from multilift_marl.command import (
@@ -49,6 +49,8 @@ A trained policy brings the control, env.history and env.units that it was train
 control.action=ctbr, say. All else is the suite's. Tasks that a policy cannot fly are listed with the reason."""
 _SHIPPED = Path(ml.__file__).parent / "policies"
 _BROUGHT = ("control", "env.history", "env.units")
+_ADDED = ("versions", "sources"), ("policy", "sha256")
+"""What cards of earlier versions may not say; a card that goes on from one does not say it either."""
 
 
 class Options(CommandOptions):
@@ -75,6 +77,8 @@ class _Contender(NamedTuple):
     name: str
     config: Config
     make: Callable[[MultiliftVec], Any]
+    warning: str
+    """What is to be known of that, see `TrainedPolicy.warning`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,30 +106,36 @@ def _benchmark(values: dict[str, Any], alone: bool) -> int:
             "digest": suite.digest,
             "seed": suite.seed,
             "episodes": episodes,
-            "versions": {"multilift_marl": ml.__version__, "mujoco": mujoco.__version__},
+            "versions": find_versions(),
             "policy": {"name": name, "sha256": _digest(_source(policy, name)), "brings": brought},
         }
         card = _begin(out / "card.json", head, refused)
-    print(f"{card['benchmark']}, suite {suite.name}: {name}, {episodes} episodes of each task")
-    try:
-        with interrupted_by_signals(), ExitStack() as stack:
-            if options.workers:
-                stack.enter_context(cluster(options.ray, options.workers))
-                stack.enter_context(interrupted_by_signals())  # in place of Ray's handler
+    print(f"{card['benchmark']}, suite {suite.name}: {name}, {episodes} episodes of each task, into {out}")
+    with interrupted_by_signals(), ExitStack() as stack:
+        if options.workers:
+            stack.enter_context(cluster(options.ray, options.workers))
+            stack.enter_context(interrupted_by_signals())  # in place of Ray's handler
+        try:
             for task in suite.tasks:
                 if task.name not in card["tasks"]:
                     card["tasks"][task.name] = _fly(task, contenders[task.name], suite, episodes, options)
                     _write(out, card)
-    except KeyboardInterrupt:
-        done = sum("policies" in row for row in card["tasks"].values())
+        except (KeyboardInterrupt, Exception) as error:  # a policy of one's own may raise anything
+            done = sum("policies" in row for row in card["tasks"].values())
+            _finish(out, suite, card)
+            again = options.model_dump(include=options.model_fields_set) | {"episodes": episodes, "out": str(out)}
+            command = join_command("python", "-m", "multilift_marl.benchmark", *_spell(again | given))
+            print(f"stopped after {done} of {len(contenders)} tasks; go on by: {command}", file=sys.stderr)
+            if isinstance(error, KeyboardInterrupt):
+                return 130
+            raise
         _finish(out, suite, card)
-        again = options.model_dump(include=options.model_fields_set) | {"episodes": episodes, "out": str(out)} | given
-        words = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in again.items()]
-        command = join_command("python", "-m", "multilift_marl.benchmark", *words)
-        print(f"stopped after {done} of {len(contenders)} tasks; go on by: {command}", file=sys.stderr)
-        return 130
-    _finish(out, suite, card)
     return 0
+
+
+def _spell(values: dict[str, Any]) -> list[str]:
+    """Return values by key as arguments of the command."""
+    return [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in values.items()]
 
 
 def _find(options: Options, given: dict[str, Any]) -> tuple[NamedPolicy, dict[str, Any]]:
@@ -160,8 +170,7 @@ def _check(
     for task in suite.tasks:
         try:
             config = _configure(task, brought)
-            if policy.config is None:
-                policy.check(config, "policy")
+            policy.check(config, "policy")
             probe = MultiliftVec(build_config(config.model_dump(), {"env.num_envs": 1}))
             if not (why := policy.misfit(probe)):
                 policy.bind(probe)
@@ -170,13 +179,15 @@ def _check(
         if why:
             refused[task.name] = why
             continue
-        teams = {"policy": _Contender(name, config, policy.bind)}
+        teams = {"policy": _Contender(name, config, policy.bind, policy.warning(config))}
         if task.baseline != name:
-            teams["baseline"] = _Contender(task.baseline, _configure(task, {}), Script(task.baseline).bind)
+            teams["baseline"] = _Contender(task.baseline, _configure(task, {}), Script(task.baseline).bind, "")
         weights = None if task.shipped is None else _SHIPPED / f"{task.shipped}.pt"
         if weights is not None and _digest(weights) != _digest(_source(policy, name)):
             shipped = load_policy(weights)
-            teams["shipped"] = _Contender(str(task.shipped), _configure(task, _brought(shipped)), shipped.bind)
+            config = _configure(task, _brought(shipped))
+            shipped.check(config)
+            teams["shipped"] = _Contender(str(task.shipped), config, shipped.bind, shipped.warning(config))
         contenders[task.name] = teams
     if not contenders:
         first, why = next(iter(refused.items()))
@@ -190,10 +201,14 @@ def _configure(task: BenchmarkTask, brought: dict[str, Any]) -> Config:
 
 
 def _source(policy: NamedPolicy, name: str) -> Path | None:
-    """Return the file of a policy: its weights, or the module of a class of one's own."""
+    """Return the file of a policy: its weights, or the module of a class of one's own, which is imported already."""
     if policy.config is not None:
         return Path(policy.source)
-    return plugins.find_file(name.rpartition(":")[0]) if ":" in name else None
+    if ":" not in name:
+        return None
+    module, _ = plugins.import_module(name.rpartition(":")[0], "policy")
+    file = getattr(module, "__file__", None)
+    return None if file is None else Path(file)
 
 
 def _digest(path: Path | None) -> str | None:
@@ -202,20 +217,25 @@ def _digest(path: Path | None) -> str | None:
 
 def _begin(path: Path, head: dict[str, Any], refused: dict[str, str]) -> dict[str, Any]:
     """Return a card with the rows that the file has already, if it is of the same evaluation."""
-    card = head | {"complete": False, "tasks": {name: {"not_applicable": why} for name, why in refused.items()}}
+    tasks: dict[str, Any] = {name: {"not_applicable": why} for name, why in refused.items()}
     if not path.exists():
-        return card
+        return head | {"complete": False, "tasks": tasks}
     try:
         known = json.loads(path.read_text(encoding="utf-8"))
         found = {key: known[key] for key in head}
-        rows = {name: row for name, row in known["tasks"].items() if "policies" in row}
+        unknown = [(part, key) for part, key in _ADDED if found[part].get(key) is None and head[part][key] is not None]
+        tasks |= {name: row for name, row in known["tasks"].items() if "policies" in row}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path} is no card to go on with ({reason(error)}); give another folder by out=") from error
+    for part, key in unknown:
+        found[part] |= {key: None}
+        head = head | {part: head[part] | {key: None}}
     for key, value in json.loads(json.dumps(head)).items():
         if found[key] != value:
             raise ConfigError(f"{path} is of another evaluation, its {key} differs; give another folder by out=")
-    card["tasks"] |= rows
-    return card
+    for part, key in unknown:
+        print(f"note: {path} does not say {key} of {part}, so its rows may be of other code; out=<folder> begins anew")
+    return head | {"complete": False, "tasks": tasks}
 
 
 def _fly(
@@ -232,6 +252,7 @@ def _fly(
         "policies": {
             label: {
                 "name": teams[label].name,
+                **({"warning": warning} if (warning := teams[label].warning) else {}),
                 "metrics": summarize(each, causes),
                 "unsuccessful": explain(each, causes),
             }

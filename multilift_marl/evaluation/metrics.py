@@ -258,12 +258,15 @@ def format_reasons(report: dict[str, Any], name: str = "policy") -> str:
 def format_card(card: dict[str, Any]) -> str:
     """Return a card of the benchmark as Markdown: a table of the tasks, and why the policy cannot fly the others."""
     cells = [["task", "policy", "best baseline", "shipped policy", "policy - baseline: points, cm"]]
-    refused, reasons = [], []
+    refused, warnings, reasons = [], [], []
     for name, row in card["tasks"].items():
         if "not_applicable" in row:
             cells.append([name, "not applicable", "-", "-", "-"])
             refused.append(f"- {name}: {row['not_applicable']}")
             continue
+        warnings += [
+            f"- {name}: {each['name']} {each['warning']}" for each in row["policies"].values() if "warning" in each
+        ]
         if unsuccessful := row["policies"]["policy"].get("unsuccessful"):  # none in cards of former versions
             reasons.append(format_explanation(unsuccessful, name, card["episodes"]))
         cells.append([name])
@@ -278,6 +281,8 @@ def format_card(card: dict[str, Any]) -> str:
     whole = "" if card["complete"] else "; not complete"
     told = f"{card['policy']['name']}: {place}, {card['episodes']} episodes of each task{whole}"
     parts = [told, _align(cells), *(["Not applicable:\n\n" + "\n".join(refused)] if refused else [])]
+    if warnings:
+        parts.append("Warnings:\n\n" + "\n".join(warnings))
     if any(reasons):
         parts.append("The policy, by task:\n\n```\n" + "\n".join(filter(None, reasons)) + "\n```")
     return "\n\n".join(parts) + "\n"

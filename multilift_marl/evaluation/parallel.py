@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from multilift_marl import _ray
+from multilift_marl._versions import find_versions
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
 from multilift_marl.envs.core import MultiliftVec
@@ -135,7 +136,7 @@ class _Worker:
     def fly(self, task: Any, part: tuple[int, int]) -> None:
         """Begin with a part of a task, see `_fly_part`."""
         self._task, self.part, self._tries = task, part, 0
-        self.result = self._actor.fly.remote(task, *part)
+        self.result = self._actor.fly.remote(find_versions(), task, *part)
 
     def take(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
         """Return the metrics and trajectories of its part once they are there.
@@ -148,11 +149,8 @@ class _Worker:
         try:
             self._pulse.check(self._actor)
             if ray.wait([self.result], timeout=0)[0]:
-                found: tuple[dict[str, np.ndarray], dict[str, np.ndarray]] = ray.get(self.result)
+                found: tuple[dict[str, np.ndarray], dict[str, np.ndarray]] = _ray.get(self.result)
                 return found
-        except ray.exceptions.RayTaskError as error:
-            # What the worker raised, as it would be raised here.
-            raise error.cause from error
         except (ray.exceptions.RayActorError, ray.exceptions.ObjectLostError, _ray.Silent):
             assert self.part is not None
             self.end()
@@ -164,7 +162,7 @@ class _Worker:
                     "more memory, or set workers=0"
                 ) from None
             self._begin()
-            self.result = self._actor.fly.remote(self._task, *self.part)
+            self.result = self._actor.fly.remote(find_versions(), self._task, *self.part)
         return None
 
     def end(self) -> None:
@@ -184,8 +182,11 @@ class _Flyer:
         """Return the number of this process, by a thread of its own: it runs."""
         return os.getpid()
 
-    def fly(self, task: bytes, first: int, count: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """See `_fly_part`."""
+    def fly(
+        self, versions: dict[str, str], task: bytes, first: int, count: int
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Do as `_fly_part`, after `check_versions` of the caller's."""
+        _ray.check_versions(versions)  # before what it may read otherwise
         return _fly_part(task, first, count)
 
 

@@ -3,11 +3,13 @@
 import contextlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
 from functools import partial
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import psutil
@@ -16,6 +18,8 @@ import torch
 from conftest import SMALL, make_trainer
 
 from multilift_marl import _ray
+from multilift_marl._versions import find_versions
+from multilift_marl.agents import workers
 from multilift_marl.agents.checkpoint import load_checkpoint
 from multilift_marl.agents.logging import read_metrics
 from multilift_marl.agents.rollouts import exploration_noise
@@ -31,6 +35,7 @@ from multilift_marl.policies.baselines import make_scripted
 
 ROOT = Path(__file__).parents[2]
 GRU = {"train.gru": 8, "train.sequence": 8}
+sys.path.insert(0, str(ROOT / "results"))
 
 
 @pytest.fixture(scope="module")
@@ -221,9 +226,102 @@ def test_a_benchmark_by_workers_has_the_same_card(tmp_path, local_ray, monkeypat
     assert alone == apart and [task.factors for task in tasks] == [{"payload_mass": 1.35}, {"cable_length": 1.2}]
 
 
+def build(versions):
+    workers._Worker.__new__(workers._Worker).build({}, 0, 1, 0, versions)
+
+
+def fly(versions):
+    parallel._Flyer.__new__(parallel._Flyer).fly(versions, b"", 0, 1)
+
+
+def call(versions):
+    reproduce = pytest.importorskip("reproduce")
+    reproduce._call_here(b"", os.getcwd(), str(ROOT / "results"), versions)
+
+
+@pytest.mark.parametrize("work", [build, fly, call])
+@pytest.mark.parametrize("other", ["multilift_marl", "sources", "mujoco"])
+def test_a_node_with_other_versions_refuses_to_work(work, other):
+    with pytest.raises(ConfigError) as caught:
+        work(find_versions() | {other: "0.0.1"})
+    message = str(caught.value)
+    assert message.startswith(f"the node {socket.gethostname()} of the cluster of Ray has multilift_marl ")
+    assert f"{other} {find_versions()[other]}" in message.partition("its caller")[0]
+    assert f"{other} 0.0.1" in message.partition("its caller")[2] and message.endswith("every node (docs/ray.md)")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("work", ["training", "evaluation", "results"])
+def test_versions_of_the_caller_go_with_the_work(tmp_path, local_ray, monkeypatch, work):
+    reproduce = pytest.importorskip("reproduce")
+    for module in (workers, parallel, reproduce):
+        monkeypatch.setattr(module, "find_versions", lambda: find_versions() | {"multilift_marl": "0.0.1"})
+    with pytest.raises(
+        ConfigError, match=r"^the node .* of the cluster of Ray has .*its caller has multilift_marl 0.0.1"
+    ):
+        if work == "training":
+            make_trainer(tmp_path, **{"train.workers": 1}).step()
+        elif work == "evaluation":
+            make = partial(make_scripted, "formation")
+            parallel.evaluate_parallel(load_config("hover"), make, parallel.Evaluation(2, 5, workers=1))
+        else:
+            list(reproduce.spread_by_ray(str, ["gate"], 1, "local"))
+
+
+@pytest.mark.parametrize("ask", ["collect", "get_state", "set_state"])
+@pytest.mark.parametrize("built", [False, True])
+def test_what_a_worker_raises_is_raised_as_here(monkeypatch, ask, built):
+    import ray
+
+    def fail(result):
+        cause = ConfigError("reward term bad is not finite")
+        raise ray.exceptions.RayTaskError("f", "Traceback", cause, "p", 1, "127.0.0.1").as_instanceof_cause()
+
+    monkeypatch.setattr(ray, "wait", lambda results, **_: (results, []))
+    monkeypatch.setattr(ray, "get", fail)
+    monkeypatch.setattr(ray, "put", lambda value: value)
+    few = workers.Workers.__new__(workers.Workers)
+    few._ray, few._actor, few._bounds, few._states = ray, torch.nn.Linear(1, 1), [0, 2], [None]
+    few._workers, few._built = [MagicMock()], [None if built else 0]
+    with pytest.raises(ConfigError) as caught:
+        getattr(few, ask)(*{"collect": (0,), "get_state": (), "set_state": ({"state": torch.zeros(2)},)}[ask])
+    assert type(caught.value) is ConfigError and str(caught.value) == "reward term bad is not finite"
+
+
+BAD = """
+import numpy as np
+import multilift_marl as ml
+from multilift_marl.mdp.rewards import Term
+from multilift_marl.tasks.hover import Hover
+
+def bad(view, margin):
+    return np.where(view.time > 0.1, np.nan, 1.0)
+
+@ml.register_task
+class Bad(Hover):
+    name = "bad_reward"
+    REWARD = {**Hover.REWARD, "bad": Term(0.1, bad, margin=0.1, unit="m")}
+"""
+
+
+@pytest.mark.slow
+def test_a_reward_that_is_not_finite_is_refused_alike_by_a_worker(tmp_path, local_ray, registries):
+    (tmp_path / "bad_reward.py").write_text(BAD)
+    task = {"import": str(tmp_path / "bad_reward.py"), "task": "bad_reward"}
+    said = []
+    for k in (0, 1):
+        trainer = make_trainer(tmp_path, **task, **{"train.workers": k})
+        with pytest.raises(ConfigError) as caught:
+            learn(trainer)
+        said.append(str(caught.value))
+        trainer.rollouts.close()
+    assert said[0] == said[1] and said[0].startswith(
+        "task bad_reward: reward term 'bad', function bad, returned what is not finite"
+    )
+
+
 @pytest.mark.slow
 def test_results_of_flights_are_spread_and_yielded_as_they_come(local_ray):
-    sys.path.insert(0, str(ROOT / "results"))
     from reproduce import spread_by_ray
 
     def measure(job):
@@ -236,7 +334,7 @@ def test_results_of_flights_are_spread_and_yielded_as_they_come(local_ray):
     def fail(job):
         raise ConfigError(f"{job} cannot be")
 
-    with pytest.raises(ConfigError, match="cannot be"):
+    with pytest.raises(ConfigError, match=r"^(gate|hover) cannot be$"):
         list(spread_by_ray(fail, ["gate", "hover"], 2, "local"))
 
 

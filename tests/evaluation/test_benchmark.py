@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import importlib
 import json
 import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from conftest import ALL, refusal
 
+from multilift_marl._versions import find_versions
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.cli import benchmark as command
 from multilift_marl.cli.benchmark import main as benchmark
@@ -243,6 +247,87 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_folder_goes_on(short, tmp_path, 
     assert list(whole["tasks"]) == ["hover", "land", "again"]
 
 
+def test_a_policy_that_raises_leaves_what_is_done_and_how_to_go_on(short, tmp_path, capsys, monkeypatch):
+    real = command.fly
+
+    def fail(config, make, name, *others):
+        if name.startswith("again"):
+            raise RuntimeError("solver diverged")
+        return real(config, make, name, *others)
+
+    monkeypatch.setattr(command, "fly", fail)
+    out = tmp_path / "card"
+    with pytest.raises(RuntimeError, match="solver diverged"):
+        benchmark(["policy=formation", f"out={out}"])
+    said = capsys.readouterr()
+    assert said.out.splitlines()[0].endswith(f"2 episodes of each task, into {out}")
+    assert f"wrote card.json, table.md and card.png in {out}" in said.out
+    again = said.err.splitlines()[-1].partition("after 2 of 3 tasks; go on by: python -m multilift_marl.benchmark ")[2]
+    assert sorted(shlex.split(again)) == sorted(["policy=formation", "episodes=2", f"out={out}"])
+    assert list(read(out)["tasks"]) == ["hover", "land"] and not read(out)["complete"]
+    assert "| hover " in (out / "table.md").read_text(encoding="utf-8")
+
+
+def test_a_cluster_that_cannot_be_joined_is_refused_in_a_sentence_alone(short, tmp_path, capsys):
+    assert benchmark(["policy=formation", "workers=1", "ray=nowhere", f"out={tmp_path}"]) == 2
+    assert capsys.readouterr().err.splitlines() == [
+        "error: ray=nowhere is no host:port of a Ray cluster's head node; give one, local or auto"
+    ]
+
+
+@pytest.mark.parametrize("name", ["kit_of_policies:P", "multilift_marl.policies.tuned:HoverRigs"])
+def test_a_card_knows_the_file_of_an_installed_policy(name, short, tmp_path, capsys, monkeypatch, registries):
+    (tmp_path / "site").mkdir()
+    kit, out = tmp_path / "site" / "kit_of_policies.py", tmp_path / "card"
+    kit.write_text("from multilift_marl.policies.formation import Formation as P\n")
+    monkeypatch.syspath_prepend(str(kit.parent))
+    monkeypatch.chdir(tmp_path)
+    assert benchmark([f"policy={name}", f"out={out}"]) == 0
+    file = Path(importlib.import_module(name.partition(":")[0]).__file__)
+    assert read(out)["policy"]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    if file == kit:
+        kit.write_text(kit.read_text() + "# changed\n")
+        assert benchmark([f"policy={name}", f"out={out}"]) == 2
+        assert "is of another evaluation, its policy differs" in capsys.readouterr().err
+
+
+def test_an_earlier_card_goes_on_and_says_what_is_not_known_of_it(short, tmp_path, capsys):
+    arguments = ["policy=multilift_marl.policies.tuned:HoverRigs", f"out={tmp_path}"]
+    assert benchmark(arguments) == 0
+    card = read(tmp_path)
+    del card["versions"]["sources"], card["tasks"]["again"]
+    card["policy"]["sha256"] = None
+    (tmp_path / "card.json").write_text(json.dumps(card), encoding="utf-8")
+    capsys.readouterr()
+    for _ in range(2):
+        assert benchmark(arguments) == 0
+        shown = capsys.readouterr().out
+        for what in ("sources of versions", "sha256 of policy"):
+            assert f"note: {tmp_path / 'card.json'} does not say {what}, so its rows may be of other code" in shown
+    whole = read(tmp_path)
+    assert whole["versions"] == find_versions() | {"sources": None} and whole["policy"]["sha256"] is None
+    assert whole["complete"] and whole["tasks"]["hover"] == card["tasks"]["hover"]
+
+
+def test_a_policy_that_was_trained_at_another_rate_is_warned_of(short, tmp_path, caplog):
+    from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+
+    content = load_checkpoint(command._SHIPPED / "hover.pt")
+    content["config"]["env"]["policy_hz"] = 125.0
+    save_checkpoint(tmp_path / "fast.pt", content)
+    for name, warned in ((tmp_path / "fast.pt", True), ("hover", False)):
+        caplog.clear()
+        assert benchmark([f"policy={name}", f"out={tmp_path / 'card'}{warned}"]) == 0
+        warning = (
+            "was configured with env.policy_hz=125.0; the values here change what its actions and observations mean"
+        )
+        assert (f"the policy of {name} {warning}" in caplog.messages) == warned
+        row = read(tmp_path / f"card{warned}")["tasks"]["hover"]["policies"]
+        assert row["policy"].get("warning") == (warning if warned else None) and "warning" not in row["baseline"]
+        table = (tmp_path / f"card{warned}" / "table.md").read_text(encoding="utf-8")
+        assert (f"\n- hover: {name} {warning}\n" in table) == warned
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -282,6 +367,10 @@ def test_the_card_of_another_evaluation_is_not_gone_on_with(short, tmp_path, cap
     assert "is of another evaluation, its episodes differs" in capsys.readouterr().err
     assert benchmark(["policy=formation_feedback", f"out={tmp_path}"]) == 2
     assert "its policy differs" in capsys.readouterr().err
+    assert read(tmp_path)["versions"] == find_versions()
+    monkeypatch.setattr(command, "find_versions", lambda: find_versions() | {"sources": "0" * 16})
+    assert benchmark(["policy=formation", f"out={tmp_path}"]) == 2
+    assert "its versions differs" in capsys.readouterr().err
     assert (tmp_path / "card.json").read_bytes() == before
     (tmp_path / "card.json").write_text("{")
     assert benchmark(["policy=formation", f"out={tmp_path}"]) == 2

@@ -17,10 +17,10 @@ from multilift_marl._renamed import RENAMED
 
 PACKAGE = Path(ml.__file__).parent
 LOWEST_FIRST = (
-    "errors", "physical", "_platform", "_files", "remember", "_interrupt", "realtime", "_renamed", "kernels", "rng",
-    "math3d", "schema", "plugins", "trust", "rig", "config", "sim", "control", "mdp", "sensing", "planning",
-    "diffmpc", "navigation", "tasks", "rendering", "envs", "policies", "_ray", "evaluation", "agents", "command",
-    "deploy", "viewer", "validation", "cli", "benchmark", "export", "plan",
+    "errors", "physical", "_platform", "_versions", "_files", "remember", "_interrupt", "realtime", "_renamed",
+    "kernels", "rng", "math3d", "schema", "plugins", "trust", "rig", "config", "sim", "control", "mdp", "sensing",
+    "planning", "diffmpc", "navigation", "tasks", "rendering", "envs", "policies", "_ray", "evaluation", "agents",
+    "command", "deploy", "viewer", "validation", "cli", "benchmark", "export", "plan",
 )  # fmt: skip
 
 
