@@ -1,22 +1,20 @@
-"""Configurations from names, files and overrides, and their explanation for --help."""
+"""Configurations from names, files and overrides."""
 
 from __future__ import annotations
 
-import typing
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 from multilift_marl.config.aliases import plain_values, stored_names
 from multilift_marl.config.config import Config
+from multilift_marl.config.keys import find_unknown, list_keys
 from multilift_marl.config.precedence import give_way, is_empty, merge, system_part
-from multilift_marl.errors import ConfigError, UnknownKeywordError, called_elsewhere, nearest, reason, shorten
+from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest, reason, shorten
 from multilift_marl.plugins import describe_unregistered, identify, import_modules, load_entry_points, named, refused
 from multilift_marl.schema.files import as_mapping, change_files, is_yaml
 from multilift_marl.schema.validate import validate
-from multilift_marl.schema.values import Section
 from multilift_marl.schema.yaml_text import parse_yaml, read_yaml, write_yaml
 from multilift_marl.trust import name_cluster, review, trusting
 
@@ -100,7 +98,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
     merged, overrides = merge({}, plain_values(values)), stored_names(overrides or {})
-    free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
+    free = {name.removesuffix(".<name>") for name, _, _ in list_keys(Config) if name.endswith(".<name>")}
     for dotted, value in overrides.items():
         _note_named(dotted, value)
         *sections, key = dotted.split(".", _MOST_SECTIONS)
@@ -160,45 +158,6 @@ def resolve_config(
     return build_config(task.model_dump(include=task.model_fields_set), overrides)  # what is stated stays known as such
 
 
-def check_names(given: Iterable[str], own: Iterable[str]) -> None:
-    """Refuse the first name that `find_unknown` finds.
-
-    Raises:
-        ConfigError: an unknown name.
-    """
-    if unknown := find_unknown(given, own):
-        raise ConfigError(f"unknown key '{unknown[0]}'{unknown[1]}")
-
-
-def find_unknown(given: Iterable[str], own: Iterable[str]) -> tuple[str, str] | None:
-    """Return the first name without a dot that is neither a caller's own nor a section or value of a configuration.
-
-    Args:
-        given: the names; those with a dot are left to `build_config`.
-        own: of the caller's arguments.
-
-    Returns:
-        The name and a hint, None if all are known. The hint knows every key, too: frames is near train.frames.
-    """
-    top = {*Config.model_fields, *own}
-    keys: dict[str, list[str]] = {}
-    meanings = {key: text for key, _, text in _leaves(Config, "")}
-    for key in meanings:
-        keys.setdefault(key.rpartition(".")[2], []).append(key)
-    keys = {name: homes for name, homes in keys.items() if name != "<name>"} | {name: [name] for name in top}
-    whole = {key.replace(".", "_"): key for key in meanings}
-    for name in given:
-        if "." not in name and name not in top:
-            if name in whole:  # payload_mass is payload.mass, not its randomization
-                return name, f"; did you mean '{whole[name]}'?"
-            if (here := called_elsewhere(name)) in keys:
-                key = keys[here][0]
-                return name, f"; did you mean '{key}'" + (f" ({meanings[key]})?" if key in meanings else "?")
-            hint = nearest(name, keys, lambda near: "' or '".join(keys[near]))
-            return name, hint if "did you mean" in hint else nearest(name, top)
-    return None
-
-
 def parse_overrides(arguments: Iterable[str], names: Collection[str] = ()) -> dict[str, Any]:
     """Return {"a.b": value} of command-line arguments a.b=value, read as YAML.
 
@@ -231,39 +190,6 @@ def parse_overrides(arguments: Iterable[str], names: Collection[str] = ()) -> di
 def dump_config(config: Config) -> str:
     """Return the resolved configuration as YAML, complete: it loads back to an equal one."""
     return write_yaml(config.model_dump(mode="json"))
-
-
-def explain(section: type[Section] | Section = Config, prefix: str = "") -> str:
-    """Return every key of a section with its default and meaning, for --help.
-
-    Of a section with values these are shown, and the default behind the meaning where it is another.
-    """
-    kind = section if isinstance(section, type) else type(section)
-    lines = []
-    for key, default, text in _leaves(kind, prefix):
-        value = default
-        if isinstance(section, Section):
-            path = key.removeprefix(prefix).removesuffix(".<name>")  # of names that are free: all of them
-            value = reduce(getattr, path.split("."), section)
-        changed = "" if value == default else f" (default {_plain(default)})"
-        lines.append(f"  {key:<32} {_plain(value):<14} {text}{changed}")
-    return "\n".join(lines)
-
-
-def _plain(value: Any) -> str:
-    if value is None or value == {}:
-        return "-"
-    return str(list(value) if isinstance(value, tuple) else value)
-
-
-def _leaves(section: type[Section], prefix: str) -> Iterator[tuple[str, Any, str]]:
-    for name, field in section.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
-            yield from _leaves(field.annotation, f"{prefix}{name}.")
-        elif typing.get_origin(field.annotation) is dict:
-            yield f"{prefix}{name}.<name>", {}, field.description or ""
-        else:
-            yield prefix + name, field.default, field.description or ""
 
 
 def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:

@@ -10,11 +10,11 @@ from conftest import TASKS
 
 from multilift_marl.config import precedence
 from multilift_marl.config.config import Config
+from multilift_marl.config.keys import explain
 from multilift_marl.config.load import (
     CONFIGS,
     build_config,
     dump_config,
-    explain,
     list_configs,
     load_config,
     parse_overrides,
