@@ -162,19 +162,23 @@ def is_path(reference: str) -> bool:
     return reference.endswith(".py") or "/" in reference
 
 
-def find_file(reference: str) -> Path | None:
-    """Return the file of a module in the current folder or by path; None if there is none."""
+def find_file(reference: str, folder: Path | None = None) -> Path | None:
+    """Return the file of a module in a folder, by default the current one, or by path; None if there is none."""
+    here = Path.cwd() if folder is None else folder
     if is_path(reference):
         try:
-            path = Path(os.path.abspath(os.path.expanduser(reference)))
+            path = Path(os.path.abspath(here / os.path.expanduser(reference)))
         except ValueError:  # of a user's name with a NUL
             return None
         path = path / "__init__.py" if os.path.isdir(path) else path
         return path if os.path.isfile(path) else None
-    base = Path.cwd().joinpath(*reference.split("."))
+    base = here.joinpath(*reference.split("."))
     for path in (base / "__init__.py", base.parent / f"{base.name}.py"):
-        if os.path.isfile(path) and module_name(path)[1] == reference:
-            return path
+        if os.path.isfile(path):
+            name = module_name(path)[1]
+            # A folder that is given may itself be within a package.
+            if name == reference or (folder is not None and name.endswith(f".{reference}")):
+                return path
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -12,8 +13,16 @@ from multilift_marl.config.config import Config
 from multilift_marl.config.keys import find_unknown, list_keys
 from multilift_marl.config.precedence import give_way, is_empty, merge, system_part
 from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest, reason, shorten
-from multilift_marl.plugins import describe_unregistered, identify, import_modules, load_entry_points, named, refused
-from multilift_marl.schema.files import as_mapping, change_files, is_yaml
+from multilift_marl.plugins import (
+    describe_unregistered,
+    find_file,
+    identify,
+    import_modules,
+    load_entry_points,
+    named,
+    refused,
+)
+from multilift_marl.schema.files import FILE_KEYS, as_mapping, change_files, is_yaml
 from multilift_marl.schema.validate import validate
 from multilift_marl.schema.yaml_text import parse_yaml, read_yaml, write_yaml
 from multilift_marl.trust import name_cluster, review, trusting
@@ -82,7 +91,7 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
     with trusting(trust):
         values = _read(name)
         if (task := overrides.get("task", values.get("task"))) != values.get("task"):
-            values = _set_task(task, system_part(values))
+            values = _set_system(_read_preset(task), system_part(values))
     return build_config(give_way(values, overrides), overrides, where=str(name))
 
 
@@ -132,7 +141,7 @@ def choose_config(name: str | Path | None, own: Config | None, overrides: Mappin
     if (task := overrides.get("task", own.task)) != own.task:
         import_modules(overrides.get("import"))  # they may bring the task
         observed = {key: values["env"][key] for key in ("history", "units")}
-        values = _set_task(task, merge(system_part(values), {"env": observed}))
+        values = _set_system(_read_preset(task), merge(system_part(values), {"env": observed}))
     return build_config(values, overrides)
 
 
@@ -195,11 +204,16 @@ def dump_config(config: Config) -> str:
 def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the values of a configuration with those of its bases below them; `above` names what is based on it."""
     path = Path(name)
+    if not is_yaml(path):
+        path = config_dir() / f"{name}.yaml"
+        if not os.path.isfile(path):
+            return _read_own(str(name), above)
+    return _add_bases(_read_file(path), (*above, str(path)))
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    """Return what a YAML file says itself, with what lies beside it by absolute paths; its bases are not read."""
     try:
-        if not is_yaml(path):
-            path = config_dir() / f"{name}.yaml"
-            if not path.is_file():
-                return _read_own(str(name), above)
         values = read_yaml(path)
     # A ConfigError is a ValueError, too, but not one of those that are caught below.
     except ConfigError:
@@ -214,14 +228,14 @@ def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
         ) from None
     except (OSError, ValueError) as error:  # ValueError: what is no YAML, and names with a NUL
         raise ConfigError(f"cannot read {shorten(path, 300)} as YAML: {reason(error)}") from None
-    folder = path.absolute().parent
-    # Before bases are added: a path counts from the folder of the file that states it.
-    located = _locate(stored_names(as_mapping(values, path, "sections such as 'env:'")), folder)
+    # A path counts from the folder of the file that states it.
+    values = stored_names(as_mapping(values, path, "sections such as 'env:'"))
+    located = _locate(values, path.absolute().parent)
     review(located, path)
-    return _add_bases(located, folder, (*above, str(path)))
+    return located
 
 
-def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> dict[str, Any]:
+def _add_bases(values: dict[str, Any], above: tuple[str, ...]) -> dict[str, Any]:
     """Return the values of `base`, one configuration or several, with a configuration's own `values` over them.
 
     The task is its own, else that of its first base; bases with another task give their system only, those without
@@ -229,7 +243,6 @@ def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> 
 
     Args:
         values: of a configuration.
-        folder: of its file, where bases that are files are looked for.
         above: the configurations that led here, itself the last.
 
     Raises:
@@ -244,14 +257,22 @@ def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> 
         )
     merged: dict[str, Any] = {}
     for name in names:
-        source = str(folder / name) if is_yaml(name) else str(config_dir() / f"{name}.yaml")
-        # By path and by name, for configurations that are registered have no path.
-        if source in above or name in above:
-            raise ConfigError(f"{above[-1]} is based on {name}, which is based on it; take one of the two bases out")
-        part = _read(folder / name if is_yaml(name) else name, above)
+        if _identify(name) in [_identify(each) for each in above]:
+            short = Path(name).name if is_yaml(name) else name
+            raise ConfigError(f"{above[-1]} is based on {short}, which is based on it; take one of the two bases out")
+        part = _read(name, above)
         task = own.get("task", merged.get("task", part.get("task")))
         merged = merge(merged, part if part.get("task", task) == task else system_part(part))
     return merge(give_way(merged, own), own)
+
+
+def _identify(name: str) -> str:
+    """Return what a configuration is known by, however it is written: its file, links followed, or its name."""
+    source = Path(name) if is_yaml(name) else CONFIGS.get(name, config_dir() / f"{name}.yaml")
+    try:
+        return os.path.realpath(source) if isinstance(source, Path) else name
+    except ValueError:  # of a name with a NUL: refused where it is read
+        return name
 
 
 def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
@@ -263,9 +284,7 @@ def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
         hint = describe_unregistered(name) or nearest(name, [*list_configs(), *CONFIGS], otherwise=otherwise)
         raise ConfigError(f"no configuration named '{shorten(name)}'{hint}")
     source = CONFIGS[name]
-    return (
-        _read(source, above) if isinstance(source, Path) else _add_bases(stored_names(source), Path(), (*above, name))
-    )
+    return _read(source, above) if isinstance(source, Path) else _add_bases(stored_names(source), (*above, name))
 
 
 def _read_preset(task: Any) -> dict[str, Any]:
@@ -274,27 +293,24 @@ def _read_preset(task: Any) -> dict[str, Any]:
     return _read(task) if known else {}
 
 
-def _set_task(task: Any, system: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the configuration of a task with a system over it."""
-    return merge(give_way(_read_preset(task), system), system)
+def _set_system(values: Mapping[str, Any], system: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a configuration with a system over them."""
+    return merge(give_way(values, system), system)
 
 
 def _locate(values: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the values of a file in `folder` with modules and files that lie beside it as absolute paths."""
+    """Return the values of a file in `folder` with modules, files and bases that lie beside it as absolute paths."""
 
-    def absolute(reference: Any, suffix: str = "") -> Any:
-        if isinstance(reference, list):
-            return [absolute(each, suffix) for each in reference]
-        beside = folder / f"{reference}{suffix}"
+    def find_beside(key: str, reference: str) -> str:
+        if key == "base":
+            return str(folder / reference) if is_yaml(reference) else reference
+        path = find_file(reference, folder) if key == "import" else folder / reference
         try:
-            return str(beside) if isinstance(reference, str) and beside.is_file() else reference
+            return str(path) if path is not None and path.is_file() else reference
         except (OSError, ValueError):  # of names too long, and names with a NUL: refused where they are read
             return reference
 
-    located = change_files(values, lambda _, reference: absolute(reference))
-    if "import" in values:
-        located["import"] = absolute(absolute(values["import"]), ".py")
-    return located
+    return change_files(values, find_beside, keys=(*FILE_KEYS, "import", "base"))
 
 
 def _import_all(stored: Any, more: Any) -> Any:
