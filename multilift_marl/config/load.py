@@ -14,6 +14,7 @@ from multilift_marl.config.keys import find_unknown, list_keys
 from multilift_marl.config.precedence import give_way, is_empty, merge, system_part
 from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest, reason, shorten
 from multilift_marl.plugins import (
+    describe_unknown,
     describe_unregistered,
     find_file,
     identify,
@@ -282,15 +283,18 @@ def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
     if name not in CONFIGS:
         otherwise = "; one's own needs import=<module>, or is a file"
         hint = describe_unregistered(name) or nearest(name, [*list_configs(), *CONFIGS], otherwise=otherwise)
-        raise ConfigError(f"no configuration named '{shorten(name)}'{hint}")
+        raise ConfigError(describe_unknown(name, f"no configuration named '{shorten(name)}'{hint}"))
     source = CONFIGS[name]
     return _read(source, above) if isinstance(source, Path) else _add_bases(stored_names(source), (*above, name))
 
 
 def _read_preset(task: Any) -> dict[str, Any]:
     """Return the configuration that has the name of a task, {} if there is none."""
-    known = isinstance(task, str) and (task in CONFIGS or task in list_configs())
-    return _read(task) if known else {}
+    if not isinstance(task, str):
+        return {}
+    if task not in CONFIGS and task not in list_configs():
+        load_entry_points()
+    return _read(task) if task in CONFIGS or task in list_configs() else {}
 
 
 def _set_system(values: Mapping[str, Any], system: Mapping[str, Any]) -> dict[str, Any]:

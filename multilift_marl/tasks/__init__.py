@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from multilift_marl.config.load import register_config
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.plugins import describe_unregistered, load_entry_points, registers
+from multilift_marl.plugins import describe_unknown, describe_unregistered, load_entry_points, registers
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.gate import Gate
 from multilift_marl.tasks.hover import Hover
@@ -67,7 +67,13 @@ def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None)
     return task
 
 
-registers.append(register_task)
+def _register_found(task: Any) -> None:
+    """Register what an entry point is, unless its module has done so, with a configuration perhaps."""
+    if not any(task is known for known in TASKS.values()):
+        register_task(task)
+
+
+registers.append(_register_found)
 
 
 def list_tasks() -> list[str]:
@@ -82,10 +88,9 @@ def find_task(name: str) -> type[Task]:
     Raises:
         ConfigError: there is no such task, or the package that has it fails.
     """
-    failures = {} if name in TASKS else load_entry_points()
-    if name in failures:
-        raise ConfigError(failures[name])
+    if name not in TASKS:
+        load_entry_points()
     if name not in TASKS:
         cure = describe_unregistered(name) or nearest(name, TASKS, otherwise="; one's own needs import=<module>")
-        raise ConfigError(f"unknown task '{name}'{cure}")
+        raise ConfigError(describe_unknown(name, f"unknown task '{name}'{cure}"))
     return TASKS[name]
