@@ -65,6 +65,28 @@ def register_config(name: str, source: str | Path | Mapping[str, Any]) -> None:
     CONFIGS[name] = source
 
 
+def state_task(task: str, source: str | Path | Mapping[str, Any]) -> Path | Mapping[str, Any]:
+    """Return the configuration of a task, a YAML file or its values, such that it says which task it is of.
+
+    Raises:
+        ConfigError: it says another, or there is no such file.
+    """
+    if isinstance(source, Mapping):
+        values = source
+    else:
+        source = Path(source).absolute()
+        # Bases, too, for a mistake in them to show here.
+        _read(source)
+        values = _read_file(source)
+    if (stated := values.get("task", task)) != task:
+        where = "its configuration" if isinstance(source, Mapping) else source
+        raise ConfigError(
+            f"{where} is of task={shorten(stated)}, not of the task '{task}' that it is registered with; leave out its "
+            "key task"
+        )
+    return source if "task" in values else {"task": task, **values}
+
+
 def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None = None, trust: bool = False) -> Config:
     """Return typed defaults < the configuration `name` < `overrides`.
 

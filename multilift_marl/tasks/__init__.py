@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from multilift_marl.config.load import register_config
+from multilift_marl.config.load import register_config, state_task
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.plugins import describe_unknown, describe_unregistered, load_entry_points, registers
 from multilift_marl.tasks.base import Task
@@ -45,15 +45,15 @@ def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None)
 
     Args:
         task: the class; of several with one name, the latest counts.
-        config: its configuration, which is then known by the same name: a YAML file, or values by section; None for
-            typed defaults.
+        config: its configuration, which is then known by the same name, and needs no key `task`: a YAML file, or values
+            by section; None for typed defaults.
 
     Returns:
         The class.
 
     Raises:
-        ConfigError: no task, one without a name, or with that of a shipped task or configuration, or one that declares
-            what cannot be; see `check_declared`.
+        ConfigError: no task, one without a name, or with that of a shipped task or configuration, one that declares
+            what cannot be, see `check_declared`, or a configuration of another task.
     """
     name = getattr(task, "name", None)
     if not (isinstance(task, type) and issubclass(task, Task) and isinstance(name, str)):
@@ -62,7 +62,7 @@ def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None)
         raise ConfigError(f"a task of one's own cannot have the name '{name}': choose one that is not taken")
     if name not in _SHIPPED:
         check_declared(task)
-        register_config(name, {"task": name} if config is None else config)
+        register_config(name, state_task(name, {} if config is None else config))
     TASKS[name] = task
     return task
 

@@ -210,6 +210,34 @@ def test_a_task_brings_its_configuration_under_its_name(folder):
     assert load_config("rigs/mine", {"task": "track"}).control == load_config("track").control
 
 
+@pytest.mark.parametrize("form", ["mapping", "file"])
+def test_a_tasks_configuration_is_of_that_task_without_saying_so_and_of_no_other(folder, form):
+    class Far(Hover):
+        name = "far"
+
+    def source(values):
+        (folder / "sub").mkdir(exist_ok=True)
+        (folder / "sub" / "far.yaml").write_text(json.dumps(values))
+        return values if form == "mapping" else "sub/far.yaml"
+
+    (folder / "sub" / "heavy.yaml").parent.mkdir()
+    (folder / "sub" / "heavy.yaml").write_text("payload: {mass: 2.0}")
+    base = {"base": str(folder / "sub" / "heavy.yaml") if form == "mapping" else "heavy.yaml"}
+    long = {"env": {"episode_seconds": 3.0}}
+    for values, mass in ((long, None), (long | base, 2.0), (long | {"task": "far"} | base, 2.0)):
+        ml.register_task(Far, source(values))
+        config = load_config("far")
+        assert (config.task, config.env.episode_seconds, config.payload.mass) == ("far", 3.0, mass)
+    ml.register_task(Far, source(long | {"base": "track"}))
+    config = load_config("far")
+    assert (config.task, config.env.episode_seconds) == ("far", 3.0)
+    assert config.train == build_config({}).train  # of a base with another task the system counts alone
+    assert refusal(ml.register_task, Far, source(long | {"task": "hover"})).endswith(
+        "is of task=hover, not of the task 'far' that it is registered with; leave out its key task"
+    )
+    assert load_config("far").env.episode_seconds == 3.0
+
+
 # Vehicles
 
 
