@@ -118,6 +118,20 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
     return build_config(give_way(values, overrides), overrides, where=str(name))
 
 
+def load_rig(name: str | Path, task: str | Path, overrides: Mapping[str, Any]) -> Config:
+    """Return the configuration `task` with the system of the configuration `name` over it, then `overrides`.
+
+    Where `task` is the name of a task rather than of a configuration, `load_config` does so.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    overrides = stored_names(overrides)
+    import_modules(overrides.get("import"))
+    values = _set_system(_read(task), system_part(_read(name)))
+    return build_config(give_way(values, overrides), overrides, where=f"{task}, {name}")
+
+
 def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, where: str = "") -> Config:
     """Return the validated configuration of nested `values` with dotted `overrides` applied.
 
