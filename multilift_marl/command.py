@@ -21,7 +21,8 @@ from pydantic import Field
 from multilift_marl._files import check_writable, make_run_folder
 from multilift_marl._interrupt import end_quiet_import
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import check_names, explain, load_config, parse_overrides
+from multilift_marl.config.keys import check_names, explain
+from multilift_marl.config.load import load_config, parse_overrides
 from multilift_marl.errors import (
     CheckpointError,
     ConfigError,

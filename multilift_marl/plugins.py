@@ -20,6 +20,7 @@ _PACKAGE = str(Path(__file__).parent)
 GROUP = "multilift_marl.tasks"  # entry points of installed packages
 registers: list[Callable[[Any], object]] = []  # what takes the tasks of entry points, see `tasks/__init__.py`
 _imported: dict[str, ModuleType] = {}  # by the last part of their name
+_loading: set[str] = set()  # values of entry points whose modules, while they run, may ask for what others bring
 named: set[str] = set()
 """Modules, see `identify`, and clusters that the user has named or trusts; others that files name wait (`trust.py`)."""
 STORED = "train.residual", "train.dagger.teacher"  # keys by which a run names a class
@@ -107,12 +108,28 @@ def load_entry_points() -> dict[str, str]:
     """
     failures = {}
     for point in entry_points(group=GROUP):
+        if point.value in _loading:
+            continue
+        _loading.add(point.value)
         try:
             _register(point.load())
         except (Exception, SystemExit) as error:  # a broken package must not keep others from working
             failures[point.name] = f"{_origin(point)} cannot be loaded: {describe_error(error)}"
             warnings.warn(failures[point.name], stacklevel=2)
+        finally:
+            _loading.discard(point.value)
     return failures
+
+
+def describe_unknown(name: str, unknown: str) -> str:
+    """Return what is wrong where nothing of a `name` is registered, with what failed of the packages that may have it.
+
+    Args:
+        name: a task's, a configuration's or a vehicle's.
+        unknown: the sentence that says so, which holds where no entry point has the name.
+    """
+    failures = load_entry_points()
+    return failures.get(name) or "; ".join((unknown, *failures.values()))
 
 
 def describe_error(error: BaseException) -> str:
@@ -148,7 +165,7 @@ def _register(found: Any) -> None:
 
 def _origin(point: EntryPoint) -> str:
     package = point.dist.name if point.dist is not None else "an installed package"
-    return f"the task '{point.name}' of {package} ({point.value})"
+    return f"the {'task' if point.attr else 'module'} '{point.name}' of {package} ({point.value})"
 
 
 def identify(reference: str) -> str:
@@ -162,19 +179,23 @@ def is_path(reference: str) -> bool:
     return reference.endswith(".py") or "/" in reference
 
 
-def find_file(reference: str) -> Path | None:
-    """Return the file of a module in the current folder or by path; None if there is none."""
+def find_file(reference: str, folder: Path | None = None) -> Path | None:
+    """Return the file of a module in a folder, by default the current one, or by path; None if there is none."""
+    here = Path.cwd() if folder is None else folder
     if is_path(reference):
         try:
-            path = Path(os.path.abspath(os.path.expanduser(reference)))
+            path = Path(os.path.abspath(here / os.path.expanduser(reference)))
         except ValueError:  # of a user's name with a NUL
             return None
         path = path / "__init__.py" if os.path.isdir(path) else path
         return path if os.path.isfile(path) else None
-    base = Path.cwd().joinpath(*reference.split("."))
+    base = here.joinpath(*reference.split("."))
     for path in (base / "__init__.py", base.parent / f"{base.name}.py"):
-        if os.path.isfile(path) and module_name(path)[1] == reference:
-            return path
+        if os.path.isfile(path):
+            name = module_name(path)[1]
+            # A folder that is given may itself be within a package.
+            if name == reference or (folder is not None and name.endswith(f".{reference}")):
+                return path
     return None
 
 

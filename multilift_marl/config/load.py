@@ -1,22 +1,30 @@
-"""Configurations from names, files and overrides, and their explanation for --help."""
+"""Configurations from names, files and overrides."""
 
 from __future__ import annotations
 
-import typing
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import os
+from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 from multilift_marl.config.aliases import plain_values, stored_names
 from multilift_marl.config.config import Config
+from multilift_marl.config.keys import find_unknown, list_keys
 from multilift_marl.config.precedence import give_way, is_empty, merge, system_part
-from multilift_marl.errors import ConfigError, UnknownKeywordError, called_elsewhere, nearest, reason, shorten
-from multilift_marl.plugins import describe_unregistered, identify, import_modules, load_entry_points, named, refused
-from multilift_marl.schema.files import as_mapping, change_files, is_yaml
+from multilift_marl.errors import ConfigError, UnknownKeywordError, nearest, reason, shorten
+from multilift_marl.plugins import (
+    describe_unknown,
+    describe_unregistered,
+    find_file,
+    identify,
+    import_modules,
+    load_entry_points,
+    named,
+    refused,
+)
+from multilift_marl.schema.files import FILE_KEYS, as_mapping, change_files, is_yaml
 from multilift_marl.schema.validate import validate
-from multilift_marl.schema.values import Section
 from multilift_marl.schema.yaml_text import parse_yaml, read_yaml, write_yaml
 from multilift_marl.trust import name_cluster, review, trusting
 
@@ -57,6 +65,28 @@ def register_config(name: str, source: str | Path | Mapping[str, Any]) -> None:
     CONFIGS[name] = source
 
 
+def state_task(task: str, source: str | Path | Mapping[str, Any]) -> Path | Mapping[str, Any]:
+    """Return the configuration of a task, a YAML file or its values, such that it says which task it is of.
+
+    Raises:
+        ConfigError: it says another, or there is no such file.
+    """
+    if isinstance(source, Mapping):
+        values = source
+    else:
+        source = Path(source).absolute()
+        # Bases, too, for a mistake in them to show here.
+        _read(source)
+        values = _read_file(source)
+    if (stated := values.get("task", task)) != task:
+        where = "its configuration" if isinstance(source, Mapping) else source
+        raise ConfigError(
+            f"{where} is of task={shorten(stated)}, not of the task '{task}' that it is registered with; leave out its "
+            "key task"
+        )
+    return source if "task" in values else {"task": task, **values}
+
+
 def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None = None, trust: bool = False) -> Config:
     """Return typed defaults < the configuration `name` < `overrides`.
 
@@ -84,8 +114,22 @@ def load_config(name: str | Path = "hover", overrides: Mapping[str, Any] | None 
     with trusting(trust):
         values = _read(name)
         if (task := overrides.get("task", values.get("task"))) != values.get("task"):
-            values = _set_task(task, system_part(values))
+            values = _set_system(_read_preset(task), system_part(values))
     return build_config(give_way(values, overrides), overrides, where=str(name))
+
+
+def load_rig(name: str | Path, task: str | Path, overrides: Mapping[str, Any]) -> Config:
+    """Return the configuration `task` with the system of the configuration `name` over it, then `overrides`.
+
+    Where `task` is the name of a task rather than of a configuration, `load_config` does so.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    overrides = stored_names(overrides)
+    import_modules(overrides.get("import"))
+    values = _set_system(_read(task), system_part(_read(name)))
+    return build_config(give_way(values, overrides), overrides, where=f"{task}, {name}")
 
 
 def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, where: str = "") -> Config:
@@ -100,7 +144,7 @@ def build_config(values: Mapping[str, Any], overrides: Mapping[str, Any] | None 
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
     merged, overrides = merge({}, plain_values(values)), stored_names(overrides or {})
-    free = {name.removesuffix(".<name>") for name, _, _ in _leaves(Config, "") if name.endswith(".<name>")}
+    free = {name.removesuffix(".<name>") for name, _, _ in list_keys(Config) if name.endswith(".<name>")}
     for dotted, value in overrides.items():
         _note_named(dotted, value)
         *sections, key = dotted.split(".", _MOST_SECTIONS)
@@ -134,7 +178,7 @@ def choose_config(name: str | Path | None, own: Config | None, overrides: Mappin
     if (task := overrides.get("task", own.task)) != own.task:
         import_modules(overrides.get("import"))  # they may bring the task
         observed = {key: values["env"][key] for key in ("history", "units")}
-        values = _set_task(task, merge(system_part(values), {"env": observed}))
+        values = _set_system(_read_preset(task), merge(system_part(values), {"env": observed}))
     return build_config(values, overrides)
 
 
@@ -158,45 +202,6 @@ def resolve_config(
     if not isinstance(task, Config):
         return load_config(task, overrides)
     return build_config(task.model_dump(include=task.model_fields_set), overrides)  # what is stated stays known as such
-
-
-def check_names(given: Iterable[str], own: Iterable[str]) -> None:
-    """Refuse the first name that `find_unknown` finds.
-
-    Raises:
-        ConfigError: an unknown name.
-    """
-    if unknown := find_unknown(given, own):
-        raise ConfigError(f"unknown key '{unknown[0]}'{unknown[1]}")
-
-
-def find_unknown(given: Iterable[str], own: Iterable[str]) -> tuple[str, str] | None:
-    """Return the first name without a dot that is neither a caller's own nor a section or value of a configuration.
-
-    Args:
-        given: the names; those with a dot are left to `build_config`.
-        own: of the caller's arguments.
-
-    Returns:
-        The name and a hint, None if all are known. The hint knows every key, too: frames is near train.frames.
-    """
-    top = {*Config.model_fields, *own}
-    keys: dict[str, list[str]] = {}
-    meanings = {key: text for key, _, text in _leaves(Config, "")}
-    for key in meanings:
-        keys.setdefault(key.rpartition(".")[2], []).append(key)
-    keys = {name: homes for name, homes in keys.items() if name != "<name>"} | {name: [name] for name in top}
-    whole = {key.replace(".", "_"): key for key in meanings}
-    for name in given:
-        if "." not in name and name not in top:
-            if name in whole:  # payload_mass is payload.mass, not its randomization
-                return name, f"; did you mean '{whole[name]}'?"
-            if (here := called_elsewhere(name)) in keys:
-                key = keys[here][0]
-                return name, f"; did you mean '{key}'" + (f" ({meanings[key]})?" if key in meanings else "?")
-            hint = nearest(name, keys, lambda near: "' or '".join(keys[near]))
-            return name, hint if "did you mean" in hint else nearest(name, top)
-    return None
 
 
 def parse_overrides(arguments: Iterable[str], names: Collection[str] = ()) -> dict[str, Any]:
@@ -233,47 +238,19 @@ def dump_config(config: Config) -> str:
     return write_yaml(config.model_dump(mode="json"))
 
 
-def explain(section: type[Section] | Section = Config, prefix: str = "") -> str:
-    """Return every key of a section with its default and meaning, for --help.
-
-    Of a section with values these are shown, and the default behind the meaning where it is another.
-    """
-    kind = section if isinstance(section, type) else type(section)
-    lines = []
-    for key, default, text in _leaves(kind, prefix):
-        value = default
-        if isinstance(section, Section):
-            path = key.removeprefix(prefix).removesuffix(".<name>")  # of names that are free: all of them
-            value = reduce(getattr, path.split("."), section)
-        changed = "" if value == default else f" (default {_plain(default)})"
-        lines.append(f"  {key:<32} {_plain(value):<14} {text}{changed}")
-    return "\n".join(lines)
-
-
-def _plain(value: Any) -> str:
-    if value is None or value == {}:
-        return "-"
-    return str(list(value) if isinstance(value, tuple) else value)
-
-
-def _leaves(section: type[Section], prefix: str) -> Iterator[tuple[str, Any, str]]:
-    for name, field in section.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
-            yield from _leaves(field.annotation, f"{prefix}{name}.")
-        elif typing.get_origin(field.annotation) is dict:
-            yield f"{prefix}{name}.<name>", {}, field.description or ""
-        else:
-            yield prefix + name, field.default, field.description or ""
-
-
 def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the values of a configuration with those of its bases below them; `above` names what is based on it."""
     path = Path(name)
+    if not is_yaml(path):
+        path = config_dir() / f"{name}.yaml"
+        if not os.path.isfile(path):
+            return _read_own(str(name), above)
+    return _add_bases(_read_file(path), (*above, str(path)))
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    """Return what a YAML file says itself, with what lies beside it by absolute paths; its bases are not read."""
     try:
-        if not is_yaml(path):
-            path = config_dir() / f"{name}.yaml"
-            if not path.is_file():
-                return _read_own(str(name), above)
         values = read_yaml(path)
     # A ConfigError is a ValueError, too, but not one of those that are caught below.
     except ConfigError:
@@ -288,14 +265,14 @@ def _read(name: str | Path, above: tuple[str, ...] = ()) -> dict[str, Any]:
         ) from None
     except (OSError, ValueError) as error:  # ValueError: what is no YAML, and names with a NUL
         raise ConfigError(f"cannot read {shorten(path, 300)} as YAML: {reason(error)}") from None
-    folder = path.absolute().parent
-    # Before bases are added: a path counts from the folder of the file that states it.
-    located = _locate(stored_names(as_mapping(values, path, "sections such as 'env:'")), folder)
+    # A path counts from the folder of the file that states it.
+    values = stored_names(as_mapping(values, path, "sections such as 'env:'"))
+    located = _locate(values, path.absolute().parent)
     review(located, path)
-    return _add_bases(located, folder, (*above, str(path)))
+    return located
 
 
-def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> dict[str, Any]:
+def _add_bases(values: dict[str, Any], above: tuple[str, ...]) -> dict[str, Any]:
     """Return the values of `base`, one configuration or several, with a configuration's own `values` over them.
 
     The task is its own, else that of its first base; bases with another task give their system only, those without
@@ -303,7 +280,6 @@ def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> 
 
     Args:
         values: of a configuration.
-        folder: of its file, where bases that are files are looked for.
         above: the configurations that led here, itself the last.
 
     Raises:
@@ -318,14 +294,22 @@ def _add_bases(values: dict[str, Any], folder: Path, above: tuple[str, ...]) -> 
         )
     merged: dict[str, Any] = {}
     for name in names:
-        source = str(folder / name) if is_yaml(name) else str(config_dir() / f"{name}.yaml")
-        # By path and by name, for configurations that are registered have no path.
-        if source in above or name in above:
-            raise ConfigError(f"{above[-1]} is based on {name}, which is based on it; take one of the two bases out")
-        part = _read(folder / name if is_yaml(name) else name, above)
+        if _identify(name) in [_identify(each) for each in above]:
+            short = Path(name).name if is_yaml(name) else name
+            raise ConfigError(f"{above[-1]} is based on {short}, which is based on it; take one of the two bases out")
+        part = _read(name, above)
         task = own.get("task", merged.get("task", part.get("task")))
         merged = merge(merged, part if part.get("task", task) == task else system_part(part))
     return merge(give_way(merged, own), own)
+
+
+def _identify(name: str) -> str:
+    """Return what a configuration is known by, however it is written: its file, links followed, or its name."""
+    source = Path(name) if is_yaml(name) else CONFIGS.get(name, config_dir() / f"{name}.yaml")
+    try:
+        return os.path.realpath(source) if isinstance(source, Path) else name
+    except ValueError:  # of a name with a NUL: refused where it is read
+        return name
 
 
 def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
@@ -335,40 +319,38 @@ def _read_own(name: str, above: tuple[str, ...]) -> dict[str, Any]:
     if name not in CONFIGS:
         otherwise = "; one's own needs import=<module>, or is a file"
         hint = describe_unregistered(name) or nearest(name, [*list_configs(), *CONFIGS], otherwise=otherwise)
-        raise ConfigError(f"no configuration named '{shorten(name)}'{hint}")
+        raise ConfigError(describe_unknown(name, f"no configuration named '{shorten(name)}'{hint}"))
     source = CONFIGS[name]
-    return (
-        _read(source, above) if isinstance(source, Path) else _add_bases(stored_names(source), Path(), (*above, name))
-    )
+    return _read(source, above) if isinstance(source, Path) else _add_bases(stored_names(source), (*above, name))
 
 
 def _read_preset(task: Any) -> dict[str, Any]:
     """Return the configuration that has the name of a task, {} if there is none."""
-    known = isinstance(task, str) and (task in CONFIGS or task in list_configs())
-    return _read(task) if known else {}
+    if not isinstance(task, str):
+        return {}
+    if task not in CONFIGS and task not in list_configs():
+        load_entry_points()
+    return _read(task) if task in CONFIGS or task in list_configs() else {}
 
 
-def _set_task(task: Any, system: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the configuration of a task with a system over it."""
-    return merge(give_way(_read_preset(task), system), system)
+def _set_system(values: Mapping[str, Any], system: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a configuration with a system over them."""
+    return merge(give_way(values, system), system)
 
 
 def _locate(values: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the values of a file in `folder` with modules and files that lie beside it as absolute paths."""
+    """Return the values of a file in `folder` with modules, files and bases that lie beside it as absolute paths."""
 
-    def absolute(reference: Any, suffix: str = "") -> Any:
-        if isinstance(reference, list):
-            return [absolute(each, suffix) for each in reference]
-        beside = folder / f"{reference}{suffix}"
+    def find_beside(key: str, reference: str) -> str:
+        if key == "base":
+            return str(folder / reference) if is_yaml(reference) else reference
+        path = find_file(reference, folder) if key == "import" else folder / reference
         try:
-            return str(beside) if isinstance(reference, str) and beside.is_file() else reference
+            return str(path) if path is not None and path.is_file() else reference
         except (OSError, ValueError):  # of names too long, and names with a NUL: refused where they are read
             return reference
 
-    located = change_files(values, lambda _, reference: absolute(reference))
-    if "import" in values:
-        located["import"] = absolute(absolute(values["import"]), ".py")
-    return located
+    return change_files(values, find_beside, keys=(*FILE_KEYS, "import", "base"))
 
 
 def _import_all(stored: Any, more: Any) -> Any:

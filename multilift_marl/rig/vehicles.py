@@ -12,6 +12,7 @@ import numpy as np
 
 from multilift_marl.errors import ConfigError, nearest
 from multilift_marl.physical import GRAVITY
+from multilift_marl.plugins import describe_unknown, load_entry_points
 from multilift_marl.rig import plausible
 from multilift_marl.rig.presets import PRESETS
 from multilift_marl.rig.urdf import REQUIRED, read_urdf
@@ -93,8 +94,11 @@ def _find_vehicle(preset: str, given: Collection[str]) -> Vehicle:
         azimuth = tuple(np.deg2rad(fields.pop("rotor_azimuth")))
         return replace(PRESETS["falcon"], name=path.stem, rotor_azimuth=azimuth, **fields)
     if preset not in PRESETS:
+        load_entry_points()
+    if preset not in PRESETS:
         cure = "; one's own needs import=<module>, or is a file, <name>.yaml or .urdf"
-        raise ConfigError(f"unknown vehicle.preset '{preset}'{nearest(preset, PRESETS, otherwise=cure)}")
+        unknown = f"unknown vehicle.preset '{preset}'{nearest(preset, PRESETS, otherwise=cure)}"
+        raise ConfigError(describe_unknown(preset, unknown))
     return PRESETS[preset]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,29 +52,34 @@ def _pin(key: str, reference: str) -> str:
     return reference if key == "vehicle.preset" and not is_vehicle_file(reference) else pin_file(reference)
 
 
-def change_files(values: Mapping[str, Any], change: Callable[[str, str], str], prefix: str = "") -> dict[str, Any]:
+def change_files(
+    values: Mapping[str, Any], change: Callable[[str, str], str], prefix: str = "", keys: Collection[str] = FILE_KEYS
+) -> dict[str, Any]:
     """Return values of a configuration in which each reference to a file is changed.
 
     Those of `scene.obstacles`, `train.overrides`, `train.rigs` and `train.stages` count, too.
 
     Args:
         values: nested or by dotted name.
-        change: takes the key, one of `FILE_KEYS`, and the reference, and returns another.
+        change: takes the key and the reference, and returns another.
         prefix: of the names of `values`.
+        keys: what hold references.
     """
     changed: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
         inside = "" if name in ("train.overrides", "train.stages.overrides") else f"{name}."
         if isinstance(value, Mapping):
-            changed[key] = change_files(value, change, inside)
+            changed[key] = change_files(value, change, inside, keys)
         elif name in ("scene.obstacles", "train.rigs", "train.stages") and isinstance(value, list | tuple):
             start = "" if name == "train.rigs" else f"{name}."
-            changed[key] = [change_files(each, change, start) if isinstance(each, Mapping) else each for each in value]
-        elif name in FILE_KEYS and isinstance(value, list | tuple):
+            changed[key] = [
+                change_files(each, change, start, keys) if isinstance(each, Mapping) else each for each in value
+            ]
+        elif name in keys and isinstance(value, list | tuple):
             changed[key] = [change(name, each) if isinstance(each, str) else each for each in value]
         else:
-            changed[key] = change(name, value) if name in FILE_KEYS and isinstance(value, str) else value
+            changed[key] = change(name, value) if name in keys and isinstance(value, str) else value
     return changed
 
 

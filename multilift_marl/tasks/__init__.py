@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from multilift_marl.config.load import register_config
+from multilift_marl.config.load import register_config, state_task
 from multilift_marl.errors import ConfigError, nearest
-from multilift_marl.plugins import describe_unregistered, load_entry_points, registers
+from multilift_marl.plugins import describe_unknown, describe_unregistered, load_entry_points, registers
 from multilift_marl.tasks.base import Task
 from multilift_marl.tasks.gate import Gate
 from multilift_marl.tasks.hover import Hover
@@ -45,15 +45,15 @@ def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None)
 
     Args:
         task: the class; of several with one name, the latest counts.
-        config: its configuration, which is then known by the same name: a YAML file, or values by section; None for
-            typed defaults.
+        config: its configuration, which is then known by the same name, and needs no key `task`: a YAML file, or values
+            by section; None for typed defaults.
 
     Returns:
         The class.
 
     Raises:
-        ConfigError: no task, one without a name, or with that of a shipped task or configuration, or one that declares
-            what cannot be; see `check_declared`.
+        ConfigError: no task, one without a name, or with that of a shipped task or configuration, one that declares
+            what cannot be, see `check_declared`, or a configuration of another task.
     """
     name = getattr(task, "name", None)
     if not (isinstance(task, type) and issubclass(task, Task) and isinstance(name, str)):
@@ -62,12 +62,18 @@ def register_task(task: T, config: str | Path | Mapping[str, Any] | None = None)
         raise ConfigError(f"a task of one's own cannot have the name '{name}': choose one that is not taken")
     if name not in _SHIPPED:
         check_declared(task)
-        register_config(name, {"task": name} if config is None else config)
+        register_config(name, state_task(name, {} if config is None else config))
     TASKS[name] = task
     return task
 
 
-registers.append(register_task)
+def _register_found(task: Any) -> None:
+    """Register what an entry point is, unless its module has done so, with a configuration perhaps."""
+    if not any(task is known for known in TASKS.values()):
+        register_task(task)
+
+
+registers.append(_register_found)
 
 
 def list_tasks() -> list[str]:
@@ -82,10 +88,9 @@ def find_task(name: str) -> type[Task]:
     Raises:
         ConfigError: there is no such task, or the package that has it fails.
     """
-    failures = {} if name in TASKS else load_entry_points()
-    if name in failures:
-        raise ConfigError(failures[name])
+    if name not in TASKS:
+        load_entry_points()
     if name not in TASKS:
         cure = describe_unregistered(name) or nearest(name, TASKS, otherwise="; one's own needs import=<module>")
-        raise ConfigError(f"unknown task '{name}'{cure}")
+        raise ConfigError(describe_unknown(name, f"unknown task '{name}'{cure}"))
     return TASKS[name]

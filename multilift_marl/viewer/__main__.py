@@ -14,11 +14,11 @@ from multilift_marl._interrupt import Watch, ending_at_once, leave
 from multilift_marl.agents.policy import NamedPolicy, find_policy, load_policy
 from multilift_marl.command import check_needs, run_command, split_options
 from multilift_marl.config.config import Config
-from multilift_marl.config.load import build_config, load_config
+from multilift_marl.config.load import build_config, load_config, load_rig
 from multilift_marl.deploy.sitl.view import ViewOptions
 from multilift_marl.errors import ConfigError
-from multilift_marl.policies.baselines import SCRIPTED
 from multilift_marl.schema.values import Int
+from multilift_marl.tasks import list_tasks
 from multilift_marl.viewer.draft import DraftSession
 from multilift_marl.viewer.live import LiveSession
 from multilift_marl.viewer.page import HOST, Page
@@ -76,20 +76,20 @@ def make_session(values: dict[str, Any]) -> tuple[Session | LiveSession | DraftS
     """
     options, overrides = split_options(Options, values)
     check_needs(options, dict.fromkeys(("allow_network", "domain", "names", "ros"), "live=true"))
-    learned: dict[str, NamedPolicy] = {}
+    named: dict[str, NamedPolicy] = {}
     if options.run is not None:
-        learned["run"] = load_policy(options.run)
-    policy = "run" if learned and options.policy is None else options.policy
-    if policy is not None and policy not in ("run", *SCRIPTED):
-        learned[policy] = find_policy(policy, others=learned)
-    config = _find_config(options, learned, {**overrides, "env.num_envs": 1, "env.num_threads": 1})
+        named["run"] = load_policy(options.run)
+    policy = "run" if named and options.policy is None else options.policy
+    if policy is not None and policy != "run":
+        named[policy] = find_policy(policy, others=named)
+    config = _find_config(options, named, {**overrides, "env.num_envs": 1, "env.num_threads": 1})
     if options.live:
         return _listen(options, config), options.port
     try:
         _ = config.system
     except ConfigError:
         return DraftSession(config), options.port
-    return Session(config, learned, policy, options.seed), options.port
+    return Session(config, named, policy, options.seed), options.port
 
 
 def _listen(options: Options, config: Config) -> LiveSession:
@@ -102,11 +102,13 @@ def _listen(options: Options, config: Config) -> LiveSession:
     return LiveSession(config, node, options.names)
 
 
-def _find_config(options: Options, learned: dict[str, NamedPolicy], overrides: dict[str, Any]) -> Config:
+def _find_config(options: Options, named: dict[str, NamedPolicy], overrides: dict[str, Any]) -> Config:
     task = options.task
     if options.config is not None:
+        if task is not None and task not in list_tasks():  # of a configuration, which brings its task
+            return load_rig(options.config, task, overrides)
         return load_config(options.config, overrides if task is None else {**overrides, "task": task})
-    trained = [policy.config for policy in learned.values() if policy.config is not None]
+    trained = [policy.config for policy in named.values() if policy.config is not None]
     if task is None and trained:
         return build_config(trained[0].model_dump(), overrides)
     return load_config("hover" if task is None else task, overrides)

@@ -27,8 +27,8 @@ class Session:
 
     Args:
         config: the environment.
-        learned: trained policies by name, beside the baselines.
-        policy: name of the first one; None for the first that fits.
+        named: policies by name, beside the baselines that fit.
+        policy: name of the first one, of `named` or a baseline; None for the first that fits.
         seed: of the episodes, those of `evaluate.py`.
 
     Attributes:
@@ -43,16 +43,16 @@ class Session:
         ConfigError: there is no such policy, or it does not fit the environment.
     """
 
-    def __init__(self, config: Config, learned: dict[str, Any], policy: str | None = None, seed: int = 1000):
-        if isinstance(mine := learned.get(policy or ""), TrainedPolicy) and (reason := mine.misfit_config(config)):
+    def __init__(self, config: Config, named: dict[str, Any], policy: str | None = None, seed: int = 1000):
+        if isinstance(mine := named.get(policy or ""), TrainedPolicy) and (reason := mine.misfit_config(config)):
             raise ConfigError(f"the policy {policy} {reason}")
-        if policy is not None and policy not in learned:
+        if policy is not None:
             check_interface(policy, config.control.action, "policy")
         self.vec = vec = MultiliftVec(config, EVALUATION)
         self._lock = threading.RLock()
-        self._makers = _fitting(vec, learned)
+        self._makers = _fitting(vec, named)
         self.policies = tuple(self._makers)
-        self.policy = self._checked(policy if policy is not None else next(iter(self._makers), "none"), learned)
+        self.policy = self._checked(policy if policy is not None else next(iter(self._makers), "none"), named)
         self._policy, self._chosen = self._makers[self.policy](vec), self.policy
         self.paused = False
         self.speed = 1.0
@@ -165,18 +165,16 @@ class Session:
         self._behind = 0.0
         self._policy.reset()
 
-    def _checked(self, policy: str, learned: dict[str, Any]) -> str:
-        if policy in learned and policy not in self._makers:
-            raise ConfigError(f"the policy {policy} {learned[policy].misfit(self.vec)}")
+    def _checked(self, policy: str, named: dict[str, Any]) -> str:
+        if policy in named and policy not in self._makers:
+            raise ConfigError(f"the policy {policy} {named[policy].misfit(self.vec)}")
         if policy not in self._makers:
             raise ConfigError(f"unknown policy '{policy}'{nearest(policy, self._makers)}")
         return policy
 
 
-def _fitting(vec: MultiliftVec, learned: dict[str, Any]) -> dict[str, Callable[[MultiliftVec], Policy]]:
-    """Return the makers of all policies that fit, learned ones first."""
-    makers: dict[str, Callable[[MultiliftVec], Policy]] = {}
-    for name, policy in learned.items():
-        if not policy.misfit(vec):
-            makers[name] = policy.bind
-    return makers | {name: functools.partial(make_scripted, name) for name in fitting_scripts(vec)}
+def _fitting(vec: MultiliftVec, named: dict[str, Any]) -> dict[str, Callable[[MultiliftVec], Policy]]:
+    """Return the makers of all policies that fit, those that are `named` and no such baseline first."""
+    baselines = {name: functools.partial(make_scripted, name) for name in fitting_scripts(vec)}
+    first = {name: policy.bind for name, policy in named.items() if name not in baselines and not policy.misfit(vec)}
+    return first | baselines

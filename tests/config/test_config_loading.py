@@ -6,15 +6,16 @@ import re
 
 import pytest
 import yaml
-from conftest import TASKS
+from conftest import TASKS, refusal
 
 from multilift_marl.config import precedence
 from multilift_marl.config.config import Config
+from multilift_marl.config.keys import explain
 from multilift_marl.config.load import (
     CONFIGS,
+    _locate,
     build_config,
     dump_config,
-    explain,
     list_configs,
     load_config,
     parse_overrides,
@@ -223,3 +224,35 @@ def test_an_empty_section_asks_for_what_it_drops_alone():
     kept = give_way(stored, {"randomization": {}, "wind": {}, "task_options": {}})
     assert kept == stored
     assert give_way(stored, {"reward": {}})["train"]["overrides"] == {"randomization.cable_length": 0.1}
+
+
+def test_what_lies_beside_a_yaml_file_goes_before_all_else(tmp_path, registries):
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    for package in (theirs, theirs / "pack", theirs / "pack" / "sub"):
+        package.mkdir(exist_ok=True)
+        (package / "__init__.py").write_text("")
+        (package / "part.py").write_text("")
+    (theirs / "__init__.py").unlink()
+    (theirs / "part").write_text("no module")
+    for reference, found in (
+        ("part", "part.py"),
+        ("pack", "pack/__init__.py"),
+        ("pack.part", "pack/part.py"),
+        ("pack.sub", "pack/sub/__init__.py"),
+        ("pack/part.py", "pack/part.py"),
+        ("./pack", "pack/__init__.py"),
+        (["pack.sub.part", "json", "mine"], "pack/sub/part.py"),
+    ):
+        first = str(theirs / found)
+        expected = [first, "json", "mine"] if isinstance(reference, list) else first
+        for place in (
+            lambda name: {"import": name},
+            lambda name: {"train": {"overrides": {"import": name}}},
+            lambda name: {"train": {"rigs": [{"import": name}]}},
+            lambda name: {"train": {"stages": [{"overrides": {"import": name}}]}},
+        ):
+            assert _locate(place(reference), theirs) == place(expected)
+    (theirs / "rig.yaml").write_text("import: pack.part")
+    assert "was not run" in refusal(load_config, theirs / "rig.yaml")
+    assert getattr(load_config(theirs / "rig.yaml", trust=True), "import") == (str(theirs / "pack" / "part.py"),)

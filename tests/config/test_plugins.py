@@ -173,46 +173,6 @@ def test_the_task_that_is_missing_tells_how_to_bring_it(folder):
     assert message.startswith("unknown task 'near'; known: ") and message.endswith("; one's own needs import=<module>")
 
 
-# Tasks of installed packages
-
-
-def install(folder, entry, source):
-    """Put a package with one entry point where installed ones are."""
-    (folder / "kit_tasks.py").write_text(source)
-    info = folder / "kit_tasks-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: kit-tasks\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[multilift_marl.tasks]\n{entry}\n")
-
-
-@pytest.fixture
-def entry_points():
-    """Have entry points looked for anew, and forget them afterwards."""
-    plugins.load_entry_points.cache_clear()
-    yield
-    plugins.load_entry_points.cache_clear()
-
-
-@pytest.mark.parametrize("entry", ["near = kit_tasks:Near", "all = kit_tasks"])
-def test_tasks_of_installed_packages_are_known(folder, monkeypatch, entry_points, entry):
-    register = "@ml.register_task\n" if entry.startswith("all") else ""
-    install(folder, entry, PLUGIN.replace("@ml.register_task\n", register))
-    monkeypatch.syspath_prepend(folder)
-    assert ml.make_vec("near", num_envs=1, num_threads=1).task.name == "near"
-    assert "near" in ml.list_tasks()
-
-
-def test_a_package_that_fails_is_named_and_leaves_the_others_alone(folder, monkeypatch, entry_points):
-    install(folder, "near = kit_tasks:Near", "import nosuchlibrary")
-    monkeypatch.syspath_prepend(folder)
-    with pytest.warns(UserWarning, match="the task 'near' of kit-tasks"):
-        assert "near" not in ml.list_tasks()
-    assert refusal(MultiliftVec, build_config({"task": "near"})) == (
-        "the task 'near' of kit-tasks (kit_tasks:Near) cannot be loaded: ModuleNotFoundError in kit_tasks.py, line 1 "
-        "(No module named 'nosuchlibrary')"
-    )
-
-
 # Registering
 
 
@@ -248,6 +208,34 @@ def test_a_task_brings_its_configuration_under_its_name(folder):
     )
     ml.register_config("rigs/mine", {"env": {"num_drones": 2}})
     assert load_config("rigs/mine", {"task": "track"}).control == load_config("track").control
+
+
+@pytest.mark.parametrize("form", ["mapping", "file"])
+def test_a_tasks_configuration_is_of_that_task_without_saying_so_and_of_no_other(folder, form):
+    class Far(Hover):
+        name = "far"
+
+    def source(values):
+        (folder / "sub").mkdir(exist_ok=True)
+        (folder / "sub" / "far.yaml").write_text(json.dumps(values))
+        return values if form == "mapping" else "sub/far.yaml"
+
+    (folder / "sub" / "heavy.yaml").parent.mkdir()
+    (folder / "sub" / "heavy.yaml").write_text("payload: {mass: 2.0}")
+    base = {"base": str(folder / "sub" / "heavy.yaml") if form == "mapping" else "heavy.yaml"}
+    long = {"env": {"episode_seconds": 3.0}}
+    for values, mass in ((long, None), (long | base, 2.0), (long | {"task": "far"} | base, 2.0)):
+        ml.register_task(Far, source(values))
+        config = load_config("far")
+        assert (config.task, config.env.episode_seconds, config.payload.mass) == ("far", 3.0, mass)
+    ml.register_task(Far, source(long | {"base": "track"}))
+    config = load_config("far")
+    assert (config.task, config.env.episode_seconds) == ("far", 3.0)
+    assert config.train == build_config({}).train  # of a base with another task the system counts alone
+    assert refusal(ml.register_task, Far, source(long | {"task": "hover"})).endswith(
+        "is of task=hover, not of the task 'far' that it is registered with; leave out its key task"
+    )
+    assert load_config("far").env.episode_seconds == 3.0
 
 
 # Vehicles

@@ -1,10 +1,12 @@
 """A rig in a task that is not its own: the task's configuration under the rig's system."""
 
 import json
+import re
 
 import pytest
 from conftest import EXAMPLES, refusal
 
+import multilift_marl as ml
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.cli.evaluate import Options, _build
 from multilift_marl.cli.evaluate import main as evaluate
@@ -64,6 +66,23 @@ def test_bases_that_cannot_be_are_refused(tmp_path, content, complaint):
     (tmp_path / "own.yaml").write_text(content)
     (tmp_path / "third.yaml").write_text("base: own.yaml\n")
     assert complaint in refusal(load_config, tmp_path / "own.yaml")
+
+
+def test_a_base_that_leads_back_is_refused_however_its_path_is_written(tmp_path, monkeypatch, registries):
+    folder = tmp_path / "d"
+    folder.mkdir()
+    (tmp_path / "link").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    (folder / "third.yaml").write_text("base: ./own.yaml\n")
+    for base in ("../d/own.yaml", "./own.yaml", "../link/own.yaml", str(folder / "own.yaml"), "../d/third.yaml"):
+        (folder / "own.yaml").write_text(f"base: {base}\n")
+        for name in ("d/own.yaml", "d/../d/own.yaml", folder / "own.yaml", "link/own.yaml"):
+            assert re.search(r"is based on \S+, which is based on it", refusal(load_config, name)), (base, name)
+    (folder / "own.yaml").write_text("payload: {mass: 2.0}\n")
+    ml.register_config("mine", "d/own.yaml")
+    (folder / "own.yaml").write_text("base: mine\n")
+    for name in ("mine", "d/own.yaml"):
+        assert "own.yaml is based on mine, which is based on it" in refusal(load_config, name)
 
 
 @pytest.mark.parametrize("policy", ["hover", "hover_ctbr"])

@@ -182,6 +182,9 @@ def test_a_trained_policy_is_the_first_and_one_that_does_not_fit_is_refused():
     [
         (["task=hove"], "no configuration named 'hove'; did you mean 'hover'?"),
         (["policy=formatio"], "unknown policy 'formatio'; did you mean 'formation'?"),
+        (["policy=formation_balanced"], "policy=formation_balanced is for task regroup; take formation_integral"),
+        (["policy=mpc"], "the baseline 'mpc' acts by control.action=acc_rates and cannot fly control.action=reference"),
+        (["task=hove", "config=rigs/falcon3"], "no configuration named 'hove'; did you mean 'hover'?"),
         (["policy=run"], "unknown policy 'run'; known: formation"),
         (["port=70000"], "port must be from 0 to 65535, but is 70000"),
         (["seed=-1"], "seed must be greater than or equal to 0, but is -1"),

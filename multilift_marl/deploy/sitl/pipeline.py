@@ -10,7 +10,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from multilift_marl.command import CommandOptions, make_out, spell_arguments, split_options
-from multilift_marl.config.load import check_names, load_config
+from multilift_marl.config.keys import check_names
+from multilift_marl.config.load import load_config
 from multilift_marl.deploy.px4.__main__ import Options as FlightOptions
 from multilift_marl.deploy.ros.__main__ import OF_ROLES, USUAL, check_role
 from multilift_marl.deploy.ros.__main__ import Options as NodeOptions
