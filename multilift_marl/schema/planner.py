@@ -21,10 +21,7 @@ class PlannerConfig(Section):
         None, ge=1, le=1000, description="in each policy step, with hard limits at most; None: 1, with hard limits 40"
     )
     sweeps: Int = Field(
-        3,
-        ge=1,
-        le=100,
-        description="of a policy step in which drones of mpc_distributed improve plans; one by sensors on board",
+        3, ge=1, le=100, description="in each policy step of drones of mpc_distributed, but with sensors on board one"
     )
     distributed: bool = Field(
         False, description="whether with control.action=planner_weights each drone plans for itself, as mpc_distributed"
