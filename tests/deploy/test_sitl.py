@@ -178,7 +178,7 @@ def test_who_ends_early_is_named_with_the_last_words_and_the_rest_goes_on(tmp_pa
     assert (tmp_path / "one.log").read_text() == "hello\n" and (tmp_path / "two.log").read_text() == ""
     rows = [line.split(maxsplit=3) for line in pipeline.describe().splitlines()[1:]]
     assert [(row[0], row[3]) for row in rows] == [("flight", "status 0"), ("one", "signal 9"), ("two", "signal 2")]
-    assert float(rows[0][1]) == pytest.approx(0.6, abs=0.2) and float(rows[0][2]) < 0.2
+    assert float(rows[0][1]) >= 0.5 > float(rows[0][2])
 
 
 @pytest.mark.parametrize("last, status", [("exit 3", 3), ("kill -15 $$", 143)])
@@ -199,15 +199,17 @@ def test_cpu_time_counts_those_that_a_process_waited_for():
 def test_the_flight_ends_before_the_nodes_and_what_is_deaf_is_killed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("multilift_marl.deploy.sitl.running._END_FLIGHT", ((signal.SIGINT, 0.3),))
     monkeypatch.setattr("multilift_marl.deploy.sitl.running._END_NODES", ((signal.SIGINT, 0.3), (signal.SIGINT, 1.0)))
-    deaf = f"trap '' INT; touch {tmp_path}/deaf; while :; do sleep 0.1; done"
-    twice = f"trap 'test $n && exit 7; n=1; echo once' INT; touch {tmp_path}/twice; while :; do sleep 0.1; done"
+    deaf = f"trap '' INT; echo $$ > {tmp_path}/deaf; while :; do sleep 0.1; done"
+    early = f"kill -0 $(cat {tmp_path}/deaf) 2>/dev/null && echo early"
+    twice = (
+        f"trap 'test $n && exit 7; n=1; {early}; echo once' INT; touch {tmp_path}/twice; while :; do sleep 0.1; done"
+    )
     with Pipeline({"flight": ["sh", "-c", deaf], "node": ["sh", "-c", twice]}, tmp_path) as pipeline:
         end = time.monotonic() + 10
         while not ((tmp_path / "deaf").exists() and (tmp_path / "twice").exists()) and time.monotonic() < end:
             time.sleep(0.01)
     flight, node = pipeline.processes
     assert (flight.ending, node.ending) == ("signal 9", "status 7")
-    assert flight.seconds < node.seconds - 0.1
     assert capsys.readouterr().out == "node   | once\n"
 
 
