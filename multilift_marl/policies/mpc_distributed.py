@@ -54,10 +54,11 @@ class DistributedMpc(TeamMpc):
         super().reset(None if mask is None else np.repeat(mask, self._vec.num_drones))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """See `TeamMpc.arrays`; plans and messages of teams, drones of one after another."""
-        post = self.planner.post._asdict()
-        lately = {"lately": self._lately, "known": self._known}
-        return super().arrays() | lately | {f"Post.{name}": array for name, array in post.items()}
+        """See `TeamMpc.arrays`; (E, N, ...) of what each drone has of its own, and messages (E, ...)."""
+        teams = self._vec.num_envs, self._vec.num_drones
+        own = super().arrays() | {"lately": self._lately, "known": self._known}
+        found = {name: array.reshape(*teams, *array.shape[1:]) for name, array in own.items()}  # views
+        return found | {f"Post.{name}": array for name, array in self.planner.post._asdict().items()}
 
     def metrics(self) -> dict[str, np.ndarray]:
         """See `TeamMpc.metrics`: means over the drones."""

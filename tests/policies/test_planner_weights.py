@@ -57,6 +57,22 @@ def test_a_saved_flight_goes_on_bit_for_bit(apart):
         assert (first.step(action)[0] == second.step(action)[0]).all()
 
 
+@pytest.mark.parametrize("apart, limits", [(False, "soft"), (False, "hard"), (True, "soft")])
+def test_a_state_saved_after_a_reset_is_loaded(apart, limits):
+    """Of all environments and of one of them; arrays have a row for each environment."""
+    keys = WEIGHTS | {"planner.distributed": apart, "planner.limits": limits, "env.sensing": "mocap"}
+    vec = ml.make_vec("track", num_envs=2, **keys)
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 2, 3, vec.action_size))
+    for mask in (None, np.array([True, False])):
+        vec.reset(mask=mask)
+        saved = vec.state_dict()
+        assert {len(array) for array in saved.values()} == {2}
+        assert all(np.isfinite(array).all() for name, array in saved.items() if name.startswith("commander."))
+        first = [vec.step(action)[0] for action in actions]
+        vec.load_state_dict(saved)
+        assert all((vec.step(action)[0] == there).all() for action, there in zip(actions, first, strict=True))
+
+
 def test_an_environment_is_the_same_in_any_batch():
     alone, batch = (ml.make_vec("track", num_envs=e, first_env=f, **WEIGHTS) for e, f in ((1, 2), (4, 0)))
     action = np.random.default_rng(0).uniform(-0.5, 0.5, (4, 3, alone.action_size))
