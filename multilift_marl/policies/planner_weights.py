@@ -16,8 +16,10 @@ from multilift_marl.control.actions import PLANNER_WEIGHTS, AccRatesAction
 from multilift_marl.diffmpc.sensitivity import Gradient
 from multilift_marl.diffmpc.weighted_planner import WeightedHardPlanner, WeightedPlanner
 from multilift_marl.errors import ConfigError
+from multilift_marl.mdp.observations import observation_names
 from multilift_marl.planning.distributed_planner import DistributedPlanner
 from multilift_marl.planning.team_weights import TeamWeights
+from multilift_marl.policies.hold import HoldAccRates
 from multilift_marl.policies.mpc import TeamMpc
 from multilift_marl.policies.mpc_distributed import DistributedMpc
 
@@ -63,7 +65,7 @@ class PlannerWeights:
         said = np.repeat(action.reshape(-1, 1, action.shape[-1]), action.shape[1], axis=1) if self._apart else action
         for mine, weights in zip(self.planner.weights, self.weigh(said), strict=True):
             mine[:] = weights
-        return self.mpc.act(self._vec.task.observation)
+        return self.mpc.act(self._vec.outcome.observation)
 
     def weigh(self, action: np.ndarray) -> TeamWeights:
         """Return the weights of actions (..., N, A)."""
@@ -97,6 +99,10 @@ class PlannerWeights:
         """See `Commander.arrays`."""
         return self.mpc.arrays()
 
+    def metrics(self) -> dict[str, np.ndarray]:
+        """See `Commander.metrics`."""
+        return self.mpc.metrics()
+
 
 def weight_map(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return by how much the logarithm of each weight of N drones changes by each number of their actions.
@@ -126,7 +132,7 @@ class _ByRates:
         return "acc_rates"
 
     def _make_fallback(self) -> Policy:
-        return _Nothing(self._vec.num_drones)
+        return _HoldByRates(self._vec)
 
 
 class _WeightedMpc(_ByRates, TeamMpc):
@@ -145,15 +151,20 @@ class _DistributedWeightedMpc(_ByRates, DistributedMpc):
     """See `DistributedMpc`."""
 
 
-class _Nothing:
-    """Commands zero accelerations relative to the formation."""
+class _HoldByRates(HoldAccRates):
+    """The same, in environments with other actions: it acts as by `acc_rates`, on what is observed with these."""
 
-    def __init__(self, n: int):
-        self._shape = n, len(AccRatesAction.numbers)
+    def __init__(self, vec: MultiliftVec):
+        observed = observation_names(self.INTERFACE, vec.task.extra(vec.config), vec.config.env.ages)
+        self._columns = [vec.observation_names.index(name) for name in observed]  # so that it rounds alike, too
+        self._observed = observed
+        super().__init__(vec)
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        self._names, self._actions = self._observed, tuple(number.name for number in AccRatesAction.numbers)
+        return super().matrix()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return zeros (E, N, 5)."""
-        return np.zeros((len(observation), *self._shape))
-
-    def reset(self, mask: np.ndarray | None = None) -> None:
-        """Do nothing."""
+        """Return actions (E, N, 5) of `acc_rates` for observations (E, N, D)."""
+        return super().act(np.take(observation, self._columns, axis=-1))

@@ -8,13 +8,15 @@ import pytest
 import multilift_marl as ml
 from multilift_marl.diffmpc.weighted_planner import FlightGradient
 from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.rollout import measure_episodes
 from multilift_marl.planning.team_weights import TeamWeights
-from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.baselines import make_base_policy, make_scripted
 from multilift_marl.policies.planner_weights import weight_map
 
 pytestmark = pytest.mark.slow  # its planner takes a minute to compile
 
 WIDE = {"control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0, "env.num_threads": 1, "env.num_drones": 3}
+RATES = WIDE | {"control.action": "acc_rates"}
 WEIGHTS = WIDE | {"control.action": "planner_weights"}
 
 
@@ -27,9 +29,7 @@ def test_zero_actions_fly_as_the_planner_bit_for_bit(name, limits):
         "task_options.acceleration": 4.0,
         "num_envs": 2,
     }
-    ours, theirs = (
-        ml.make_vec("track", seed=3, **keys, **own) for keys in (WEIGHTS, WIDE | {"control.action": "acc_rates"})
-    )
+    ours, theirs = (ml.make_vec("track", seed=3, **keys, **own) for keys in (WEIGHTS, RATES))
     policy = make_scripted(name, theirs)
     observation, _ = theirs.reset(seed=3)
     ours.reset(seed=3)
@@ -38,6 +38,23 @@ def test_zero_actions_fly_as_the_planner_bit_for_bit(name, limits):
         observation = theirs.step(policy.act(observation))[0]
     assert (ours.world.state.payload_position == theirs.world.state.payload_position).all()
     assert (ours.world.state.drone_rotation == theirs.world.state.drone_rotation).all()
+
+
+@pytest.mark.parametrize(
+    "name, own", [("mpc", {}), ("mpc", {"env.history": [0, 2], "env.sensing": "mocap"}), ("mpc_distributed", {})]
+)
+def test_without_a_plan_the_linear_baseline_of_acc_rates_flies(name, own):
+    """As by mpc, bit for bit; and evaluation reports that plans were late."""
+    late = own | {"planner.deadline": 1e-4, "planner.steps": 200, "env.episode_seconds": 0.6, "num_envs": 2}
+    late["planner.distributed"] = name == "mpc_distributed"
+    ours, theirs = (ml.make_vec("track", seed=3, **keys, **late) for keys in (WEIGHTS, RATES))
+    policy, ended = make_scripted(name, theirs), []
+    for vec, each in ((ours, make_base_policy("formation", ours)), (theirs, policy)):
+        found = measure_episodes(vec, each, vec.reset(seed=3)[0])
+        assert (found["planner_late"] == 1.0).all() and "planner_failed" in found
+        ended.append(vec.world.state)
+    assert (ended[0].payload_position == ended[1].payload_position).all()
+    assert (ended[0].drone_rotation == ended[1].drone_rotation).all()
 
 
 @pytest.mark.parametrize(
