@@ -210,7 +210,7 @@ def own_metrics(vec: MultiliftVec, policy: Policy) -> dict[str, np.ndarray]:
         (f"control.action={vec.config.control.action}", vec.commander),
         ("the policy", policy),
     ):
-        reported = getattr(what, "metrics", dict)()
+        reported: dict[str, np.ndarray] = getattr(what, "metrics", dict)()
         for name in reported:
             if name in known or name in found or is_shortfall(name):
                 raise ConfigError(

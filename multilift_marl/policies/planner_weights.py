@@ -22,6 +22,7 @@ from multilift_marl.planning.team_weights import TeamWeights
 from multilift_marl.policies.hold import HoldAccRates
 from multilift_marl.policies.mpc import TeamMpc
 from multilift_marl.policies.mpc_distributed import DistributedMpc
+from multilift_marl.sim.saved import fingerprint
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -53,6 +54,7 @@ class PlannerWeights:
         n = vec.num_drones
         self._scale = log(vec.config.control.max_weight)
         self._by_drone, self._rate_by_drone, self._by_end = weight_map(n)
+        self._settings = fingerprint(str(vec.config.planner.model_dump(exclude_defaults=True)), vec.num_envs)
 
     @property
     def planner(self) -> WeightedPlanner | DistributedPlanner:
@@ -97,7 +99,7 @@ class PlannerWeights:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """See `Commander.arrays`."""
-        return self.mpc.arrays()
+        return {"planner": self._settings} | self.mpc.arrays()
 
     def metrics(self) -> dict[str, np.ndarray]:
         """See `Commander.metrics`."""

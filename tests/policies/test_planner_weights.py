@@ -90,6 +90,13 @@ def test_a_state_saved_after_a_reset_is_loaded(apart, limits):
         assert all((vec.step(action)[0] == there).all() for action, there in zip(actions, first, strict=True))
 
 
+def test_a_state_of_another_planner_is_refused():
+    own, other = (ml.make_vec("track", num_envs=2, **WEIGHTS, **{"planner.position": at}) for at in (0.1, 0.2))
+    own.reset(seed=0)
+    with pytest.raises(ValueError, match=r"'commander\.planner' is that of another"):
+        other.load_state_dict(own.state_dict())
+
+
 def test_an_environment_is_the_same_in_any_batch():
     alone, batch = (ml.make_vec("track", num_envs=e, first_env=f, **WEIGHTS) for e, f in ((1, 2), (4, 0)))
     action = np.random.default_rng(0).uniform(-0.5, 0.5, (4, 3, alone.action_size))
