@@ -42,7 +42,7 @@ class ActionComponent(NamedTuple):
 FACTOR = "max_weight"
 """The limit of factors: a number is the power of it by which something is multiplied, which 0 leaves as it is."""
 THRUST = ""
-"""The limit of thrusts, each drone's own: -1 is the least that the rotors can give, 0 the one at rest, 1 the largest."""
+"""The limit of thrusts, each drone's own: -1 is the least that rotors can give, 0 the one at rest, 1 the largest."""
 
 
 def vector_components(unit: str, limit: str, meaning: str, prefix: str = "") -> tuple[ActionComponent, ...]:
