@@ -55,7 +55,7 @@ class Tape(NamedTuple):
     late: np.ndarray
     """(T, E) int64, after how many further policy steps what a plan commands reaches the rotors."""
     cut: np.ndarray
-    """(T, E) bool, steps after which an episode ended, or whose plan failed: nothing goes back through them."""
+    """(T, E) bool, steps after which an episode ended, or whose plan was not flown: nothing goes back through them."""
 
     @classmethod
     def of(cls, steps: int, num_envs: int, horizon: int, n: int) -> Tape:
@@ -286,7 +286,7 @@ def pull_flight_back(costs, times, weights, model, surroundings, adjoint):
         for i in range(size):
             costate[i] = costs[e, steps, i]
         for t in range(steps - 1, -1, -1):
-            # An episode has ended here, or a plan failed: what comes after owes nothing to what was before.
+            # An episode has ended here, or a plan was not flown: what comes after owes nothing to what was before.
             if tape.cut[t, e]:
                 by_input[:] = 0.0
                 for i in range(size):

@@ -20,6 +20,7 @@ from multilift_marl.mdp.observations import observation_names
 from multilift_marl.planning.distributed_planner import DistributedPlanner
 from multilift_marl.planning.team_weights import TeamWeights
 from multilift_marl.policies.hold import HoldAccRates
+from multilift_marl.policies.last_plan import LastPlan
 from multilift_marl.policies.mpc import TeamMpc
 from multilift_marl.policies.mpc_distributed import DistributedMpc
 from multilift_marl.sim.saved import fingerprint
@@ -55,6 +56,11 @@ class PlannerWeights:
         self._scale = log(vec.config.control.max_weight)
         self._by_drone, self._rate_by_drone, self._by_end = weight_map(n)
         self._settings = fingerprint(str(vec.config.planner.model_dump(exclude_defaults=True)), vec.num_envs)
+
+    @property
+    def follows(self) -> np.ndarray:
+        """Whether teams fly by the plans made last (E,) bool: none came late or failed, nor was a state unknown."""
+        return self.mpc.follows
 
     @property
     def planner(self) -> WeightedPlanner | DistributedPlanner:
@@ -129,6 +135,12 @@ class _ByRates:
     """What acts by `acc_rates`, whatever the environment's actions are."""
 
     _vec: MultiliftVec
+    _last: LastPlan
+
+    @property
+    def follows(self) -> np.ndarray:
+        """See `PlannerWeights`; of drones that plan for themselves (E N,)."""
+        return self._last.age == 0.0
 
     def _interface(self, vec: MultiliftVec) -> str:
         return "acc_rates"

@@ -85,6 +85,28 @@ def test_delay_that_plans_expect_does_not_count_as_lateness(steps, expected, lat
     assert (trainer.rollouts._flight.tape.late == late).all()
 
 
+@pytest.mark.parametrize("spoil", ["late", "unknown"])
+def test_plans_that_are_not_flown_teach_nothing(spoil):
+    """Those that come late, and those of a team, the second one here, whose state is unknown."""
+    trainer = Trainer(config(**POOR), Path("unused"))
+    mpc, tape = trainer.rollouts._commander.mpc, trainer.rollouts._flight.tape
+    measure = mpc._measure
+
+    def measured():
+        found = measure()
+        found[0][1] = np.nan
+        return found
+
+    if spoil == "late":
+        mpc._deadline = -1.0
+    else:
+        mpc._measure = measured
+    values = trainer.step()
+    assert tape.cut[:, 1].all() and tape.cut[:, 0].all() == (spoil == "late")
+    assert (values["gradient"] == 0.0) == (spoil == "late")
+    assert values["cut"] == pytest.approx(1.0 if spoil == "late" else 0.5, abs=0.05)
+
+
 @pytest.mark.parametrize(
     ("own", "message"),
     [
