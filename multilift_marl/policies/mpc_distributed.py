@@ -25,14 +25,15 @@ if TYPE_CHECKING:
 class DistributedMpc(TeamMpc):
     """See `TeamMpc`; plan e N + n is that of drone n of environment e."""
 
+    NAME: ClassVar[str] = "mpc_distributed"
     INTERFACES: ClassVar[tuple[str, ...]] = ("acc_rates",)
     planner: DistributedPlanner
 
     def __init__(self, vec: MultiliftVec, preview: Preview | None = None):
         if vec.config.planner.limits == "hard" or vec.num_drones < 2:
             raise ConfigError(
-                "policy=mpc_distributed has soft limits, and two drones or more; set planner.limits=soft, or take "
-                "policy=mpc"
+                f"policy={self.NAME} has soft limits, and two drones or more; set planner.limits=soft, or take policy="
+                f"{self.NAME.removesuffix('_distributed')}"
             )
         super().__init__(vec, preview)
         self._lately, self._known = np.zeros_like(self.planner.plans.states[:, 0]), np.zeros(len(self._fresh), bool)

@@ -51,6 +51,11 @@ class PlannerWeights:
         if vec.config.planner.feedback < 1.0:
             raise ConfigError("control.action=planner_weights commands acc_rates; set planner.feedback=1")
         self._apart = vec.config.planner.distributed
+        if self._apart and (vec.config.planner.limits == "hard" or vec.num_drones < 2):
+            raise ConfigError(
+                "planner.distributed=true has soft limits, and two drones or more; set planner.limits=soft, or "
+                "planner.distributed=false"
+            )
         self._vec, self.mpc = vec, _DistributedWeightedMpc(vec) if self._apart else _WeightedMpc(vec)
         n = vec.num_drones
         self._scale = log(vec.config.control.max_weight)
@@ -141,6 +146,9 @@ class _ByRates:
     def follows(self) -> np.ndarray:
         """See `PlannerWeights`; of drones that plan for themselves (E N,)."""
         return self._last.age == 0.0
+
+    def _asked(self, vec: MultiliftVec) -> str:
+        return f"control.action={vec.config.control.action}"
 
     def _interface(self, vec: MultiliftVec) -> str:
         return "acc_rates"

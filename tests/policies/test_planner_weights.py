@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import refusal
 
 import multilift_marl as ml
 from multilift_marl.diffmpc.weighted_planner import FlightGradient
+from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError
 from multilift_marl.evaluation.rollout import measure_episodes
 from multilift_marl.planning.team_weights import TeamWeights
@@ -202,9 +204,21 @@ def test_derivatives_by_actions_are_differences_of_simulated_flights(own, most):
 
 
 def test_what_cannot_be_planned_is_refused():
-    with pytest.raises(ConfigError, match="cannot fly task recover"):
-        ml.make_vec("recover", **{"control.action": "planner_weights"})
+    own = {"control.action": "planner_weights"}
+    said = refusal(ml.make_vec, "recover", **own)
+    assert said.startswith("control.action=planner_weights cannot fly task recover: ")
+    assert said.endswith("; take another control.action")
+    apart = WEIGHTS | {"planner.distributed": True}
+    for more in ({"planner.limits": "hard"}, {"env.num_drones": 1, "payload.shape": "point"}):
+        said = refusal(ml.make_vec, "track", **apart | more)
+        assert said.startswith("planner.distributed=true has soft limits, and two drones or more; ")
+        assert said.endswith("set planner.limits=soft, or planner.distributed=false")
     with pytest.raises(ConfigError, match=r"planner\.feedback=1"):
         ml.make_vec("track", **WEIGHTS, **{"planner.feedback": 0.5})
     with pytest.raises(ConfigError, match=r"control\.max_weight"):
         ml.load_config("track", {"control.max_weight": 1.0})
+
+
+def test_a_team_that_is_measured_is_not_planned_for():
+    said = refusal(MeasuredTeam, ml.load_config("track", WEIGHTS))
+    assert said.startswith("control.action=planner_weights commands simulated teams alone, ")
