@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from multilift_marl.agents.environments import training_environment
+from multilift_marl.agents.environments import check_environment, training_environment
 from multilift_marl.agents.policy import first_difference
 from multilift_marl.agents.rigs import divide_rigs
 from multilift_marl.agents.rollouts import NOISE
@@ -105,6 +105,7 @@ def _enter(own: Config, k: int, stage: Stage) -> Config:
     try:
         environment = build_config(own.model_dump(), stage.overrides)
         _ = environment.system
+        check_environment(environment)
     except ConfigError as error:
         raise ConfigError(f"stage {k} of train.stages: {error}") from error
     return environment

@@ -91,6 +91,7 @@ class DiffMpcRollouts(LearningRollouts):
         rows: list[dict[str, np.ndarray]] = []
         losses: list[float] = []
         norms: list[float] = []
+        cuts: list[float] = []
         seconds, slot = 0.0, 0
         for _ in range(self._horizon):
             self._fly(observation, slot, rows)
@@ -103,11 +104,13 @@ class DiffMpcRollouts(LearningRollouts):
             check_finite(self._learner, iteration)  # it flies on with them
             losses.append(loss)
             norms.append(norm)
+            cuts.append(float(self._flight.tape.cut[:-1].mean()))
             self._shift(every)
             slot -= every
             seconds += time.perf_counter() - begin
         self.values = {
-            "loss": float(np.mean(losses)), "gradient": float(np.mean(norms)), "learning_seconds": seconds,
+            "loss": float(np.mean(losses)), "gradient": float(np.mean(norms)), "cut": float(np.mean(cuts)),
+            "learning_seconds": seconds,
         }  # fmt: skip
         return [join_steps(rows, vec)]
 
@@ -122,7 +125,8 @@ class DiffMpcRollouts(LearningRollouts):
         for kept, weights in zip(flight.weights, planner.weights, strict=True):
             kept[slot] = weights
         rows.append(list_step(outcome, vec))
-        flight.tape.cut[slot] |= rows[-1]["done"][:, 0] | began
+        # Nor do plans that are not flown teach: those that came late, or of teams whose states are unknown.
+        flight.tape.cut[slot] |= rows[-1]["done"][:, 0] | began | ~self._commander.follows
         # A plan begins where the team will be after `planner.delay`, and so does what the tape keeps.
         flight.tape.late[slot] = np.maximum(vec.task.view.action_delay - self._expected, 0)
 

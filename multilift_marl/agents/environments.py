@@ -30,14 +30,20 @@ def training_environment(config: Config) -> Config:
         environment = build_config(config.model_dump(), config.train.overrides)
     except ConfigError as error:
         raise ConfigError(f"train.overrides: {error}") from error
-    check_interface(config.train.residual, environment.control.action, "train.residual")
-    for env in (config.env, environment.env):
-        check_communication(config.train, env)
-    if config.train.algorithm == "diffmpc":
-        check_diffmpc(config.train, environment.control.action, environment.planner)
+    check_communication(config.train, config.env)
+    check_environment(environment)
     if config.train.algorithm == "dagger":
         check_dagger(config.train)
     return environment
+
+
+def check_environment(environment: Config) -> None:
+    """Refuse, by a ConfigError, an environment in which no policy can be trained as `train` says."""
+    train, action = environment.train, environment.control.action
+    check_interface(train.residual, action, "train.residual")
+    check_communication(train, environment.env)
+    if train.algorithm == "diffmpc":
+        check_diffmpc(train, action, environment.planner)
 
 
 def make_envs(environment: Config, purpose: int = TRAINING) -> list[MultiliftEnv]:

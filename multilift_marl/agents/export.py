@@ -25,7 +25,7 @@ from multilift_marl.agents.logging import package_versions
 from multilift_marl.agents.networks import Actor, Normalizer
 from multilift_marl.agents.policy import LearnedPolicy, TrainedPolicy
 from multilift_marl.config.config import Config
-from multilift_marl.control.action_interface import THRUST, ControlContext
+from multilift_marl.control.action_interface import FACTOR, THRUST, ControlContext
 from multilift_marl.control.actions import ACTIONS
 from multilift_marl.control.formation import Goal, Reference
 from multilift_marl.control.gains import make_gains
@@ -256,9 +256,14 @@ def _describe_action(policy: LearnedPolicy) -> dict[str, Any]:
     numbers = []
     for name, frame, unit, limit, meaning in ACTIONS[control.action].numbers:
         full = None if limit == THRUST else getattr(policy.config.acting, limit)
-        low, zero, high = next(thrusts) if full is None else (-full, 0.0, full)
-        scale = {"at_minus_one": low, "at_zero": zero, "at_one": high}
-        numbers.append({"name": name, "frame": frame, "unit": unit, "meaning": meaning, **scale})
+        is_factor = limit == FACTOR
+        if full is None:
+            low, zero, high = next(thrusts)
+        else:
+            low, zero, high = (1.0 / full, 1.0, full) if is_factor else (-full, 0.0, full)
+        values = {"at_minus_one": low, "at_zero": zero, "at_one": high}
+        scale = {"scale": "exponential" if is_factor else "linear"}
+        numbers.append({"name": name, "frame": frame, "unit": unit, "meaning": meaning, **values, **scale})
     margins = Margins.of(control)
     kept: dict[str, Any] = {"margins": margins._asdict()} if any(margins) else {}
     if control.swing_shift:

@@ -25,6 +25,7 @@ from multilift_marl.agents.networks import (
     build_actor,
     draw_action,
 )
+from multilift_marl.diffmpc.sensitivity import Tape
 from multilift_marl.envs.core import MultiliftVec
 from multilift_marl.envs.torchrl_env import MultiliftEnv
 from multilift_marl.errors import ConfigError
@@ -155,14 +156,19 @@ def check_batch(train: TrainConfig, vec: MultiliftVec, num_envs: int, rigs: int 
             f"train.minibatches={train.minibatches} exceeds the {rows} {what} of a batch; lower it or raise "
             "train.horizon or env.num_envs"
         )
+    # float32; before and after each step observation, action and memory of each drone, and the global state.
     per_drone = 2 * (vec.observation_size + vec.action_size + train.gru) + 6
     needed = 4 * steps * (2 * vec.state_size + vec.num_drones * per_drone)
-    # float32; before and after each step observation, action and memory of each drone, and the global state.
+    lower = "train.horizon"
+    # Beside them what the plans of the window leave for their derivatives.
+    if train.algorithm == "diffmpc":
+        tape = train.diffmpc.window + 1, num_envs, vec.config.planner.steps, vec.num_drones
+        needed, lower = needed + Tape.nbytes(*tape), "train.diffmpc.window, planner.steps, train.horizon"
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > there:
         raise ConfigError(
             f"a batch of {steps} steps takes {needed / 1e9:.0f} GB, but this machine has {there / 1e9:.0f} GB; lower "
-            "train.horizon or env.num_envs"
+            f"{lower} or env.num_envs"
         )
 
 

@@ -35,12 +35,14 @@ class ActionComponent(NamedTuple):
     frame: str
     unit: str
     limit: str
-    """Key of `control` with what 1 stands for, -1 for its opposite; THRUST where drones have limits of their own."""
+    """Key of `control` with what 1 stands for, -1 for its opposite, of FACTOR for its inverse; THRUST, see there."""
     meaning: str
 
 
+FACTOR = "max_weight"
+"""The limit of factors: a number is the power of it by which something is multiplied, which 0 leaves as it is."""
 THRUST = ""
-"""The limit of thrusts: -1 is the least that the rotors can give, 0 the one at rest, 1 the largest."""
+"""The limit of thrusts, each drone's own: -1 is the least that rotors can give, 0 the one at rest, 1 the largest."""
 
 
 def vector_components(unit: str, limit: str, meaning: str, prefix: str = "") -> tuple[ActionComponent, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from multilift_marl.control.action_interface import (
     AXES,
+    FACTOR,
     THRUST,
     YAW_RATE,
     ActionComponent,
@@ -161,7 +162,7 @@ class PlannerWeightsAction(AccRatesAction):
     """
 
     numbers = tuple(
-        ActionComponent(f"{name}_weight", "-", "-", "max_weight", f"weight of {meaning}")
+        ActionComponent(f"{name}_weight", "-", "-", FACTOR, f"factor on the planner's weight of {meaning}")
         for name, meaning in PLANNER_WEIGHTS.items()
     )
     supports: ClassVar[tuple[str, ...]] = ()  # the planner rejects unknown forces

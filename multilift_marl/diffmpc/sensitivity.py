@@ -7,14 +7,15 @@ recursion has found, from Q⁻¹ v on (Amos et al., NeurIPS 2018; Jin et al., Ne
 state are the first gain. Limits that are exceeded count as in the iteration. What an iteration owes to its guess is
 left out: it vanishes as plans converge.
 
-A flight moves by the reduced model; the adjoint of its states runs back through the model's Jacobians and the gains. A
-plan commands thrust vectors ahead of the present ones, F + lead u, which rotors approach by a share `response` in a
-policy step, perhaps some steps late: where none are, and response · lead is a policy step, u is the model's input.
+A flight moves by the reduced model; the adjoint of its states runs back through the model's Jacobians and the gains.
+Plans begin at the thrust vectors F commanded last, which stand for the present ones. They command F + lead u, which
+rotors approach by a share `response` in a policy step, perhaps some steps late: where none are, and response · lead is
+a policy step, u is the model's input.
 """
 
 from __future__ import annotations
 
-from math import sqrt
+from math import prod, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -55,19 +56,28 @@ class Tape(NamedTuple):
     late: np.ndarray
     """(T, E) int64, after how many further policy steps what a plan commands reaches the rotors."""
     cut: np.ndarray
-    """(T, E) bool, steps after which an episode ended, or whose plan failed: nothing goes back through them."""
+    """(T, E) bool, steps after which an episode ended, or whose plan was not flown: nothing goes back through them."""
 
     @classmethod
     def of(cls, steps: int, num_envs: int, horizon: int, n: int) -> Tape:
         """Return a tape for T policy steps of E teams of N drones that plan K steps."""
+        arrays = [np.zeros(shape) for shape in cls._shapes(steps, num_envs, horizon, n)]
+        return cls(*arrays, *(np.zeros((steps, num_envs), kind) for kind in (np.int64, bool)))
+
+    @classmethod
+    def nbytes(cls, steps: int, num_envs: int, horizon: int, n: int) -> int:
+        """Return how many bytes such a tape takes."""
+        return 8 * sum(prod(shape) for shape in cls._shapes(steps, num_envs, horizon, n)) + 9 * steps * num_envs
+
+    @staticmethod
+    def _shapes(steps: int, num_envs: int, horizon: int, n: int) -> tuple[tuple[int, ...], ...]:
+        """Return those of all arrays but the last two."""
         size, q, nu, te = state_size(n), 6 + 2 * n, 3 * n, (steps, num_envs)
-        shapes = (
+        return (
             (*te, horizon, nu, size), (*te, horizon, q, size), (*te, horizon, 15), (*te, horizon, n, size),
             (*te, nu, nu), (*te, horizon + 1, size), (*te, horizon, nu), (*te, horizon, n), (*te, horizon + 1, n, 3),
             (num_envs, steps + 1, size), (num_envs, steps, nu), (num_envs, steps, 7),
         )  # fmt: skip
-        arrays = [np.zeros(shape) for shape in shapes]
-        return cls(*arrays, *(np.zeros(te, kind) for kind in (np.int64, bool)))
 
 
 class Gradient(NamedTuple):
@@ -286,7 +296,7 @@ def pull_flight_back(costs, times, weights, model, surroundings, adjoint):
         for i in range(size):
             costate[i] = costs[e, steps, i]
         for t in range(steps - 1, -1, -1):
-            # An episode has ended here, or a plan failed: what comes after owes nothing to what was before.
+            # An episode has ended here, or a plan was not flown: what comes after owes nothing to what was before.
             if tape.cut[t, e]:
                 by_input[:] = 0.0
                 for i in range(size):

@@ -24,6 +24,9 @@ class Commander(Protocol):
     def arrays(self) -> dict[str, np.ndarray]:
         """Return live arrays of all that later commands depend on, environment first, by name."""
 
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Return numbers (E,) of the episodes so far by name, which evaluation reports."""
+
 
 def find_commander(action: str) -> Callable[[Any], Commander]:
     """Return what makes the commander of environments (MultiliftVec) with this `control.action`."""

@@ -264,7 +264,7 @@ class MultiliftVec:
             ValueError: it is of other environments, or not what `state_dict` returned; nothing is changed then.
         """
         now = {key: each for key, each in self.state_dict().items() if key != "control" or key in saved}  # not in older
-        check_saved(saved, now, "world.diverged", "world.system", "task_name", "control")
+        check_saved(saved, now, "world.diverged", "world.system", "task_name", "control", "commander.planner")
         delays, most = self.config.randomization, 2**63 - 1
         whole = "steps", "seeds", "sensing.sent", "sensing.seen", "sensing.obstacle_steps"
         counts = dict.fromkeys(whole, (0, most))

@@ -7,7 +7,9 @@ import numpy as np
 from multilift_marl.config.config import Config
 from multilift_marl.config.load import build_config
 from multilift_marl.control.formation import Reference
+from multilift_marl.envs.commander import COMMANDERS
 from multilift_marl.envs.core import EVALUATION, MultiliftVec
+from multilift_marl.errors import ConfigError
 from multilift_marl.sim.world import Shard, World
 
 Measured = dict[str, np.ndarray]
@@ -38,12 +40,17 @@ class MeasuredTeam(MultiliftVec):
         config: the task and its rig.
 
     Raises:
-        ConfigError: see `MultiliftVec`.
+        ConfigError: see `MultiliftVec`; actions that are for a planner, see `envs/commander.py`.
     """
 
     world_type = _StillWorld
 
     def __init__(self, config: Config):
+        if (action := config.control.action) in COMMANDERS:
+            raise ConfigError(
+                f"control.action={action} commands simulated teams alone, not one that is measured; take another "
+                "control.action, such as full_state with policy=mpc"
+            )
         super().__init__(
             build_config(config.model_dump(), _PERFECT | {"env.num_envs": 1, "env.num_threads": 1}), EVALUATION
         )

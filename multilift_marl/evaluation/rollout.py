@@ -198,15 +198,19 @@ def measure_episodes(
 
 
 def own_metrics(vec: MultiliftVec, policy: Policy) -> dict[str, np.ndarray]:
-    """Return what task and policy report of the episodes so far, numbers (E,) by name.
+    """Return what task, planner of actions and policy report of the episodes so far, numbers (E,) by name.
 
     Raises:
-        ConfigError: a name that evaluation has itself, or both of them.
+        ConfigError: a name that evaluation has itself, or two of them.
     """
     found: dict[str, np.ndarray] = {}
     known = {*MEASURED, *derived_names(vec.failure_causes)}
-    for who, ask in ((f"task {vec.task.name}", vec.task.metrics), ("the policy", getattr(policy, "metrics", dict))):
-        reported = ask()
+    for who, what in (
+        (f"task {vec.task.name}", vec.task),
+        (f"control.action={vec.config.control.action}", vec.commander),
+        ("the policy", policy),
+    ):
+        reported: dict[str, np.ndarray] = getattr(what, "metrics", dict)()
         for name in reported:
             if name in known or name in found or is_shortfall(name):
                 raise ConfigError(

@@ -25,6 +25,7 @@ from multilift_marl.rig.system import System
 LOCAL = 13  # what the law of a drone depends on: attitude 3, body rates 3, c 2, ċ 2, thrust vector 3
 _STEEPEST = 0.1  # least vertical component of a cable's unit vector that the chart is used with
 HEAVY = 0.15  # [-] of the payload: weight of the cables above which sag matters
+SLUGGISH = 0.06  # [s] motor lag above which teams get worse: at 0.07 s errors double, at 0.1 s teams are lost
 SLOW = 1e-6  # [m²/s²] that makes the drag smooth at rest
 
 
@@ -50,14 +51,26 @@ def has_model(system: System) -> bool:
     return not system.anchors.any() or bool(np.ptp(system.anchors, axis=0).max() > 1e-9)
 
 
-def warn_of_heavy_cables(system: System) -> None:
-    """Warn where cables weigh so much that the model's straight ones lead a team astray."""
+def warn_of_heavy_cables(system: System, asked: str) -> None:
+    """Warn where cables weigh so much that the model's straight ones lead a team astray; `asked`: key=value for it."""
     share = float(system.cable_mass.sum()) / system.payload_mass
     if share > HEAVY:
         warn_once(
             "planning",
-            f"plans are of straight cables, but these weigh {share:.0%} of the payload and sag: teams of policy=mpc "
-            "may be lost; lower cable.density, or take another policy",
+            f"plans are of straight cables, but these weigh {share:.0%} of the payload and sag: teams of {asked} may "
+            f"be lost; lower cable.density, or take another {asked.partition('=')[0]}",
+        )
+
+
+def warn_of_slow_motors(system: System, asked: str) -> None:
+    """Warn where rotors follow commands so late that a team oscillates; `asked`: key=value for it."""
+    slowest = max(system.vehicles, key=lambda vehicle: vehicle.rotor_time_constant)
+    if slowest.rotor_time_constant > SLUGGISH:
+        warn_once(
+            "planning",
+            f"the motors of {slowest.name} lag by {slowest.rotor_time_constant:.3g} s, and above {SLUGGISH:g} s teams "
+            f"of {asked} err more or are lost; lower vehicle.rotor_time_constant_up and _down, or take another "
+            f"{asked.partition('=')[0]}",
         )
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from multilift_marl.planning.team_planner import Plans
 
+NEVER = 1e6  # [s] without a plan where there never was one; finite, so that saved states hold sound numbers alone
+
 
 class LastPlan:
     """The last sound plans of E teams, and how old they are.
@@ -18,7 +20,7 @@ class LastPlan:
 
     Attributes:
         age: (E,) time since the plan was made [s].
-        without: (E,) how long no sound plan has been made [s]; infinite where there never was one.
+        without: (E,) how long no sound plan has been made [s]; `NEVER` or more where there was none.
         steps, late, failed: (E,) policy steps of the episode, those with a late plan, those with one that failed.
     """
 
@@ -27,18 +29,18 @@ class LastPlan:
         self._states, self._inputs = np.zeros_like(plans.states), np.zeros_like(plans.inputs)
         self._step, self._dt = step, dt
         num_envs = len(self._states)
-        self.age, self.without = np.zeros(num_envs), np.full(num_envs, np.inf)
+        self.age, self.without = np.zeros(num_envs), np.full(num_envs, NEVER)
         self.steps, self.late, self.failed = np.zeros((3, num_envs))
 
     def reset(self, mask: np.ndarray) -> None:
         """Forget the plans and counts of the teams in the mask (E,)."""
-        self.without[mask] = np.inf
+        self.without[mask] = NEVER
         for count in (self.age, self.steps, self.late, self.failed):
             count[mask] = 0.0
 
     def keep(self, plans: Plans, late: bool, failed: np.ndarray) -> None:
         """Take over the plans that came in time and did not fail (E,); all others grow older by a policy step."""
-        sound, first = ~failed & (not late), np.isinf(self.without)
+        sound, first = ~failed & (not late), self.without >= NEVER
         self._states[sound], self._inputs[sound] = plans.states[sound], plans.inputs[sound]
         self.age = np.where(sound, 0.0, self.age + self._dt)
         self.without = np.where(sound, 0.0, self.without + self._dt)

@@ -18,12 +18,12 @@ from multilift_marl.planning.approach import Approach, begin_approaches, write_a
 from multilift_marl.planning.flatness import SAMPLES, SHAPES, STEP
 from multilift_marl.planning.force_estimator import ForceEstimator
 from multilift_marl.planning.hard_planner import HardPlanner
-from multilift_marl.planning.team_model import has_model, warn_of_heavy_cables
 from multilift_marl.planning.team_observer import TeamObserver
 from multilift_marl.planning.team_planner import TeamPlanner
 from multilift_marl.policies.full_state_command import FullStateCommand, rotations
 from multilift_marl.policies.hold import HoldAccRates, HoldFullState
 from multilift_marl.policies.last_plan import LastPlan
+from multilift_marl.policies.mpc_checks import check_team
 from multilift_marl.sensing.load_sensing import CAMERA_DELAY, CAMERAS
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class TeamMpc:
         preview: where targets come from, see the attribute.
 
     Class attributes:
+        NAME: of the policy.
         INTERFACE, INTERFACES: by which it acts, and those by which it can.
 
     Attributes:
@@ -67,30 +68,16 @@ class TeamMpc:
             `team_model.has_model`); drones that reject the forces that it estimates.
     """
 
+    NAME: ClassVar[str] = "mpc"
     INTERFACE: ClassVar[str] = "acc_rates"
     INTERFACES: ClassVar[tuple[str, ...]] = ("acc_rates", "full_state")
     _vec: MultiliftVec
 
     def __init__(self, vec: MultiliftVec, preview: Preview | None = None):
         system, config, n = vec.world.system, vec.config, vec.num_drones
-        if not vec.task.CAN_PLAN:
-            raise ConfigError(
-                f"policy=mpc cannot fly task {config.task}: it plans for taut cables, all drones and free air; take "
-                "another policy"
-            )
+        asked = self._asked(vec)
+        check_team(vec, asked)
         self._is_point = vec.task.rig.is_point
-        if not has_model(system):
-            raise ConfigError(
-                "policy=mpc plans for bodies with two anchors or more, apart, and for points; set payload.shape=point, "
-                "or take another policy for this rig"
-            )
-        warn_of_heavy_cables(system)
-        rejection = config.control.disturbance
-        if config.planner.estimate and rejection != "none":
-            raise ConfigError(
-                f"policy=mpc estimates unknown forces, which control.disturbance={rejection} would reject a second "
-                "time; set control.disturbance=none, or planner.estimate=false"
-            )
         self._vec, settings, self.preview = vec, config.planner, preview
         self._exact = exact = config.env.sensing == "ideal" and not config.randomization.observation_noise
         self.planner = self._make_planner()
@@ -130,7 +117,7 @@ class TeamMpc:
         enough = ENOUGH[interface]
         if any(getattr(config.acting, key) < least for key, (least, _) in enough.items()):
             cure = " ".join(f"control.{key}={wide:g}" for key, (_, wide) in enough.items())
-            warn_once("mpc", f"actions of these full scales limit what policy=mpc can command; set {cure}")
+            warn_once("mpc", f"actions of these full scales limit what {asked} can command; set {cure}")
         self._deadline = np.inf if settings.deadline is None else settings.deadline
         self._patience = settings.patience
         self._limits = config.acting.max_acceleration, config.acting.max_tilt_rate
@@ -139,6 +126,10 @@ class TeamMpc:
         vec, settings = self._vec, self._vec.config.planner
         team = vec.world.system, settings, vec.num_envs
         return HardPlanner(*team) if settings.limits == "hard" else TeamPlanner(*team, vec.world.obstacles)
+
+    def _asked(self, vec: MultiliftVec) -> str:
+        """Return key=value by which its plans are asked for."""
+        return f"policy={self.NAME}"
 
     def _interface(self, vec: MultiliftVec) -> str:
         """Return by which interface it acts."""

@@ -25,14 +25,15 @@ if TYPE_CHECKING:
 class DistributedMpc(TeamMpc):
     """See `TeamMpc`; plan e N + n is that of drone n of environment e."""
 
+    NAME: ClassVar[str] = "mpc_distributed"
     INTERFACES: ClassVar[tuple[str, ...]] = ("acc_rates",)
     planner: DistributedPlanner
 
     def __init__(self, vec: MultiliftVec, preview: Preview | None = None):
         if vec.config.planner.limits == "hard" or vec.num_drones < 2:
             raise ConfigError(
-                "policy=mpc_distributed has soft limits, and two drones or more; set planner.limits=soft, or take "
-                "policy=mpc"
+                f"policy={self.NAME} has soft limits, and two drones or more; set planner.limits=soft, or take policy="
+                f"{self.NAME.removesuffix('_distributed')}"
             )
         super().__init__(vec, preview)
         self._lately, self._known = np.zeros_like(self.planner.plans.states[:, 0]), np.zeros(len(self._fresh), bool)
@@ -57,10 +58,11 @@ class DistributedMpc(TeamMpc):
         super().reset(None if mask is None else np.repeat(mask, self._vec.num_drones))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """See `TeamMpc.arrays`; plans and messages of teams, drones of one after another."""
-        post = self.planner.post._asdict()
-        lately = {"lately": self._lately, "known": self._known}
-        return super().arrays() | lately | {f"Post.{name}": array for name, array in post.items()}
+        """See `TeamMpc.arrays`; (E, N, ...) of what each drone has of its own, and messages (E, ...)."""
+        teams = self._vec.num_envs, self._vec.num_drones
+        own = super().arrays() | {"lately": self._lately, "known": self._known}
+        found = {name: array.reshape(*teams, *array.shape[1:]) for name, array in own.items()}  # views
+        return found | {f"Post.{name}": array for name, array in self.planner.post._asdict().items()}
 
     def metrics(self) -> dict[str, np.ndarray]:
         """See `TeamMpc.metrics`: means over the drones."""

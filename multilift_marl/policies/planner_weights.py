@@ -16,10 +16,14 @@ from multilift_marl.control.actions import PLANNER_WEIGHTS, AccRatesAction
 from multilift_marl.diffmpc.sensitivity import Gradient
 from multilift_marl.diffmpc.weighted_planner import WeightedHardPlanner, WeightedPlanner
 from multilift_marl.errors import ConfigError
+from multilift_marl.mdp.observations import observation_names
 from multilift_marl.planning.distributed_planner import DistributedPlanner
 from multilift_marl.planning.team_weights import TeamWeights
+from multilift_marl.policies.hold import HoldAccRates
+from multilift_marl.policies.last_plan import LastPlan
 from multilift_marl.policies.mpc import TeamMpc
 from multilift_marl.policies.mpc_distributed import DistributedMpc
+from multilift_marl.sim.saved import fingerprint
 
 if TYPE_CHECKING:
     from multilift_marl.envs.core import MultiliftVec
@@ -47,10 +51,21 @@ class PlannerWeights:
         if vec.config.planner.feedback < 1.0:
             raise ConfigError("control.action=planner_weights commands acc_rates; set planner.feedback=1")
         self._apart = vec.config.planner.distributed
+        if self._apart and (vec.config.planner.limits == "hard" or vec.num_drones < 2):
+            raise ConfigError(
+                "planner.distributed=true has soft limits, and two drones or more; set planner.limits=soft, or "
+                "planner.distributed=false"
+            )
         self._vec, self.mpc = vec, _DistributedWeightedMpc(vec) if self._apart else _WeightedMpc(vec)
         n = vec.num_drones
         self._scale = log(vec.config.control.max_weight)
         self._by_drone, self._rate_by_drone, self._by_end = weight_map(n)
+        self._settings = fingerprint(str(vec.config.planner.model_dump(exclude_defaults=True)), vec.num_envs)
+
+    @property
+    def follows(self) -> np.ndarray:
+        """Whether teams fly by the plans made last (E,) bool: none came late or failed, nor was a state unknown."""
+        return self.mpc.follows
 
     @property
     def planner(self) -> WeightedPlanner | DistributedPlanner:
@@ -63,7 +78,7 @@ class PlannerWeights:
         said = np.repeat(action.reshape(-1, 1, action.shape[-1]), action.shape[1], axis=1) if self._apart else action
         for mine, weights in zip(self.planner.weights, self.weigh(said), strict=True):
             mine[:] = weights
-        return self.mpc.act(self._vec.task.observation)
+        return self.mpc.act(self._vec.outcome.observation)
 
     def weigh(self, action: np.ndarray) -> TeamWeights:
         """Return the weights of actions (..., N, A)."""
@@ -95,7 +110,11 @@ class PlannerWeights:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """See `Commander.arrays`."""
-        return self.mpc.arrays()
+        return {"planner": self._settings} | self.mpc.arrays()
+
+    def metrics(self) -> dict[str, np.ndarray]:
+        """See `Commander.metrics`."""
+        return self.mpc.metrics()
 
 
 def weight_map(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -121,12 +140,21 @@ class _ByRates:
     """What acts by `acc_rates`, whatever the environment's actions are."""
 
     _vec: MultiliftVec
+    _last: LastPlan
+
+    @property
+    def follows(self) -> np.ndarray:
+        """See `PlannerWeights`; of drones that plan for themselves (E N,)."""
+        return self._last.age == 0.0
+
+    def _asked(self, vec: MultiliftVec) -> str:
+        return f"control.action={vec.config.control.action}"
 
     def _interface(self, vec: MultiliftVec) -> str:
         return "acc_rates"
 
     def _make_fallback(self) -> Policy:
-        return _Nothing(self._vec.num_drones)
+        return _HoldByRates(self._vec)
 
 
 class _WeightedMpc(_ByRates, TeamMpc):
@@ -145,15 +173,20 @@ class _DistributedWeightedMpc(_ByRates, DistributedMpc):
     """See `DistributedMpc`."""
 
 
-class _Nothing:
-    """Commands zero accelerations relative to the formation."""
+class _HoldByRates(HoldAccRates):
+    """The same, in environments with other actions: it acts as by `acc_rates`, on what is observed with these."""
 
-    def __init__(self, n: int):
-        self._shape = n, len(AccRatesAction.numbers)
+    def __init__(self, vec: MultiliftVec):
+        observed = observation_names(self.INTERFACE, vec.task.extra(vec.config), vec.config.env.ages)
+        self._columns = [vec.observation_names.index(name) for name in observed]  # so that it rounds alike, too
+        self._observed = observed
+        super().__init__(vec)
+
+    def matrix(self) -> np.ndarray:
+        """See `Formation.matrix`."""
+        self._names, self._actions = self._observed, tuple(number.name for number in AccRatesAction.numbers)
+        return super().matrix()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return zeros (E, N, 5)."""
-        return np.zeros((len(observation), *self._shape))
-
-    def reset(self, mask: np.ndarray | None = None) -> None:
-        """Do nothing."""
+        """Return actions (E, N, 5) of `acc_rates` for observations (E, N, D)."""
+        return super().act(np.take(observation, self._columns, axis=-1))

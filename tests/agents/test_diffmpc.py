@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from conftest import refusal
 
 import multilift_marl as ml
 from multilift_marl.agents.checkpoint import load_checkpoint
+from multilift_marl.agents.mappo import check_batch
 from multilift_marl.agents.policy import load_policy
 from multilift_marl.agents.trainer import Trainer, new_run, resume_run
+from multilift_marl.diffmpc.sensitivity import Tape
 from multilift_marl.errors import ConfigError
 
 pytestmark = pytest.mark.slow  # its planner takes a minute to compile
@@ -83,6 +87,42 @@ def test_delay_that_plans_expect_does_not_count_as_lateness(steps, expected, lat
     trainer = Trainer(config(**own), Path("unused"))
     trainer.step()
     assert (trainer.rollouts._flight.tape.late == late).all()
+
+
+@pytest.mark.parametrize("spoil", ["late", "unknown"])
+def test_plans_that_are_not_flown_teach_nothing(spoil):
+    """Those that come late, and those of a team, the second one here, whose state is unknown."""
+    trainer = Trainer(config(**POOR), Path("unused"))
+    mpc, tape = trainer.rollouts._commander.mpc, trainer.rollouts._flight.tape
+    measure = mpc._measure
+
+    def measured():
+        found = measure()
+        found[0][1] = np.nan
+        return found
+
+    if spoil == "late":
+        mpc._deadline = -1.0
+    else:
+        mpc._measure = measured
+    values = trainer.step()
+    assert tape.cut[:, 1].all() and tape.cut[:, 0].all() == (spoil == "late")
+    assert (values["gradient"] == 0.0) == (spoil == "late")
+    assert values["cut"] == pytest.approx(1.0 if spoil == "late" else 0.5, abs=0.05)
+
+
+def test_more_plans_than_memory_holds_are_refused(monkeypatch):
+    """As many bytes as the window's plans take are too few: the batch comes beside them."""
+    own = config(**{"train.diffmpc.window": 40})
+    vec = ml.make_vec(own)
+    plans = Tape.nbytes(41, 2, own.planner.steps, 3)
+    for there, refused in ((plans, True), (2 * plans, False)):
+        monkeypatch.setattr(os, "sysconf", {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": there}.get)
+        if refused:
+            said = refusal(check_batch, own.train, vec, 2)
+            assert said.endswith("lower train.diffmpc.window, planner.steps, train.horizon or env.num_envs")
+        else:
+            check_batch(own.train, vec, 2)
 
 
 @pytest.mark.parametrize(

@@ -222,6 +222,18 @@ def test_the_contract_says_what_a_one_stands_for():
     })  # fmt: skip
 
 
+@pytest.mark.parametrize("most", [100.0, 50.0])
+def test_the_contract_says_that_weights_of_a_planner_are_factors(most):
+    told = make_contract(policy("track", **{"control.action": "planner_weights", "control.max_weight": most}))["action"]
+    assert len(told["numbers"]) == 13
+    for number in told["numbers"]:
+        ends = [number[f"at_{end}"] for end in ("minus_one", "zero", "one")]
+        assert ends == pytest.approx([1 / most, 1.0, most], rel=1e-12)
+        assert number["scale"] == "exponential" and "factor" in number["meaning"]
+    others = make_contract(policy(**{"control.action": "ctbr"}))["action"]["numbers"]
+    assert {number["scale"] for number in others} == {"linear"}
+
+
 @pytest.mark.parametrize("units", ["si", pytest.param("cable", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("interface", "name"), [one if one in FEW else slow(*one) for one in READ])
 def test_full_actions_are_what_the_contract_says(interface, name, units):

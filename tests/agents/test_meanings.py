@@ -19,6 +19,12 @@ from multilift_marl.errors import warn_once
         ("reference", {"env.policy_hz": 25.0, "control.max_yaw": 0.2}, ["control.max_yaw", "env.policy_hz"]),
         ("ctbr", {"control.max_offset": 0.1, "control.max_tilt_rate": 8.0}, ["control.max_tilt_rate"]),
         ("rotor", {"control.max_offset": 0.1, "sim.timestep": 0.002, "sim.control_hz": 500}, []),
+        ("acc_rates", {"planner.position": 0.2}, []),
+        ("planner_weights", {"control.max_weight": 50.0}, ["control.max_weight"]),
+        ("planner_weights", {"planner.position": 0.2, "planner.steps": 10}, ["planner.steps", "planner.position"]),
+        ("planner_weights", {"planner.limits": "hard", "planner.lead": 0.1}, ["planner.limits", "planner.lead"]),
+        ("planner_weights", {"planner.deadline": 0.1, "planner.patience": 1.0, "planner.distributed": True}, []),
+        ("planner_weights", {"planner.sweeps": 5, "control.max_offset": 0.1}, []),
         ("reference", {"env.num_drones": 6, "payload.mass": 2.0, "randomization.payload_mass": 0.3}, []),
     ],
 )

@@ -9,6 +9,7 @@ from conftest import make_trainer, refusal
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from multilift_marl.agents.checkpoint import load_checkpoint, save_checkpoint
+from multilift_marl.agents.curriculum import Curriculum
 from multilift_marl.agents.evaluator import Evaluator
 from multilift_marl.agents.logging import read_metrics
 from multilift_marl.agents.trainer import resume_run
@@ -182,3 +183,21 @@ def test_a_damaged_stage_is_no_checkpoint(tmp_path):
         with pytest.raises(CheckpointError, match="stage"):
             resume_run(trainer.folder, {})
     assert build_config(content["config"]).train.stages == trainer.config.train.stages
+
+
+@pytest.mark.parametrize(
+    "own, change, message",
+    [
+        ({}, {"planner.distributed": True}, "set planner.distributed=false"),
+        ({}, {"planner.lead": 0.1}, "leave planner.lead out"),
+        ({}, {"control.action": "acc_rates"}, "set control.action=planner_weights"),
+        ({"train.algorithm": "mappo", "train.actor": "set"}, {"env.sensing": "onboard"}, "env.communication=all"),
+        ({"train.algorithm": "ippo", "control.action": "reference", "train.residual": "formation_integral"},
+         {"control.action": "velocity"}, "acts by control.action=reference"),
+    ],
+)  # fmt: skip
+def test_every_stage_is_checked_as_the_training_s_own_environment(own, change, message):
+    """The second one here."""
+    both = [{"overrides": each, "until": {"frames": k}} for k, each in ((10, {"payload.mass": 0.8}), (20, change))]
+    said = refusal(Curriculum, load_config("track_weights", own | {"train.stages": both}))
+    assert said.startswith("stage 2 of train.stages: ") and message in said

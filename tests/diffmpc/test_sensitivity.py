@@ -183,3 +183,7 @@ def test_nothing_goes_back_through_the_end_of_an_episode():
     assert not gradient.state[:10].any()
     assert not gradient.starts.any()
     assert gradient.state[10:].any()
+
+
+def test_a_tape_takes_as_much_memory_as_is_said():
+    assert Tape.nbytes(5, 2, 7, 3) == sum(array.nbytes for array in Tape.of(5, 2, 7, 3))

@@ -17,6 +17,7 @@ from multilift_marl.planning.team_model import (
     state_size,
     step_state,
     warn_of_heavy_cables,
+    warn_of_slow_motors,
 )
 
 GRAVITY = 9.81
@@ -204,5 +205,24 @@ def test_heavy_cables_are_warned_of(caplog, density, said):
     """Of 16 teams of policy=mpc in `track` none is lost with 0.03 kg/m, four are with 0.05: chains sag."""
     warn_once.cache_clear()
     chains = {"cable.model": "chain", "cable.density": density, "payload.mass": 1.0}
-    warn_of_heavy_cables(ml.load_config("hover", chains).system)
+    warn_of_heavy_cables(ml.load_config("hover", chains).system, "policy=mpc")
     assert [f"weigh {4 * density:.0%} of the payload" in each.message for each in caplog.records] == [True] * said
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        ({}, []),
+        ({"vehicle.preset": "crazyflie", "payload.mass": 0.02}, []),
+        ({"vehicle.preset": "crazyflie_id", "payload.mass": 0.02}, ["crazyflie_id lag by 0.145 s"]),
+        ({"vehicle.rotor_time_constant_down": 0.07}, ["falcon lag by 0.07 s"]),
+        ({"vehicle.rotor_time_constant_up": [0.03, 0.03, 0.03, 0.1]}, ["falcon lag by 0.1 s"]),
+    ],
+)
+def test_slow_motors_are_warned_of(caplog, own, said):
+    """The slowest drone's count, up or down."""
+    warn_once.cache_clear()
+    warn_of_slow_motors(ml.load_config("hover", own).system, "control.action=planner_weights")
+    messages = [each.message for each in caplog.records]
+    assert len(messages) == len(said) and all(words in each for words, each in zip(said, messages, strict=True))
+    assert all("teams of control.action=planner_weights" in each for each in messages)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import refusal
 
 import multilift_marl as ml
 from multilift_marl.diffmpc.weighted_planner import FlightGradient
+from multilift_marl.envs.measured import MeasuredTeam
 from multilift_marl.errors import ConfigError
+from multilift_marl.evaluation.rollout import measure_episodes
 from multilift_marl.planning.team_weights import TeamWeights
-from multilift_marl.policies.baselines import make_scripted
+from multilift_marl.policies.baselines import make_base_policy, make_scripted
 from multilift_marl.policies.planner_weights import weight_map
 
 pytestmark = pytest.mark.slow  # its planner takes a minute to compile
 
 WIDE = {"control.max_acceleration": 25.0, "control.max_tilt_rate": 15.0, "env.num_threads": 1, "env.num_drones": 3}
+RATES = WIDE | {"control.action": "acc_rates"}
 WEIGHTS = WIDE | {"control.action": "planner_weights"}
 
 
@@ -27,9 +31,7 @@ def test_zero_actions_fly_as_the_planner_bit_for_bit(name, limits):
         "task_options.acceleration": 4.0,
         "num_envs": 2,
     }
-    ours, theirs = (
-        ml.make_vec("track", seed=3, **keys, **own) for keys in (WEIGHTS, WIDE | {"control.action": "acc_rates"})
-    )
+    ours, theirs = (ml.make_vec("track", seed=3, **keys, **own) for keys in (WEIGHTS, RATES))
     policy = make_scripted(name, theirs)
     observation, _ = theirs.reset(seed=3)
     ours.reset(seed=3)
@@ -38,6 +40,23 @@ def test_zero_actions_fly_as_the_planner_bit_for_bit(name, limits):
         observation = theirs.step(policy.act(observation))[0]
     assert (ours.world.state.payload_position == theirs.world.state.payload_position).all()
     assert (ours.world.state.drone_rotation == theirs.world.state.drone_rotation).all()
+
+
+@pytest.mark.parametrize(
+    "name, own", [("mpc", {}), ("mpc", {"env.history": [0, 2], "env.sensing": "mocap"}), ("mpc_distributed", {})]
+)
+def test_without_a_plan_the_linear_baseline_of_acc_rates_flies(name, own):
+    """As by mpc, bit for bit; and evaluation reports that plans were late."""
+    late = own | {"planner.deadline": 1e-4, "planner.steps": 200, "env.episode_seconds": 0.6, "num_envs": 2}
+    late["planner.distributed"] = name == "mpc_distributed"
+    ours, theirs = (ml.make_vec("track", seed=3, **keys, **late) for keys in (WEIGHTS, RATES))
+    policy, ended = make_scripted(name, theirs), []
+    for vec, each in ((ours, make_base_policy("formation", ours)), (theirs, policy)):
+        found = measure_episodes(vec, each, vec.reset(seed=3)[0])
+        assert (found["planner_late"] == 1.0).all() and "planner_failed" in found
+        ended.append(vec.world.state)
+    assert (ended[0].payload_position == ended[1].payload_position).all()
+    assert (ended[0].drone_rotation == ended[1].drone_rotation).all()
 
 
 @pytest.mark.parametrize(
@@ -55,6 +74,29 @@ def test_a_saved_flight_goes_on_bit_for_bit(apart):
     second.load_state_dict(first.state_dict())
     for action in actions[10:]:
         assert (first.step(action)[0] == second.step(action)[0]).all()
+
+
+@pytest.mark.parametrize("apart, limits", [(False, "soft"), (False, "hard"), (True, "soft")])
+def test_a_state_saved_after_a_reset_is_loaded(apart, limits):
+    """Of all environments and of one of them; arrays have a row for each environment."""
+    keys = WEIGHTS | {"planner.distributed": apart, "planner.limits": limits, "env.sensing": "mocap"}
+    vec = ml.make_vec("track", num_envs=2, **keys)
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 2, 3, vec.action_size))
+    for mask in (None, np.array([True, False])):
+        vec.reset(mask=mask)
+        saved = vec.state_dict()
+        assert {len(array) for array in saved.values()} == {2}
+        assert all(np.isfinite(array).all() for name, array in saved.items() if name.startswith("commander."))
+        first = [vec.step(action)[0] for action in actions]
+        vec.load_state_dict(saved)
+        assert all((vec.step(action)[0] == there).all() for action, there in zip(actions, first, strict=True))
+
+
+def test_a_state_of_another_planner_is_refused():
+    own, other = (ml.make_vec("track", num_envs=2, **WEIGHTS, **{"planner.position": at}) for at in (0.1, 0.2))
+    own.reset(seed=0)
+    with pytest.raises(ValueError, match=r"'commander\.planner' is that of another"):
+        other.load_state_dict(own.state_dict())
 
 
 def test_an_environment_is_the_same_in_any_batch():
@@ -162,9 +204,21 @@ def test_derivatives_by_actions_are_differences_of_simulated_flights(own, most):
 
 
 def test_what_cannot_be_planned_is_refused():
-    with pytest.raises(ConfigError, match="cannot fly task recover"):
-        ml.make_vec("recover", **{"control.action": "planner_weights"})
+    own = {"control.action": "planner_weights"}
+    said = refusal(ml.make_vec, "recover", **own)
+    assert said.startswith("control.action=planner_weights cannot fly task recover: ")
+    assert said.endswith("; take another control.action")
+    apart = WEIGHTS | {"planner.distributed": True}
+    for more in ({"planner.limits": "hard"}, {"env.num_drones": 1, "payload.shape": "point"}):
+        said = refusal(ml.make_vec, "track", **apart | more)
+        assert said.startswith("planner.distributed=true has soft limits, and two drones or more; ")
+        assert said.endswith("set planner.limits=soft, or planner.distributed=false")
     with pytest.raises(ConfigError, match=r"planner\.feedback=1"):
         ml.make_vec("track", **WEIGHTS, **{"planner.feedback": 0.5})
     with pytest.raises(ConfigError, match=r"control\.max_weight"):
         ml.load_config("track", {"control.max_weight": 1.0})
+
+
+def test_a_team_that_is_measured_is_not_planned_for():
+    said = refusal(MeasuredTeam, ml.load_config("track", WEIGHTS))
+    assert said.startswith("control.action=planner_weights commands simulated teams alone, ")

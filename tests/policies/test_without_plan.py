@@ -11,7 +11,7 @@ from multilift_marl.evaluation.metrics import compare, summarize
 from multilift_marl.evaluation.rollout import run_episodes
 from multilift_marl.planning.team_planner import Plans
 from multilift_marl.policies.baselines import make_scripted
-from multilift_marl.policies.last_plan import LastPlan
+from multilift_marl.policies.last_plan import NEVER, LastPlan
 
 pytestmark = pytest.mark.slow  # its planner takes a minute to compile
 
@@ -93,7 +93,7 @@ def test_a_plan_is_read_at_its_age_and_ends():
     states = np.arange(4.0)[None, :, None] ** 2 * np.ones(5)
     plans = Plans(states, np.diff(states, axis=1)[..., :3], states, np.zeros(1, bool), np.zeros(1, bool))
     last, good, bad = LastPlan(plans, 0.5, 0.25), np.zeros(1, bool), np.ones(1, bool)
-    assert np.isinf(last.without)
+    assert last.without == NEVER
     last.keep(plans, False, good)
     assert last.states()[0, 0] == 0 and last.inputs()[0, 0] == 1
     for k, (state, change) in enumerate([(0.5, 1), (1, 3), (2.5, 3), (4, 5), (6.5, 5), (9, 0), (9, 0)], 1):
