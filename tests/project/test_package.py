@@ -296,8 +296,8 @@ def of_documents():
 
 
 def with_marks(commands):
-    """Return the commands as parameters, those that start a cluster or environments of others as long ones."""
-    apart = re.compile(r"workers=2|bench/(workers|peers)|ray_tune")
+    """Return the commands as parameters; what starts clusters, installs others, searches or films is long."""
+    apart = re.compile(r"workers=2|bench/(workers|peers)|ray_tune|search_gains|video=true")
     return [pytest.param(each, marks=[pytest.mark.long] if apart.search(each) else []) for each in commands]
 
 
