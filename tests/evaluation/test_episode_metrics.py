@@ -35,6 +35,7 @@ class Film:
     """Environments in which all happens as it was drawn before; episode e fails in step `fails[e]`, 0: never."""
 
     num_drones, action_size, failure_causes = 2, 3, ("none",)
+    config, commander = SimpleNamespace(control=SimpleNamespace(action="reference")), None
 
     def __init__(self, fails, seed: int = 0, steps: int = STEPS, rmse_after: float = 0.5):
         self.num_envs, self.max_steps, self.fails = len(fails), steps, np.array(fails)
