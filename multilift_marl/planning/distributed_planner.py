@@ -40,8 +40,8 @@ from multilift_marl.sensing.communication import Links
 from multilift_marl.sim.obstacles import Obstacles
 
 OWN = 19  # numbers of a drone's problem: payload 12, its cable 4, its thrust vector 3
-SLOWEST = 0.8  # see `sweep_shares`
-MOMENTUM = 0.4
+SLOWEST = 0.8  # of what Chebyshev's iteration is for, see `sweep_shares`
+MOMENTUM = 0.4  # of a damped sweep's change, that the next one adds
 
 
 class ApartWork(NamedTuple):
